@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -100,6 +100,8 @@ class Level:
     """The parts of their outline where a road of level 0 goes on."""
     approach: shapely.MultiPolygon
     """The road of level 0 beyond the joints: there level 0 has the surface of this level."""
+    passing: shapely.MultiPolygon = field(default_factory=shapely.MultiPolygon)
+    """The streets of level 0 near the joints that pass below the deck, or above the tube."""
 
     def covers(self, easting: Floats, northing: Floats) -> Bools:
         """Return which points lie on the decks or tubes, in the points' broadcast shape."""
@@ -109,8 +111,8 @@ class Level:
     def weight(self, easting: Floats, northing: Floats) -> Floats:
         """Return the share of this level's surface in that of level 0, from 0 to 1, in the broadcast shape.
 
-        It is 1 on the approach, falls to 0 over `BLEND_M` beside and behind it, and is 0 below the decks and
-        at their free edges.
+        It is 1 on the approach, falls to 0 over `BLEND_M` beside and behind it, and is 0 below the decks, at
+        their free edges, and on streets that pass.
         """
         easting, northing = np.broadcast_arrays(easting, northing)
         result = np.zeros(easting.shape)
@@ -122,6 +124,8 @@ class Level:
         share = np.clip(1 - shapely.distance(self.approach, places) / BLEND_M, 0.0, 1.0)
         away, from_joints = shapely.distance(self.areas, places), shapely.distance(self.joints, places)
         free = (away < from_joints - FREE_M) | ((away == 0.0) & (from_joints > ON_JOINT_M))
+        shapely.prepare(self.passing)
+        free |= shapely.contains_properly(self.passing, places)
         result[near] = np.where(free, 0.0, share * share * (3 - 2 * share))
         return result
 

@@ -43,6 +43,7 @@ AREAS = {
         "pipeline/store",
     },
     "photos": {"catalog", "tasks/acquire", "tasks/io", "pipeline/prepare"},
+    "levels": {f"tasks/{name}" for name in ("filter", "fit", "levels", "roads", "segment", "spline")},
     "readers": RUNS | {"pipeline/check", "pipeline/results", "tasks/acquire", "tasks/segment"},
 }
 

@@ -16,7 +16,14 @@ from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.results.points import Ground
-from flexroad.pipeline.results.query import along_lines, at_points, beyond_survey, outside, required_crs
+from flexroad.pipeline.results.query import (
+    LevelWanted,
+    along_lines,
+    at_points,
+    beyond_survey,
+    outside,
+    required_crs,
+)
 from flexroad.pipeline.results.query_files import LONLAT, parse_csv, read_lines, read_points
 
 app = group()
@@ -72,6 +79,13 @@ def query(
             rich_help_panel=INPUTS,
         ),
     ] = None,
+    level: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|all",
+            help="Level of roads above roads: 0 is the ground, all: a row per level; default: the highest.",
+        ),
+    ] = None,
     variant: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Variant of the surface; default: the exported one."),
@@ -100,14 +114,15 @@ def query(
     if output is not None and output.suffix.lower() not in (".csv", ".gpkg"):
         raise ConfigError(f"-o {output}: give a name that ends in .csv or .gpkg")
     given = LONLAT if lonlat else crs
+    wanted = _level(level)
     ground = Ground.open(path, variant, allow or (), earlier=True)
     if line is not None:
-        result = along_lines(ground, read_lines(line, given, layer, required_crs(ground)), step)
+        result = along_lines(ground, read_lines(line, given, layer, required_crs(ground)), step, wanted)
     elif points == STDIN:
-        result = at_points(ground, parse_csv(sys.stdin.buffer.read(), "standard input", given))
+        result = at_points(ground, parse_csv(sys.stdin.buffer.read(), "standard input", given), wanted)
     else:
         assert points is not None
-        result = at_points(ground, read_points(points, given, layer))
+        result = at_points(ground, read_points(points, given, layer), wanted)
     if output is not None and output.suffix.lower() == ".gpkg":
         result.write_geopackage(output)
     else:
@@ -120,3 +135,14 @@ def query(
         )
     for note in filter(None, (*result.notes, outside(result, ground), beyond_survey(result))):
         echo(f"note: {note}", err=True)
+
+
+def _level(text: str | None) -> LevelWanted:
+    if text is None:
+        return None
+    if text == "all":
+        return "all"
+    try:
+        return int(text)
+    except ValueError:
+        raise ConfigError(f"--level {text}: give a whole number, such as 0, or all") from None

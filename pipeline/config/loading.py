@@ -13,6 +13,7 @@ from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config import document
 from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.levels import check_levels
 from flexroad.pipeline.config.methods import DEFAULTS
 from flexroad.pipeline.config.models import TAG, Config, Export, stage_models
 from flexroad.pipeline.config.settings import Setting, applied, merge
@@ -105,6 +106,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
             )
             for stage in stages
         }
+        check_levels(chains[str(variant)], f"{name}: {where}" if overrides else name)
     given = _mapping(raw.get("export") or {}, name, "export")
     export = _validate(TypeAdapter(Export), {"variants": _main_variant(chains)} | given, f"{name}: export")
     for variant in export.variants:

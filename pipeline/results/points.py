@@ -8,8 +8,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, open_variant
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, peek_statuses
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 
@@ -40,6 +42,10 @@ class Answer:
     """``(n,)``, ``road`` or ``terrain`` according to the segmented mask."""
     earlier: tuple[str, ...] = ()
     """Ids of tiles whose values are of earlier sources or options (`Ground.earlier`)."""
+    level: NDArray[np.int8] | None = None
+    """``(n,)``, numbers of the levels that the values are of; None if all are of the highest."""
+    numbers: tuple[int, ...] = (0,)
+    """The levels of the tiles that have points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +82,17 @@ class Ground:
             raise ConfigError(f"{path} has no finished tile; see `flexroad status {path}`")
         return ground
 
-    def at(self, easting: Floats, northing: Floats) -> Answer:
+    def at(self, easting: Floats, northing: Floats, level: int | None = None) -> Answer:
         """Return height, normal, tile and class at n points (m, in the run's CRS).
 
         A point on the edge of two finished tiles belongs to the one first in the catalog. A surface goes on
         beyond the survey, but its heights there are no heights of the ground.
+
+        Parameters
+        ----------
+        level : int, optional
+            The level of roads above roads: 0 is the ground, others are where they have decks or tubes. None:
+            the highest at each point.
         """
         easting = np.atleast_1d(np.asarray(easting, dtype=np.float64))
         northing = np.atleast_1d(np.asarray(northing, dtype=np.float64))
@@ -89,7 +101,8 @@ class Ground:
         tile = np.zeros(easting.shape, dtype=object)
         kind = np.full(easting.shape, "", dtype=object)
         tile[:] = ""
-        earlier = []
+        earlier, numbers = [], {0}
+        of_level = np.zeros(easting.shape, np.int8)
         for status, selected in self._owners(easting, northing):
             graph = status.graph
             found = self._current(status) if status.done else self._last(graph.tile.id)
@@ -99,11 +112,43 @@ class Ground:
             earlier += [] if status.done else [graph.tile.id]
             tile[selected] = graph.tile.id
             selected = selected[~road.outside[road.grid.cells(easting[selected], northing[selected])]]
-            east, north = easting[selected], northing[selected]
-            height[selected] = surface.height(east, north)
-            normal[selected] = surface.normal(east, north)
-            kind[selected] = np.where(road.mask[road.grid.cells(east, north)], "road", "terrain")
-        return Answer(height, normal, tile.astype(str), kind.astype(str), tuple(earlier))
+            numbers.update(surface.numbers if isinstance(surface, LevelledSurface) else ())
+            for number, chosen, own in _by_level(surface, easting, northing, selected, level):
+                east, north = easting[chosen], northing[chosen]
+                height[chosen], normal[chosen] = own.height(east, north), own.normal(east, north)
+                is_road = (number != 0) | road.mask[road.grid.cells(east, north)]
+                kind[chosen], of_level[chosen] = np.where(is_road, "road", "terrain"), number
+        return Answer(
+            height,
+            normal,
+            tile.astype(str),
+            kind.astype(str),
+            tuple(earlier),
+            of_level if level is None else np.full(easting.shape, level, np.int8),
+            tuple(sorted(numbers)),
+        )
+
+    def on_every_level(self, easting: Floats, northing: Floats) -> tuple[NDArray[np.intp], Answer]:
+        """Return what `at` returns for all levels of each point, and the number of the point of each row.
+
+        The rows of a point are ordered by level, and its first one is that of the ground.
+        """
+        ground = self.at(easting, northing, 0)
+        answers = [ground, *(self.at(easting, northing, k) for k in ground.numbers if k != 0)]
+        kept = [
+            np.arange(len(answer.height)) if answer is ground else np.flatnonzero(np.isfinite(answer.height))
+            for answer in answers
+        ]
+        points = np.concatenate(kept)
+        columns: dict[str, Any] = {
+            name: np.concatenate(
+                [getattr(answer, name)[rows] for answer, rows in zip(answers, kept, strict=True)]
+            )
+            for name in ("height", "normal", "tile", "kind", "level")
+        }
+        order = np.lexsort((columns["level"], columns["level"] != 0, points))
+        columns = {name: values[order] for name, values in columns.items()}
+        return points[order], replace(ground, **columns)
 
     def _owners(self, easting: Floats, northing: Floats) -> Iterator[tuple[TileStatus, NDArray[np.intp]]]:
         """Yield the state of each finished tile that has points, with the indices of the points."""
@@ -134,3 +179,23 @@ class Ground:
     def _current(self, status: TileStatus) -> tuple[Surface, RoadMask]:
         tile = FinishedTile.of(self.run, status, self.variant)
         return tile.surface, tile.road
+
+
+def _by_level(
+    surface: Surface, easting: Floats, northing: Floats, selected: NDArray[np.intp], level: int | None
+) -> Iterator[tuple[int, NDArray[np.intp], Surface]]:
+    """Yield each level with its points among the selected ones, and its surface."""
+    if not isinstance(surface, LevelledSurface):
+        if level in (None, 0):
+            yield 0, selected, surface
+        return
+    east, north = easting[selected], northing[selected]
+    top = surface.top(east, north)
+    for number in surface.numbers:
+        if level is None:
+            here = top == number
+        elif level == number:
+            here = np.ones(len(selected), np.bool_) if number == 0 else surface.covers(number, east, north)
+        else:
+            continue
+        yield number, selected[here], surface.at(number)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from flexroad.catalog.crs import short
 from flexroad.catalog.headers.open_vector import ERRORS
@@ -29,6 +30,8 @@ else:
 
 MAX_POINTS = 10_000_000
 """Largest number of points of the profiles of one command: their table takes gigabytes."""
+LevelWanted = int | Literal["all"] | None
+"""A level of roads above roads, all that each point has, or the highest."""
 MILLIMETRES = ("distance_m", "easting", "northing")
 """Columns that are written with three decimals; other numbers have nine digits."""
 
@@ -49,6 +52,8 @@ class AnswerTable:
     """Lines for the user."""
     separator: str = ","
     decimal: str = "."
+    level: LevelWanted = None
+    """The level that was asked for."""
 
     def write_csv(self, out: TextIO | Path) -> None:
         """Write the table as CSV; text that spreadsheets would take for a formula begins with an apostrophe.
@@ -117,10 +122,11 @@ def required_crs(ground: Ground) -> str:
     return crs
 
 
-def at_points(ground: Ground, points: Points) -> AnswerTable:
+def at_points(ground: Ground, points: Points, level: LevelWanted = None) -> AnswerTable:
     """Return what a run has at points: the columns height_m, nx, ny, nz, tile and class.
 
-    Points of a vector file also get the columns easting and northing (m), in the CRS of the run.
+    Points of a vector file also get the columns easting and northing (m), in the CRS of the run. With a level
+    there is also a column level; with all levels, each point has a row for each level that it has.
 
     Raises
     ------
@@ -132,19 +138,36 @@ def at_points(ground: Ground, points: Points) -> AnswerTable:
         easting, northing = to_crs(points.x, points.y, points.crs, required_crs(ground))
     if points.vector:
         table = table.assign(easting=easting, northing=northing)
-    answer = ground.at(easting, northing)
-    whole = table.assign(**_columns(answer))
+    rows, answer = _on_level(ground, easting, northing, level)
+    whole = table.iloc[rows].assign(**_columns(answer, level))
     return AnswerTable(
-        whole, easting, northing, crs_of(ground), answer, points.notes, points.separator, points.decimal
+        whole,
+        easting[rows],
+        northing[rows],
+        crs_of(ground),
+        answer,
+        points.notes,
+        points.separator,
+        points.decimal,
+        level,
     )
 
 
-def along_lines(ground: Ground, lines: list[Floats], step_m: float) -> AnswerTable:
+def _on_level(
+    ground: Ground, easting: Floats, northing: Floats, level: LevelWanted
+) -> tuple[NDArray[np.intp], Answer]:
+    """Return the number of the point of each row, and what a run has there."""
+    if level == "all":
+        return ground.on_every_level(easting, northing)
+    return np.arange(len(easting)), ground.at(easting, northing, level)
+
+
+def along_lines(ground: Ground, lines: list[Floats], step_m: float, level: LevelWanted = None) -> AnswerTable:
     """Return profiles: what a run has every ``step_m`` along lines, and at their ends.
 
     The columns are line (only if there are several), distance_m, easting, northing, height_m, grade_percent,
     nx, ny, nz, tile and class. The grade is that of the surface in the direction of the line, positive
-    uphill.
+    uphill. For levels see `at_points`.
 
     Raises
     ------
@@ -153,13 +176,14 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float) -> AnswerTab
     """
     points = stations(lines, step_m)
     easting, northing = points.easting.to_numpy(), points.northing.to_numpy()
-    answer = ground.at(easting, northing)
+    rows, answer = _on_level(ground, easting, northing, level)
+    points = points.iloc[rows]
     # A normal is (-dz/dx, -dz/dy, 1), scaled to length 1.
     slope = -(answer.normal[:, :2] * points[["east", "north"]].to_numpy()).sum(axis=1) / answer.normal[:, 2]
     table = points.drop(columns=["east", "north"] if len(lines) > 1 else ["line", "east", "north"])
-    columns = _columns(answer)
+    columns = _columns(answer, level)
     table = table.assign(height_m=columns.pop("height_m"), grade_percent=100 * slope, **columns)
-    return AnswerTable(table, easting, northing, crs_of(ground), answer)
+    return AnswerTable(table, easting[rows], northing[rows], crs_of(ground), answer, level=level)
 
 
 def stations(lines: list[Floats], step_m: float) -> pd.DataFrame:
@@ -202,9 +226,10 @@ def _along(line: Floats, step_m: float) -> Floats:
     return np.column_stack([distance, start[part] + beyond[:, None] * direction, direction])
 
 
-def _columns(answer: Answer) -> dict[str, Any]:
+def _columns(answer: Answer, level: LevelWanted) -> dict[str, Any]:
     normal = dict(zip(("nx", "ny", "nz"), answer.normal.T, strict=True))
-    return {"height_m": answer.height, **normal, "tile": answer.tile, "class": answer.kind}
+    columns = {"height_m": answer.height, **normal, "tile": answer.tile, "class": answer.kind}
+    return columns if level is None else columns | {"level": answer.level}
 
 
 def beyond_survey(result: AnswerTable) -> str:
@@ -213,6 +238,8 @@ def beyond_survey(result: AnswerTable) -> str:
     if not number:
         return ""
     verb, whose = ("lies", "its") if number == 1 else ("lie", "their")
+    if result.level not in (None, 0, "all"):
+        return f"{count(number, 'point')} {verb} on no road of level {result.level}; {whose} height is empty"
     return f"{count(number, 'point')} {verb} beyond the survey; {whose} height, normal and class are empty"
 
 

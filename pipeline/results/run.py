@@ -148,13 +148,16 @@ class RunView:
                 raise ConfigError(f"{path} {why}") from error
             raise ConfigError(f"{path} is damaged: {error}; run `flexroad rerun {self.run.path}`") from error
 
-    def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
+    def height(self, x: ArrayLike, y: ArrayLike, level: int | None = None) -> Floats:
         """Return the height at points, with the steps beside roads.
 
         Parameters
         ----------
         x, y : array_like
             Eastings and northings (m) in the CRS of the tiles, of shapes that broadcast.
+        level : int, optional
+            The level of roads above roads (``segment.levels``): 0 is the ground with its streets, 1 a deck
+            above it, -1 a tube below it; NaN where there is none. By default the highest at each point.
 
         Returns
         -------
@@ -172,7 +175,7 @@ class RunView:
         >>> flexroad.open_run("runs/city").height([500010.0, 500050.0], 5600030.0).round(1)
         array([151.3,   nan])
         """
-        shape, answer = self._at(x, y)
+        shape, answer = self._at(x, y, level)
         return answer.height.reshape(shape)[()]
 
     def normal(self, x: ArrayLike, y: ArrayLike) -> Floats:
@@ -398,9 +401,9 @@ class RunView:
             process(prepared)
         return open_run(str(self.run.path), self.variant, self.allow)
 
-    def _at(self, x: ArrayLike, y: ArrayLike) -> tuple[tuple[int, ...], Answer]:
+    def _at(self, x: ArrayLike, y: ArrayLike, level: int | None = None) -> tuple[tuple[int, ...], Answer]:
         easting, northing = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-        return easting.shape, Ground(self.run, self.variant).at(easting.ravel(), northing.ravel())
+        return easting.shape, Ground(self.run, self.variant).at(easting.ravel(), northing.ravel(), level)
 
 
 def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str | Path] = ()) -> RunView:

@@ -18,8 +18,10 @@ from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store.products import file_entry
 from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.levels.seen import top_mask
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.quality.support import of_faces
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats
 
@@ -139,9 +141,11 @@ def _cog(
 ) -> dict[Kind, bytes]:
     road, surface = evaluate(nodes["segment"]), evaluate(nodes["fit"])
     window = road.grid.window(core)
-    heights = surface.lattice(core.eastings, core.northings)
+    # Rasters have the highest level, as the DSM.
+    lattice = surface.top_lattice if isinstance(surface, LevelledSurface) else surface.lattice
+    heights = lattice(core.eastings, core.northings)
     heights[road.outside[window]] = float("nan")
-    kept = evaluate(nodes["ecsrc"]).mask[window]
+    kept = top_mask(evaluate(nodes["ecsrc"]))[window]
     support = evaluate(nodes["assess"]).support
     # Without a common one, GDAL's environment is set up and cleared for each call.
     with rasterio.Env():

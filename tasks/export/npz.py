@@ -9,21 +9,29 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
+from collections.abc import Iterator
 from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.archive import npz
+from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import Level
 
 VERSION = 2
+WITH_LEVELS = 3
+"""Version of files with several levels."""
 NAME = "_surface.npz"
 STEPS = ("steps", "south_north", "west_east")
+SHAPES = ("areas", "joints", "approach", "passing")
+"""Fields of a `Level` that are written."""
 MEDIA_TYPE = "application/zip"
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
@@ -36,6 +44,10 @@ def encode(surface: NurbsSurface) -> bytes:
     A `SteppedSurface` has four more: ``steps``, ``south_north`` and ``west_east`` (float32), and ``cells``,
     their grid (west, north and cell size in m, columns, rows).
 
+    A `LevelledSurface`, version 3, has ``levels``, the numbers of its other levels, and for each of them, as
+    level 1, ``A_1`` (its coefficients) and the shapes of its `Level` as WKB (m): ``areas_1``, ``joints_1``,
+    ``approach_1`` and ``passing_1``.
+
     ``z(u, v) = datum + A(u, v) / W(u, v)``, with u and v affine over ``bounds`` (west, south, east, north;
     m), from the knot with the number ``degree`` to the one as far from the end. Coefficients are (row, col)
     with row 0 in the south. No pickled objects; float64.
@@ -45,9 +57,18 @@ def encode(surface: NurbsSurface) -> bytes:
         _, *numbers = astuple(surface.cells)
         stepped = {name: getattr(surface, name) for name in STEPS}
         stepped["cells"] = np.asarray(numbers, np.float64)
+    version = VERSION
+    if isinstance(surface, LevelledSurface):
+        version = WITH_LEVELS
+        stepped["levels"] = np.array([own.level.number for own in surface.levels], np.int64)
+        for own in surface.levels:
+            stepped[f"A_{own.level.number}"] = own.A
+            for name in SHAPES:
+                wkb = shapely.to_wkb(getattr(own.level, name))
+                stepped[f"{name}_{own.level.number}"] = np.frombuffer(wkb, np.uint8)
     return npz(
         {
-            "version": np.int64(VERSION),
+            "version": np.int64(version),
             "crs": np.array(surface.crs),
             "bounds": np.asarray(surface.bounds, np.float64),
             "degree": np.asarray(surface.degree, np.int64),
@@ -77,9 +98,10 @@ def decode(source: bytes | Path | str) -> NurbsSurface:
         ) as archive:
             arrays = {key: archive[key] for key in archive.files}
         version = int(arrays["version"])
-        if version > VERSION:
+        if version > WITH_LEVELS:
             message = (
-                f"{name}: surface of version {version}, this program reads up to {VERSION}; update FlexRoad"
+                f"{name}: surface of version {version}, this program reads up to {WITH_LEVELS}; "
+                "update FlexRoad"
             )
             raise TaskError(message, name)
         return _surface(arrays)
@@ -115,6 +137,18 @@ def _surface(arrays: dict[str, np.ndarray]) -> NurbsSurface:
     rows, columns = (max(len(borders), 2) for borders in (south_north, west_east))
     if shapes != (cells.shape, (rows, cells.width), (columns, cells.height)):
         raise ValueError(f"steps {shapes} do not fit cells {cells.shape}")
-    return SteppedSurface(
+    stepped = SteppedSurface(
         **vars(spline), steps=steps, cells=cells, south_north=south_north, west_east=west_east
     )
+    if "levels" not in arrays:
+        return stepped
+    return LevelledSurface(**vars(stepped), levels=tuple(_levels(arrays, expected)))
+
+
+def _levels(arrays: dict[str, np.ndarray], expected: tuple[int, int]) -> Iterator[LevelSpline]:
+    for number in arrays["levels"].tolist():
+        control = arrays[f"A_{number}"]
+        if control.shape != expected:
+            raise ValueError(f"coefficients {control.shape} of level {number} are not {expected}")
+        shapes = {name: shapely.from_wkb(arrays[f"{name}_{number}"].tobytes()) for name in SHAPES}
+        yield LevelSpline(Level(int(number), **shapes), control)

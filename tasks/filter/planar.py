@@ -19,6 +19,7 @@ from pydantic import Field
 
 from flexroad.tasks import options as base
 from flexroad.tasks.compiled import compiled
+from flexroad.tasks.levels.seen import level_clusters
 from flexroad.tasks.roads.distances import columns_of, within
 from flexroad.tasks.roads.dtm_validity import invalid_dtm
 from flexroad.tasks.roads.flat_patches import Patches, flat_patches
@@ -114,8 +115,22 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
         Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if
         no cluster is large enough. ``dtm_invalid`` marks the dropped cells where the DTM is not the road's
         height either (under a car on a bridge it is the valley's), and the verge. ``beside`` are the cells
-        of the verge and those up to `BEYOND_M` from it.
+        of the verge and those up to `BEYOND_M` from it. With levels, it is once for each of them.
     """
+    if road.levels:
+
+        def of_level(seen: TileData, road: RoadMask, other: bool) -> RoadClusters:
+            # A deck that is named needs no area.
+            return _clusters_of(
+                seen, road, options.model_copy(update={"raised_m2_per_m": 0.0} if other else {})
+            )
+
+        return level_clusters(data, road, of_level, options.verge_m, BEYOND_M)
+    return _clusters_of(data, road, options)
+
+
+def _clusters_of(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
+    """Return the clusters of one level."""
     cell, theta = data.grid.cell, options.theta_z_m
     points = road.mask & np.isfinite(data.dsm)
     patches = flat_patches(data.dsm, points, cell, options.roughness_m, options.bend)

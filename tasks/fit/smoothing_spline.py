@@ -12,13 +12,16 @@ neighbours have one surface, although no tile waits for another (docs/mosaic.md)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import shapely
 from pydantic import Field
 
 from flexroad.catalog.borders import Border
+from flexroad.tasks.levels.seen import level_data, level_road
 from flexroad.tasks.meshing.road_outline import crossings
 from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.roads.distances import distances
@@ -27,12 +30,13 @@ from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.frame import Corner, Edge, Frame, rounded
 from flexroad.tasks.spline.irls import HuberObjective, minimise
 from flexroad.tasks.spline.lattice import Lattice, Range
+from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import Space, check_cells, start_heights, surface_on
 from flexroad.tasks.spline.stepped import border_steps, ground_beside, spline_around, with_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.spline.thin_plate import bending_energy
-from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import Bools, Floats, Level, RoadClusters, RoadMask, TileData
 
 VERSION = 8
 
@@ -41,6 +45,10 @@ REACHES_M = (25.0, 50.0, 100.0)
 else all the ground around it."""
 BEYOND_DATA_M = 15.0
 """The distance is at least this (m) larger than that of the corner or edge to the farthest ground."""
+NEAR_M = 25.0
+"""A corner or edge has control points of the levels within this distance (m)."""
+ON_JOINT_M = 0.05
+"""Crossings of the outline of a level within this distance of its joints (m) are those of joints."""
 BORDER_TOLERANCE = 1e-6
 """Tolerance of corners and edges at most: they are small, and in a void the loss changes little."""
 
@@ -106,19 +114,42 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
         If there are fewer cells with a height than control points, or if neither the DTM nor the road has a
         height to start from.
     """
+    seen = level_data(data, clusters)
+    surface = _spline(seen, clusters, options, frame)
+    if clusters.levels:
+        surface = LevelledSurface.of(surface, _level_splines(data, clusters, options, frame), data.core)
+    beside = ground_beside(seen, clusters, frame) if options.steps else None
+    return with_steps(beside, surface, data.core) if beside else surface
+
+
+def _level_splines(
+    data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None
+) -> tuple[LevelSpline, ...]:
+    """Return the splines of the levels other than 0."""
+    splines = []
+    for own in clusters.levels:
+        assert own.level
+        number = own.level.number
+        held = frame.at(number) if frame else None
+        spline = _spline(level_data(data, clusters, number), own, options, held)
+        splines.append(LevelSpline(own.level, spline.A))
+    return tuple(splines)
+
+
+def _spline(data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None) -> NurbsSurface:
+    """Return the spline of one level over the tile's core."""
     fitted, core = with_road_heights(data, clusters), data.core
     rows, cols = data.grid.window(core)
     lattice = _lattice((core.width, core.height), core.cell, options)
     n, m = lattice.intervals
     shape = m + options.degree, n + options.degree
-    check_cells(_ground(fitted, clusters)[rows, cols], (shape[1], shape[0]))
+    if clusters.level is None:
+        check_cells(_ground(fitted, clusters)[rows, cols], (shape[1], shape[0]))
     held = frame.control(shape) if frame else np.full(shape, np.nan)
     problem = _problem(fitted, clusters, lattice, (rows.stop, cols.start), (0, n), (0, m), held, options)
     z = _with_held(held, _minimum_of(problem, options) + problem.datum)
     # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
-    surface = surface_on(problem.space, core, core.exact_bounds, z, np.ones_like(z), datum=0.0)
-    beside = ground_beside(data, clusters, frame) if options.steps else None
-    return with_steps(beside, surface, core) if beside else surface
+    return surface_on(problem.space, core, core.exact_bounds, z, np.ones_like(z), datum=0.0)
 
 
 def _with_held(held: Floats, z: Floats) -> Floats:
@@ -140,6 +171,19 @@ def corner(
     data, road, clusters : TileData, RoadMask, RoadClusters
         The cells of ``border.grid``, their road mask and the filtered road.
     """
+    own = _corner(level_data(data, clusters), road, clusters, border, options)
+    levels = []
+    for level, of_level in _near(clusters, border):
+        part = _corner(level_data(data, clusters, level.number), road, of_level, border, options)
+        if np.isfinite(part.control).all():
+            levels.append((level.number, part))
+    return replace(own, levels=tuple(levels))
+
+
+def _corner(
+    data: TileData, road: RoadMask, clusters: RoadClusters, border: Border, options: Options
+) -> Corner:
+    """Return the corner of one level."""
     data = with_road_heights(data, clusters)
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     k, j = _lines(data, clusters, border, lattice)
@@ -167,32 +211,95 @@ def edge(
     ends : tuple of Corner
         The corners at the western and eastern, or the southern and northern end; their points are held.
     """
-    fitted = with_road_heights(data, clusters)
+    seen, near = level_data(data, clusters), list(_near(clusters, border))
+    heights = [level_data(data, clusters, level.number) for level, _ in near]
+    lattice = _lattice(border.tile, border.grid.cell, options)
+    # Splines of all levels are on one part of the lattice.
+    lines = [_lines(seen, clusters, border, lattice)]
+    lines += [_lines(part, own, border, lattice) for part, (_, own) in zip(heights, near, strict=True)]
+    reach = max(k for k, _ in lines), max(j for _, j in lines)
+    control, spline = _along(seen, clusters, border, reach, ends, options)
+    outside = border.along(road.outside)
+    first, last = (end.outside for end in ends)
+    outside[:, 0], outside[:, -1] = (
+        (first[:, 1], last[:, 0]) if border.kind == "east" else (first[0], last[1])
+    )
+    own = Edge(
+        control,
+        road=border.along(road.mask)[1],
+        kept=border.along(clusters.mask)[1],
+        outside=outside,
+        crossings=crossings(road.areas, border),
+    )
+    splines = []
+    for (level, of_level), part_of in zip(near, heights, strict=True):
+        held = ends[0].at(level.number), ends[1].at(level.number)
+        control, around = _along(part_of, of_level, border, reach, held, options)
+        if np.isfinite(control).all():
+            splines.append(LevelSpline(level, around.A))
+            mine = level_road(road, level.number)
+            part = replace(
+                own,
+                control=control,
+                road=border.along(mine.mask)[1],
+                kept=border.along(mine.mask & of_level.mask)[1],
+                crossings=crossings(mine.areas, border),
+                levels=(),
+            )
+            on_joints = part.crossings[_on_joints(level, part.crossings, border)]
+            own = replace(
+                own,
+                crossings=np.union1d(own.crossings, on_joints),
+                levels=(*own.levels, (level.number, part)),
+            )
+    if splines:
+        spline = LevelledSurface.of(spline, tuple(splines), border.grid)
+    beside = border_steps(seen, road, clusters, border, spline) if options.steps else {}
+    return replace(own, steps=beside.get("steps"), road_m=beside.get("road_m"))
+
+
+def _along(
+    data: TileData,
+    clusters: RoadClusters,
+    border: Border,
+    reach: tuple[int, int],
+    ends: tuple[Corner, Corner],
+    options: Options,
+) -> tuple[Floats, NurbsSurface]:
+    """Return the control points of an edge for one level, and the spline around the edge.
+
+    Parameters
+    ----------
+    reach : tuple of int
+        Number of intervals up to which it is fitted, along easting and northing.
+    """
+    fitted, (k, j) = with_road_heights(data, clusters), reach
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     eastward = border.kind == "east"
     n, m = (lattice.intervals[0], 0) if eastward else (0, lattice.intervals[1])
-    k, j = _lines(fitted, clusters, border, lattice)
     held = np.full((m + 2 * j + p, n + 2 * k + p), np.nan)
     acting = slice(j, j + m + p), slice(k, k + n + p)
     held[acting][:p, :p], held[acting][-p:, -p:] = (end.control for end in ends)
     u, v = (-k, n + k), (-j, m + j)
     around = _control_heights(fitted, clusters, lattice, border.cell, u, v, held, _precise(options))
     z = rounded(around[acting])
-    control = z[:, p:-p] if eastward else z[p:-p]
-    outside = border.along(road.outside)
-    first, last = (end.outside for end in ends)
-    outside[:, 0], outside[:, -1] = (first[:, 1], last[:, 0]) if eastward else (first[0], last[1])
-    spline = spline_around(lattice, border, u, v, around)
-    beside = border_steps(data, road, clusters, border, spline) if options.steps else {}
-    return Edge(
-        control,
-        road=border.along(road.mask)[1],
-        kept=border.along(clusters.mask)[1],
-        outside=outside,
-        crossings=crossings(road.areas, border),
-        steps=beside.get("steps"),
-        road_m=beside.get("road_m"),
-    )
+    return z[:, p:-p] if eastward else z[p:-p], spline_around(lattice, border, u, v, around)
+
+
+def _near(clusters: RoadClusters, border: Border) -> Iterator[tuple[Level, RoadClusters]]:
+    """Yield the levels near a corner or edge, with their clusters."""
+    here = shapely.box(*border.within(NEAR_M))
+    for own in clusters.levels:
+        level = own.level
+        if level and (shapely.intersects(level.areas, here) or shapely.intersects(level.approach, here)):
+            yield level, own
+
+
+def _on_joints(level: Level, positions: Floats, border: Border) -> Bools:
+    """Return which positions on an edge (m from its start) lie on the joints of a level."""
+    (east, north), along = border.start, positions
+    places = (east + along, north + 0 * along) if border.kind == "east" else (east + 0 * along, north + along)
+    return np.asarray(shapely.dwithin(level.joints, shapely.points(*places), ON_JOINT_M))
 
 
 def _lattice(cells: tuple[int, int], cell: float, options: Options) -> Lattice:

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from flexroad.tasks.levels.seen import level_data, with_approaches
 from flexroad.tasks.quality.support import Support, support
 from flexroad.tasks.roads.distances import distances, filled
 from flexroad.tasks.roads.dtm_validity import AGREE_M, rise, without_invalid_dtm
@@ -167,7 +168,7 @@ def compare(
     agree_m: float,
     only_road: bool = False,
 ) -> Compared:
-    """Compare a surface with DSM and DTM cell by cell.
+    """Compare a surface with DSM and DTM cell by cell; with levels, level 0 with what it sees.
 
     Parameters
     ----------
@@ -178,6 +179,7 @@ def compare(
     only_road : bool
         Leave the estimated error NaN beside the road; that takes less time.
     """
+    data, clusters = level_data(data, clusters), with_approaches(clusters)
     window = data.grid.window(data.core)
     fitted = with_road_heights(data, clusters)
     classes = support(data, road, _with_ground(clusters, surface, data), agree_m)[window]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.levels.seen import level_data
 from flexroad.tasks.metrics.statistics import mean
 from flexroad.tasks.quality.estimate import INTERVAL, SQUARE_M, compare, heights_fitted
 from flexroad.tasks.types import Bools, RoadClusters, RoadMask, Surface, TileData
@@ -61,7 +62,8 @@ def holdout(
     """
     if not share or refit is None:
         return Holdout(np.nan, np.nan, np.nan)
-    window, kept = data.grid.window(data.core), clusters.mask & np.isfinite(data.dsm)
+    seen = level_data(data, clusters)
+    window, kept = data.grid.window(data.core), clusters.mask & np.isfinite(seen.dsm)
     squares = withheld_squares(kept[window], data.core, share)
     if not (squares >= 0).any():
         return Holdout(0.0, np.nan, np.nan)
@@ -74,7 +76,7 @@ def holdout(
         # Too few heights are left for a second fit; the tile has its surface all the same.
         return Holdout(0.0, np.nan, np.nan)
     cells = compare(rest, road, clusters, surface, agree_m, only_road=True)
-    off = cells.height - heights_fitted(data, clusters)[window]
+    off = cells.height - heights_fitted(seen, clusters)[window]
     counted = (squares >= 0) & kept[window]
     _, number = np.unique(squares[counted], return_inverse=True)
     count = np.bincount(number)

@@ -6,7 +6,7 @@ Lines have flat ends; where ends of lines meet, a disc closes the wedge between 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -17,7 +17,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.io.vectors import Query, encoding_notes, has_place, read_near
-from flexroad.tasks.roads import widths
+from flexroad.tasks.roads import level_numbers, widths
 from flexroad.tasks.roads.attributes import NO, is_yes
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
@@ -28,6 +28,8 @@ CLASS_TAGS = ("highway", "area:highway")
 HIDDEN_TAGS = ("tunnel", "covered")
 """Tags of roads under something, whose heights are not in the DSM."""
 BRIDGE, AREA = "bridge", "area"
+FARTHEST_M = 75.0
+"""Distance from the grid up to which roads are read if they have levels (m)."""
 SAME_M = 0.01
 """Ends of lines within this distance are the same (m)."""
 
@@ -78,7 +80,16 @@ class Roads:
     """Polygons in the tile's CRS, ``(n,)``."""
     bridge: Bools
     """Which of them are on bridges, ``(n,)``."""
+    level: NDArray[np.int64]
+    """Their levels, ``(n,)``; 0 if these are not read."""
     notes: tuple[str, ...] = ()
+
+
+class LevelColumns(NamedTuple):
+    """Columns that name the level of a road."""
+
+    numbers: tuple[str, ...] = level_numbers.LEVEL_COLUMNS
+    structures: tuple[str, ...] = level_numbers.STRUCTURE_COLUMNS
 
 
 def rasterise_roads(data: TileData, options: Options = DEFAULTS) -> Bools:
@@ -97,7 +108,7 @@ def cells(areas: NDArray[np.object_], grid: Grid) -> Bools:
     return np.asarray(burnt != 0)
 
 
-def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
+def roads(source: Source | None, grid: Grid, options: Options, levels: LevelColumns | None = None) -> Roads:
     """Return the roads on and around a grid, as polygons.
 
     Parameters
@@ -106,6 +117,8 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
         The tile's layer ``roads``.
     grid : Grid
         The area to read; roads that touch it are returned whole.
+    levels : LevelColumns, optional
+        Columns with the level of a road. Roads below level 0 are then kept, whatever `Options.tunnels` says.
 
     Raises
     ------
@@ -117,19 +130,21 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
             "no roads layer in the catalog: give a vector file with --roads to `flexroad catalog` "
             "or `flexroad prepare`"
         )
-    reach = options.max_width_m / 2
+    # Both portals of a tube that reaches the grid are seen.
+    reach = max(options.max_width_m / 2, FARTHEST_M if levels else 0.0)
     west, south, east, north = grid.bounds
     bounds = (west - reach, south - reach, east + reach, north + reach)
-    names = columns(options)
+    names = columns(options) + (level_numbers.columns(*levels) if levels else ())
     layer = options.layer or source.sublayer
     parts, notes = list[Roads](), list[str]()
     for path in source.paths:
         table = read_near(Query(path, layer, options.where, names, source.crs, grid.crs), bounds)
         notes += encoding_notes(table, path)
-        parts.append(_from_table(table, options))
+        parts.append(_from_table(table, options, levels))
     return Roads(
         np.concatenate([part.areas for part in parts]),
         np.concatenate([part.bridge for part in parts]),
+        np.concatenate([part.level for part in parts]),
         (*notes, *(note for part in parts for note in part.notes)),
     )
 
@@ -141,14 +156,18 @@ def columns(options: Options) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name.lower() for name in names))
 
 
-def _from_table(table: Any, options: Options) -> Roads:
+def _from_table(table: Any, options: Options, columns: LevelColumns | None) -> Roads:
     """Return the roads of one table."""
-    table, classes = selected(table, options)
+    numbers, unread = np.zeros(len(table), np.int64), tuple[str, ...]()
+    if columns:
+        numbers, unread = level_numbers.level_numbers(table, *columns)
+    classes, chosen = _selection(table, options, numbers < 0)
+    table, classes, numbers = table[chosen], classes[chosen], numbers[chosen]
     # A collection of multi-part features needs two steps to be split into simple parts.
     members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
     parts, member = shapely.get_parts(members, return_index=True)
     row = row[member]
-    bridge = is_yes(table, BRIDGE)[row]
+    bridge, level = is_yes(table, BRIDGE)[row], numbers[row]
     parts = _closed(parts, is_yes(table, AREA)[row])
     is_line = np.isin(shapely.get_type_id(parts), (1, 2))
     is_area = shapely.get_type_id(parts) == 3
@@ -156,20 +175,26 @@ def _from_table(table: Any, options: Options) -> Roads:
     rows, row_of = np.unique(of_line, return_inverse=True)
     width, notes = widths.widths(table.iloc[rows], classes[rows], options)
     half = width[row_of] / 2
-    joints, joint_bridge = _joints(lines, half, bridge[is_line])
+    joints, joint_bridge, joint_level = _joints(lines, half, bridge[is_line], level[is_line])
     strips = shapely.buffer(lines, half, quad_segs=8, cap_style="flat", join_style="round")
     return Roads(
         np.concatenate([parts[is_area], strips, joints]),
         np.concatenate([bridge[is_area], bridge[is_line], joint_bridge]),
-        notes,
+        np.concatenate([level[is_area], level[is_line], joint_level]),
+        (*unread, *notes),
     )
 
 
 def selected(table: Any, options: Options) -> tuple[Any, NDArray[np.object_]]:
     """Return the rows of a table that are roads, and the class of each, in lower case or empty."""
-    classes = _classes(table, options.class_columns)
-    chosen = _is_road(table, classes, options)
+    classes, chosen = _selection(table, options, np.zeros(len(table), np.bool_))
     return table[chosen], classes[chosen]
+
+
+def _selection(table: Any, options: Options, tubes: Bools) -> tuple[NDArray[np.object_], Bools]:
+    """Return the class of each row of a table, and which rows are roads; tubes are not left out as hidden."""
+    classes = _classes(table, options.class_columns)
+    return classes, _is_road(table, classes, options, tubes)
 
 
 def _classes(table: Any, columns: tuple[str, ...]) -> NDArray[np.object_]:
@@ -182,13 +207,13 @@ def _classes(table: Any, columns: tuple[str, ...]) -> NDArray[np.object_]:
     return classes
 
 
-def _is_road(table: Any, classes: NDArray[np.object_], options: Options) -> Bools:
+def _is_road(table: Any, classes: NDArray[np.object_], options: Options, tubes: Bools) -> Bools:
     road: Bools = ~np.isin(classes, [name.lower() for name in options.left_out])
     if any(tag in table for tag in CLASS_TAGS):
         road &= _classes(table, CLASS_TAGS) != ""
     if not options.tunnels:
         for tag in HIDDEN_TAGS:
-            road &= ~is_yes(table, tag)
+            road &= tubes | ~is_yes(table, tag)
     return road
 
 
@@ -201,21 +226,27 @@ def _closed(parts: NDArray[np.object_], area: Bools) -> NDArray[np.object_]:
     return filled
 
 
-def _joints(lines: NDArray[np.object_], half: Floats, bridge: Bools) -> tuple[NDArray[np.object_], Bools]:
-    """Return discs where ends of lines meet, ``(n,)``, and which discs have only bridges around them.
+def _joints(
+    lines: NDArray[np.object_], half: Floats, bridge: Bools, level: NDArray[np.int64]
+) -> tuple[NDArray[np.object_], Bools, NDArray[np.int64]]:
+    """Return discs where ends of lines meet, ``(n,)``, which have only bridges around them, and their levels.
 
     The radius of a disc is the second largest half width of the lines that end there, so that a wide road
-    that continues as a narrow one does not bulge beyond the narrow one's width.
+    that continues as a narrow one does not bulge beyond the narrow one's width. Where lines of several levels
+    meet there is none: it would be a street below the deck.
     """
     if not len(lines):
-        return np.empty(0, object), np.zeros(0, bool)
+        return np.empty(0, object), np.zeros(0, bool), np.empty(0, np.int64)
     ends = np.concatenate([shapely.get_coordinates(shapely.get_point(lines, i)) for i in (0, -1)])
     radius, decks = np.tile(half, 2), np.tile(bridge, 2)
     _, node = np.unique(np.rint(ends / SAME_M), axis=0, return_inverse=True)
     order = np.lexsort((-radius, node))
     first = np.flatnonzero(np.diff(node[order], prepend=-1))
     many = np.diff(first, append=len(order)) > 1
+    levels = np.tile(level, 2)[order]
+    lowest, highest = (part.reduceat(levels, first) for part in (np.minimum, np.maximum))
+    many &= lowest == highest
     second = order[first[many] + 1]
     deck = np.logical_and.reduceat(decks[order], first)[many]
     discs: NDArray[np.object_] = shapely.buffer(shapely.points(ends[second]), radius[second], quad_segs=8)
-    return discs, deck
+    return discs, deck, lowest[many]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from flexroad.tasks.levels.joints import levels_of
 from flexroad.tasks.meshing.road_outline import encoded
-from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads import level_numbers, rasterise
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean
 from flexroad.tasks.types import RoadMask, TileData
@@ -21,6 +22,8 @@ NEEDS = ("roads",)
 class Options(rasterise.Options):
     """Selection of the road features, widths of the lines, and cleanup of the mask."""
 
+    LATER: ClassVar[tuple[str, ...]] = ("levels", "level_columns", "structure_columns")
+
     method: Literal["vector"] = "vector"
     cleanup: Cleanup = Field(NOTHING, description="cleanup of the mask; none by default")
     outlines: bool = Field(
@@ -28,6 +31,25 @@ class Options(rasterise.Options):
         description="meshes have the outlines of the areas as edges, instead of steps from cell to cell; "
         "without cleanup, and with sample: {method: dynamic, mask: raw}",
     )
+    levels: bool = Field(
+        False,
+        description="roads above and below roads have surfaces of their own; with ecsrc: planar, "
+        "fit: smoothing_spline and load.halo_m of 40 m or more",
+    )
+    level_columns: tuple[str, ...] = Field(
+        level_numbers.LEVEL_COLUMNS,
+        description="columns with the level of a road as a number, besides OSM's tags: 0 on the ground",
+    )
+    structure_columns: tuple[str, ...] = Field(
+        level_numbers.STRUCTURE_COLUMNS,
+        description="columns with a word or code of a bridge or tunnel, for roads without such a number",
+    )
+
+    @model_validator(mode="after")
+    def _levels_have_outlines(self) -> Options:
+        if self.levels and (self.cleanup != NOTHING or not self.outlines):
+            raise ValueError("levels need the outlines of roads; leave out cleanup, and set outlines to true")
+        return self
 
 
 def segment(data: TileData, options: Options) -> RoadMask:
@@ -44,10 +66,13 @@ def segment(data: TileData, options: Options) -> RoadMask:
         note = "segment: no file of the roads layer reaches this tile, so it counts as a tile without roads"
         nowhere = np.zeros(data.grid.shape, np.bool_)
         return RoadMask(data.grid, data.core, nowhere, beyond_extent(data), bridge=nowhere, notes=(note,))
-    roads = rasterise.roads(data.roads, data.grid, options)
-    mask = clean(rasterise.cells(roads.areas, data.grid), data, options.cleanup)
-    notes = roads.notes
-    if data.lacks_road(mask):
+    columns = rasterise.LevelColumns(options.level_columns, options.structure_columns)
+    roads = rasterise.roads(data.roads, data.grid, options, columns if options.levels else None)
+    levels, left_out = levels_of(roads.areas, roads.level, data)
+    areas, bridge = roads.areas[roads.level == 0], roads.bridge[roads.level == 0]
+    mask = clean(rasterise.cells(areas, data.grid), data, options.cleanup)
+    notes = (*roads.notes, *left_out)
+    if data.lacks_road(mask) and not levels:
         files = ", ".join(path.name for path in data.roads.paths)
         notes += (
             f"segment: no road of {files} lies on this tile; if there are roads, check segment.layer, "
@@ -60,7 +85,8 @@ def segment(data: TileData, options: Options) -> RoadMask:
         core=data.core,
         mask=mask,
         outside=beyond_extent(data),
-        bridge=rasterise.cells(roads.areas[roads.bridge], data.grid) & mask,
-        areas=encoded(roads.areas, data.core) if outlines else None,
+        bridge=rasterise.cells(areas[bridge], data.grid) & mask,
+        areas=encoded(areas, data.core) if outlines else None,
         notes=notes,
+        levels=levels,
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import BLEND_M, Floats, Level
+from flexroad.tasks.types import BLEND_M, Bools, Floats, Level
 
 GRADIENT_M = 0.01
 """Distance over which the slope of the weight of a level is taken (m)."""
@@ -68,6 +68,11 @@ class LevelledSurface(SteppedSurface):
         own = {field.name: getattr(self, field.name) for field in fields(NurbsSurface)}
         return NurbsSurface(**own | {"A": control})
 
+    def covers(self, number: int, easting: Floats, northing: Floats) -> Bools:
+        """Return which points lie on the decks or tubes of a level, in their broadcast shape."""
+        (own,) = (own for own in self.levels if own.level.number == number)
+        return own.level.covers(easting, northing)
+
     def top(self, easting: Floats, northing: Floats) -> NDArray[np.int8]:
         """Return the number of the highest level at points, in their broadcast shape."""
         result = np.zeros(np.broadcast_shapes(np.shape(easting), np.shape(northing)), np.int8)
@@ -75,6 +80,15 @@ class LevelledSurface(SteppedSurface):
             if own.level.number > 0:
                 result[own.level.covers(easting, northing)] = own.level.number
         return result
+
+    def top_lattice(self, eastings: Floats, northings: Floats) -> Floats:
+        """Return heights of the highest level (m) at every pair, ``(len(northings), len(eastings))``."""
+        heights, (east, north) = self.lattice(eastings, northings), np.meshgrid(eastings, northings)
+        numbers = self.top(east, north)
+        for number in np.unique(numbers[numbers > 0]).tolist():
+            here = numbers == number
+            heights[here] = self.at(number).height(east[here], north[here])
+        return heights
 
     def smooth(self, easting: Floats, northing: Floats) -> Floats:
         """Return the heights of level 0 without its steps (m) at points, in their broadcast shape."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -158,7 +159,8 @@ def with_steps(beside: Beside, surface: NurbsSurface, core: Grid) -> SteppedSurf
 
     A cell has the height of its DSM if that shows the ground, averaged with the neighbours whose steps are
     alike, so that edges remain. Behind an object it has the height of the wall around, if there is one; else
-    that of its DTM, or, without DTM, a step between those around.
+    that of its DTM, or, without DTM, a step between those around. A surface that can have steps must have
+    none yet.
     """
     spline = surface.lattice(core.eastings, core.northings)
     rise, smoothed = beside.dsm - spline, beside.dtm - spline
@@ -171,13 +173,14 @@ def with_steps(beside: Beside, surface: NurbsSurface, core: Grid) -> SteppedSurf
     steps[shown] = _alike(around[shown[near]], rise[shown])
     filled = between(steps, beside.cells)
     south_north, west_east = (border.astype(np.float32) for border in (beside.south_north, beside.west_east))
-    return SteppedSurface(
-        **vars(surface),
-        steps=filled.astype(np.float32),
-        cells=core,
-        south_north=south_north,
-        west_east=west_east,
-    )
+    parts: dict[str, Any] = {
+        "steps": filled.astype(np.float32),
+        "south_north": south_north,
+        "west_east": west_east,
+    }
+    if isinstance(surface, SteppedSurface):
+        return replace(surface, **parts, cells=core)
+    return SteppedSurface(**vars(surface), **parts, cells=core)
 
 
 def _alike(around: Floats, own: Floats) -> Floats:

@@ -24,7 +24,7 @@ from flexroad.pipeline.graph.sources import SourceFiles
 from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_head, stage_version
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.options import stage_module
-from flexroad.tasks.segment import mask
+from flexroad.tasks.segment import mask, vector
 from tests.make_rasters import write
 
 PAPER = {
@@ -348,3 +348,11 @@ def test_later_option_enters_fingerprints_only_if_it_is_changed():
 
     assert stage_head("segment", Extended()) == stage_head("segment", mask.Options())
     assert stage_head("segment", Extended(extra=4))[-1] == {"method": "mask", "extra": 4}
+
+
+def test_options_of_levels_do_not_change_fingerprints():
+    """The hash is that of the version before these options."""
+    head = json.dumps(stage_head("segment", vector.Options()), sort_keys=True)
+    assert "levels" not in head
+    assert hashlib.sha256(head.encode()).hexdigest()[:16] == "a1bf6d02b744da5e"
+    assert stage_head("segment", vector.Options(levels=True))[-1]["levels"] is True

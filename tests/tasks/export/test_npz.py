@@ -117,7 +117,7 @@ def encoded_with(of=None, **fields) -> bytes:
         (encoded_with(stepped(), west_east=np.zeros((2, 9))), r"steps .*\(2, 9\)\) do not fit cells"),
         (encoded_with(stepped(), cells=None), "not a FlexRoad surface.*cells"),
         (encoded_with(A=np.zeros((9, 11))), r"\(9, 11\).*\(9, 12\)"),
-        (encoded_with(version=np.int64(npz.VERSION + 1)), "version 3, this program reads up to 2"),
+        (encoded_with(version=np.int64(npz.WITH_LEVELS + 1)), "version 4, this program reads up to 3"),
     ],
 )
 def test_decode_invalid_data_raises_one_line(data, message):

@@ -1,0 +1,1 @@
+"""Roads above and below other roads: where levels begin, and what each of them sees."""

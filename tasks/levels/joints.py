@@ -1,0 +1,255 @@
+"""Where the roads of other levels begin: the joints of decks and tubes with the ground, and their approaches.
+
+Everything is decided from the vectors and from cells near each joint alone, so that a tile, its neighbour
+and their edge find the same levels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import scipy
+import shapely
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Grid
+from flexroad.catalog.text import count
+from flexroad.tasks.io.vectors import has_place
+from flexroad.tasks.roads.flat_patches import flat_patches
+from flexroad.tasks.roads.rasterise import cells
+from flexroad.tasks.types import BLEND_M, Bools, Floats, Level, TileData
+
+APPROACH_M = 16.0
+"""Length of an approach (m): a control point of 3.6 m distance acts up to 10.8 m away."""
+REACH_M = APPROACH_M + BLEND_M + 1.0
+"""A level that is farther from a tile (m) has no effect on its surface."""
+GAP_M = 1.5
+"""Widest gap between a deck and its approach (m)."""
+SHORTEST_M = 1.5
+"""Shortest joint (m)."""
+STEP_M = 0.25
+"""Distance of the places along an outline at which a joint is looked for (m)."""
+BELOW_M = 2.5
+"""A street of level 0 that reaches so far below a deck (m) passes below it."""
+PASSES_M2 = 1.0
+"""Least area of its part so far within the outline (m2)."""
+INNER = 0.4
+"""Share of the width of a narrow deck that replaces this distance."""
+TURN_DEG = 45.0
+"""At sharper turns an outline has a corner (degrees)."""
+WIDEST_M = 40.0
+"""A straight side up to this length (m), of which half is a joint, is one completely: with its pavements."""
+RISE_M = 0.75
+"""Visible roads on both sides of a joint differ at most by this in height (m)."""
+BESIDE_M = 6.0
+"""Distance from the middle of a joint up to which they are compared (m)."""
+AROUND_M = 16.0
+"""Distance from there up to which cells decide whether a road is visible (m)."""
+ROUGHNESS_M, BEND = 0.15, 0.1
+"""A visible road has flat patches of at most these residuals (m) and differences of slope."""
+APART_M = 0.02
+"""Roads of level 0 are kept apart by this from decks (m)."""
+TUBE_M = 50.0
+"""Longest tube (m): heights of a longer one would be guessed."""
+
+Lines = NDArray[np.object_]
+
+
+def levels_of(
+    areas: NDArray[np.object_], numbers: NDArray[np.int64], data: TileData
+) -> tuple[tuple[Level, ...], tuple[str, ...]]:
+    """Return the levels that the surface of a tile depends on, by ascending number, and notes.
+
+    Parameters
+    ----------
+    areas, numbers : ndarray, (n,)
+        The roads on and around the tile's grid as polygons, and their levels.
+    data : TileData
+        Its heights refuse joints between roads that differ in height.
+    """
+    if not numbers.any():
+        return (), ()
+    known = ~shapely.is_empty(areas) & has_place(areas)
+    areas, numbers = areas[known], numbers[known]
+    invalid = ~shapely.is_valid(areas)
+    areas[invalid] = shapely.make_valid(areas[invalid])
+    streets = areas[numbers == 0]
+    window, near = _grown(data.grid, 0.0), _grown(data.core, REACH_M)
+    levels, notes = [], list[str]()
+    for number in np.unique(numbers[numbers != 0]).tolist():
+        level = _level(number, polygons(shapely.union_all(areas[numbers == number])), streets, data)
+        if number < 0:
+            level, left_out = _with_portals(level, data.core)
+            notes += left_out
+        if not shapely.intersects(shapely.union(level.areas, level.approach), near):
+            continue
+        if number > 0:
+            notes += _without_joint(level, data.core)
+        cut = polygons(shapely.intersection(level.areas, window))
+        levels.append(replace(level, areas=cut))
+    return tuple(levels), tuple(notes)
+
+
+def polygons(geometry: shapely.Geometry) -> shapely.MultiPolygon:
+    """Return the polygons of a geometry of any kind."""
+    parts = shapely.get_parts(shapely.get_parts(geometry))
+    return shapely.MultiPolygon(list(parts[(shapely.get_type_id(parts) == 3) & ~shapely.is_empty(parts)]))
+
+
+def _grown(grid: Grid, distance_m: float) -> shapely.Polygon:
+    west, south, east, north = grid.bounds
+    return shapely.box(west - distance_m, south - distance_m, east + distance_m, north + distance_m)
+
+
+def _level(number: int, areas: shapely.MultiPolygon, streets: Lines, data: TileData) -> Level:
+    """Return a level with all its areas."""
+    near = streets[shapely.dwithin(streets, areas, APPROACH_M + GAP_M)]
+    passes = _passes(near, areas)
+    touching = near[~passes & shapely.dwithin(near, areas, GAP_M)]
+    lines = list(_ends(areas, touching))
+    if number > 0:
+        window = _grown(data.grid, 0.0)
+        lines = [line for line in lines if shapely.intersects(line, window)]
+        # The road beyond a portal lies below the ground around it, and crowns hang over it.
+        deck = cells(np.array([areas]), data.grid)
+        street = cells(touching, data.grid) & ~deck
+        lines = [line for line in lines if _is_level(line, deck, street, data)]
+    joints = shapely.MultiLineString(lines)
+    ground = shapely.difference(shapely.union_all(near[~passes]), shapely.buffer(areas, APART_M))
+    road = _touching(polygons(shapely.intersection(ground, shapely.buffer(joints, APPROACH_M))), joints)
+    gaps = shapely.difference(shapely.buffer(joints, GAP_M, cap_style="flat"), areas)
+    approach = polygons(shapely.union(road, gaps))
+    beside = shapely.intersection(shapely.union_all(near[passes]), shapely.buffer(joints, REACH_M))
+    return Level(number, areas, joints, approach, polygons(shapely.difference(beside, approach)))
+
+
+def _passes(streets: Lines, areas: shapely.MultiPolygon) -> Bools:
+    """Return which streets pass below a deck, or above a tube: they have a part well within its outline."""
+    parts = shapely.get_parts(areas)
+    width = 2 * shapely.area(parts) / shapely.length(parts)
+    inner = shapely.union_all(shapely.buffer(parts, -np.minimum(BELOW_M, INNER * width)))
+    return np.asarray(shapely.area(shapely.intersection(streets, inner)) >= PASSES_M2)
+
+
+def _ends(areas: shapely.MultiPolygon, streets: Lines) -> Iterator[shapely.LineString]:
+    """Yield the lines on outlines in front of which a street ends; one that goes on below is left out."""
+    for polygon in shapely.get_parts(shapely.orient_polygons(areas)):
+        for ring in (polygon.exterior, *polygon.interiors):
+            for side in _sides(ring):
+                yield from _fronts(side, streets)
+
+
+def _sides(ring: shapely.LinearRing) -> list[shapely.LineString]:
+    """Return an outline in pieces between its corners, the first of which begins at one."""
+    corners = shapely.get_coordinates(shapely.remove_repeated_points(ring, 1e-6))[:-1]
+    steps = np.diff(corners, axis=0, append=corners[:1])
+    angle = np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))
+    sharp = np.abs((angle - np.roll(angle, 1) + 180) % 360 - 180) > TURN_DEG
+    first = int(sharp.argmax())
+    corners, sharp = np.roll(corners, -first, axis=0), np.roll(sharp, -first)
+    starts = np.flatnonzero(sharp).tolist() if sharp.any() else [0]
+    closed = np.concatenate([corners, corners[:1]])
+    return [shapely.LineString(closed[i : j + 1]) for i, j in pairwise([*starts, len(corners)])]
+
+
+def _fronts(side: shapely.LineString, streets: Lines) -> Iterator[shapely.LineString]:
+    """Yield the joints on one side of an outline that has the area on its left."""
+    places = shapely.get_coordinates(shapely.segmentize(side, STEP_M))
+    steps = np.diff(places, axis=0)
+    outward = np.column_stack([steps[:, 1], -steps[:, 0]]) / np.hypot(*steps.T)[:, None]
+    middle = (places[:-1] + places[1:]) / 2
+    joined = np.zeros(len(middle), np.bool_)
+    for street in streets[shapely.dwithin(streets, side, GAP_M)]:
+        ahead = [_is_at(street, middle + distance * outward) for distance in (0.1, GAP_M / 2, GAP_M)]
+        inside = [_is_at(street, middle - share * BELOW_M * outward) for share in np.linspace(0.2, 1, 5)]
+        joined |= np.any(ahead, axis=0) & ~np.all(inside, axis=0)
+    if joined.mean() >= 0.5 and side.length <= WIDEST_M:
+        joined[:] = True
+    changes = np.flatnonzero(np.diff(joined, prepend=False, append=False))
+    for i, j in zip(changes[::2], changes[1::2], strict=True):
+        line = shapely.LineString(places[i : j + 1])
+        if line.length >= SHORTEST_M:
+            yield line
+
+
+def _is_at(area: shapely.Geometry, places: Floats) -> Bools:
+    return np.asarray(shapely.intersects_xy(area, *places.T))
+
+
+def _is_level(joint: shapely.LineString, deck: Bools, street: Bools, data: TileData) -> bool:
+    """Return whether deck and street have one height at a joint, or one of them is not visible there."""
+    x, y = shapely.get_coordinates(joint.interpolate(0.5, normalized=True))[0]
+    grid = data.grid
+    row, col = (int(value) for value in grid.cells(np.array(x), np.array(y)))
+    n = int(AROUND_M / grid.cell) + 1
+    rows, cols = slice(max(row - n, 0), row + n + 1), slice(max(col - n, 0), col + n + 1)
+    away = np.hypot(grid.eastings[cols] - x, grid.northings[rows][:, None] - y)
+    dsm, dtm = data.dsm[rows, cols], data.dtm[rows, cols]
+    near = away <= BESIDE_M
+    above = _median(np.where(_flat(dsm, deck[rows, cols], grid.cell), dsm, np.nan)[near])
+    road = street[rows, cols]
+    ground = np.where(_flat(dsm, road, grid.cell), dsm, np.where(road, dtm, np.nan))
+    return not abs(above - _median(ground[near])) > RISE_M
+
+
+def _flat(heights: Floats, road: Bools, cell: float) -> Bools:
+    """Return the cells of flat patches of a road."""
+    patches = flat_patches(heights, road & np.isfinite(heights), cell, ROUGHNESS_M, BEND)
+    side = 2 * patches.reach + 1
+    return np.asarray(scipy.ndimage.binary_dilation(patches.centres, np.ones((side, side))))
+
+
+def _median(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else float("nan")
+
+
+def _touching(areas: shapely.MultiPolygon, joints: shapely.MultiLineString) -> shapely.MultiPolygon:
+    """Return the polygons that begin at a joint."""
+    parts = shapely.get_parts(areas)
+    shared = shapely.length(shapely.intersection(shapely.buffer(parts, GAP_M), joints))
+    return shapely.MultiPolygon(list(parts[shared >= SHORTEST_M]))
+
+
+def _with_portals(level: Level, core: Grid) -> tuple[Level, list[str]]:
+    """Return the tubes that begin and end within reach, and a note about the others on the tile."""
+    parts, kept, notes = shapely.get_parts(level.areas), list[shapely.Polygon](), list[str]()
+    joints = shapely.get_parts(level.joints)
+    for part in parts:
+        portals = shapely.dwithin(joints, part, APART_M)
+        corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(part))
+        length = float(np.hypot(*np.diff(corners, axis=0).T).max())
+        if np.count_nonzero(portals) >= 2 and length <= TUBE_M:
+            kept.append(part)
+        elif shapely.intersects(part, _grown(core, 0.0)):
+            why = f"is longer than {TUBE_M:g} m" if length > TUBE_M else "has no two portals"
+            notes.append(
+                f"segment: the tube at {_place(part)} (level {level.number}) {why}, so it is left out"
+            )
+    areas = shapely.MultiPolygon(kept)
+    joints = joints[shapely.dwithin(joints, areas, APART_M)] if kept else joints[:0]
+    lines = shapely.MultiLineString(list(joints))
+    approach = _touching(level.approach, lines)
+    return replace(level, areas=areas, joints=lines, approach=approach), notes
+
+
+def _without_joint(level: Level, core: Grid) -> list[str]:
+    """Return a note about the decks on a tile at which no road of level 0 begins."""
+    parts = shapely.get_parts(level.areas)
+    alone = parts[
+        ~shapely.dwithin(parts, level.joints, APART_M) & shapely.intersects(parts, _grown(core, 0.0))
+    ]
+    if not len(alone):
+        return []
+    return [
+        f"segment: {count(len(alone), 'deck')} of level {level.number} without a joint to a road of level 0, "
+        f"such as at {_place(alone[0])}; check the level of the roads at its ends, and gaps above {GAP_M:g} m"
+    ]
+
+
+def _place(area: shapely.Polygon) -> str:
+    x, y = shapely.get_coordinates(shapely.centroid(area))[0]
+    return f"E {x:.0f} N {y:.0f}"

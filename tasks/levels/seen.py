@@ -1,0 +1,208 @@
+"""What each level sees of the heights of a tile: levels differ in nothing else.
+
+Level 0 does not see the decks, and not the approaches, where it takes the surface of their level. A deck sees
+itself and its approaches, and beyond 12 m of them everything that level 0 sees. A tube sees its approaches;
+its own heights are inferred from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import scipy
+import shapely
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.meshing.road_outline import encoded
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.distances import within
+from flexroad.tasks.roads.dtm_validity import AGREE_M
+from flexroad.tasks.types import Bools, Floats, Level, RoadClusters, RoadMask, TileData
+
+HIDDEN_M = 1.0
+"""Distance beside a deck up to which the DSM shows neither level (m)."""
+APART_M = 12.0
+"""Heights of level 0 so near to a deck (m) are left out: a control point acts up to 10.8 m away."""
+MOST = 400
+"""Most cells of the approaches from which the heights of a tube are inferred."""
+LEAST = 20
+"""Fewest cells with which they are inferred."""
+SMOOTHING = 10.0
+"""Smoothing of the thin plate through them."""
+
+Filter = Callable[[TileData, RoadMask, bool], RoadClusters]
+"""The filter of one level, with whether it is another level than 0."""
+
+
+def level_data(data: TileData, clusters: RoadClusters, number: int = 0) -> TileData:
+    """Return the heights that a level sees; the data itself if the tile has no levels.
+
+    Parameters
+    ----------
+    clusters : RoadClusters
+        Those of level 0, with the other levels.
+    """
+    if not clusters.levels:
+        return data
+    levels = tuple(own.level for own in clusters.levels if own.level)
+    result = _masked(data, levels, number)
+    own = next((own for own in clusters.levels if own.level and own.level.number == number), None)
+    if own is None or own.level is None or number > 0:
+        return result
+    return replace(result, dsm=_inferred(result, own.level, own.mask & np.isfinite(result.dsm)))
+
+
+def level_clusters(
+    data: TileData, road: RoadMask, ecsrc: Filter, verge_m: float, beyond_m: float
+) -> RoadClusters:
+    """Return the filtered roads of level 0, with those of the other levels.
+
+    Parameters
+    ----------
+    ecsrc : callable
+        The filter of one level.
+    verge_m, beyond_m : float
+        Width of the verge, and distance beyond it, up to which the ground beside roads has steps (m).
+    """
+    grid, levels = data.grid, road.levels
+    approach = _any(grid, [_taken(level, grid) for level in levels])
+    below = _hidden(levels, grid) & road.mask
+    own = ecsrc(_masked(data, levels, 0), road, False)
+    # A road below a deck goes on between its visible parts, as stiff as a road. The DTM is interpolated
+    # there, from walls, too; ground so near that it acts on the road has its height by steps alone.
+    verge = within(below, grid.cell, APART_M) & ~road.mask
+    labels = np.where(below, max(1, int(own.labels.max())), own.labels)
+    own = _without(replace(own, labels=labels.astype(np.int32)), approach)
+    own = replace(own, dtm_invalid=verge | (own.dtm_invalid if own.dtm_invalid is not None else False))
+    if own.beside is not None:
+        reach = verge_m + beyond_m
+        near = _any(grid, [_cells(shapely.buffer(deck.areas, reach), grid) for deck in _decks(levels)])
+        near |= within(verge, grid.cell, beyond_m)
+        own = replace(own, beside=own.beside | near & ~road.mask)
+    return replace(own, levels=tuple(_of_level(data, road, level, ecsrc) for level in levels))
+
+
+def with_approaches(clusters: RoadClusters) -> RoadClusters:
+    """Return the clusters of level 0 with those of its approaches, which other levels have."""
+    for own in clusters.levels:
+        assert own.level
+        taken = _taken(own.level, clusters.grid)
+        labels = np.where(taken, own.labels, clusters.labels)
+        invalid = clusters.dtm_invalid
+        if invalid is not None and own.dtm_invalid is not None:
+            invalid = np.where(taken, own.dtm_invalid, invalid)
+        clusters = replace(clusters, labels=labels, dtm_invalid=invalid)
+    return clusters
+
+
+def top_mask(clusters: RoadClusters) -> Bools:
+    """Return the filtered road cells of the highest level, ``(H, W)``."""
+    result = with_approaches(clusters).mask
+    for own in clusters.levels:
+        if own.level and own.level.number > 0:
+            result = np.where(_cells(own.level.areas, clusters.grid), own.mask, result)
+    return result
+
+
+def level_road(road: RoadMask, number: int) -> RoadMask:
+    """Return the road mask of a level: for others than 0 its areas, beyond which it has no mesh."""
+    if number == 0:
+        return road
+    level = next(level for level in road.levels if level.number == number)
+    mask = _cells(level.areas, road.grid)
+    return RoadMask(road.grid, road.core, mask, ~mask, areas=encoded(np.array([level.areas]), road.core))
+
+
+def _of_level(data: TileData, road: RoadMask, level: Level, ecsrc: Filter) -> RoadClusters:
+    grid = data.grid
+    own, approach = _cells(level.areas, grid), _taken(level, grid)
+    apart = _cells(shapely.buffer(level.areas, APART_M), grid) & ~own & ~approach
+    mask = road.mask & ~apart | own | approach
+    clusters = ecsrc(_masked(data, road.levels, level.number), replace(road, mask=mask, levels=()), True)
+    if level.number < 0:
+        labels = np.where(own, max(1, int(clusters.labels.max())), clusters.labels)
+        clusters = replace(clusters, labels=labels.astype(np.int32))
+    return replace(_without(clusters, apart), beside=None, level=level)
+
+
+def _masked(data: TileData, levels: tuple[Level, ...], number: int) -> TileData:
+    """Return the data without the heights that a level does not see."""
+    grid = data.grid
+    hidden = _hidden(levels, grid)
+    if number == 0:
+        dsm = np.where(hidden, np.nan, data.dsm)
+        # A terrain model that has the deck tells nothing of the ground below it.
+        dtm = np.where(hidden & (np.abs(data.dtm - data.dsm) <= AGREE_M), np.nan, data.dtm)
+        return _replaced(data, dsm, dtm)
+    level = next(level for level in levels if level.number == number)
+    own = _cells(level.areas, grid)
+    gone = hidden & ~own
+    for other in levels:
+        if other.number > max(number, 0):
+            over = _cells(shapely.buffer(other.areas, HIDDEN_M), grid)
+            gone |= over & ~(_cells(other.approach, grid) & own)
+    if number < 0:
+        gone |= own
+    known = np.nan if data.decks is None or number < 0 else data.decks
+    return _replaced(data, np.where(gone, np.nan, data.dsm), np.where(own, known, data.dtm))
+
+
+def _replaced(data: TileData, dsm: Floats, dtm: Floats) -> TileData:
+    height = data.road_height
+    if height is not None:
+        height = np.where(np.isnan(dsm) & ~np.isnan(data.dsm), np.nan, height)
+    return replace(data, dsm=dsm, dtm=dtm, road_height=height)
+
+
+def _inferred(data: TileData, level: Level, visible: Bools) -> Floats:
+    """Return the DSM with the heights of a tube: a thin plate through its approaches."""
+    grid, own = data.grid, _cells(level.areas, data.grid)
+    # Other roads near the portals may lie above the tube.
+    row, col = np.nonzero(visible & _taken(level, grid))
+    if len(row) < LEAST or not own.any():
+        return data.dsm
+    chosen = np.linspace(0, len(row) - 1, min(len(row), MOST)).astype(int)
+    row, col = row[chosen], col[chosen]
+    x, y = grid.eastings - grid.west, grid.northings - grid.south
+    plate = scipy.interpolate.RBFInterpolator(
+        np.column_stack([x[col], y[row]]), data.dsm[row, col], kernel="thin_plate_spline", smoothing=SMOOTHING
+    )
+    result, (i, j) = data.dsm.copy(), np.nonzero(own)
+    result[i, j] = plate(np.column_stack([x[j], y[i]]))
+    return result
+
+
+def _without(clusters: RoadClusters, cells: Bools) -> RoadClusters:
+    """Return clusters in which some cells have neither a road nor a valid DTM."""
+    invalid = cells if clusters.dtm_invalid is None else clusters.dtm_invalid | cells
+    labels = np.where(cells, 0, clusters.labels).astype(np.int32)
+    return replace(clusters, labels=labels, dtm_invalid=invalid)
+
+
+def _hidden(levels: tuple[Level, ...], grid: Grid) -> Bools:
+    """Return the cells on decks and beside them, but for approaches."""
+    approach = _any(grid, [_taken(level, grid) for level in levels])
+    decks = [_cells(shapely.buffer(deck.areas, HIDDEN_M), grid) for deck in _decks(levels)]
+    return _any(grid, decks) & ~approach
+
+
+def _decks(levels: tuple[Level, ...]) -> list[Level]:
+    return [level for level in levels if level.number > 0]
+
+
+def _taken(level: Level, grid: Grid) -> Bools:
+    """Return the cells of the approach, on which level 0 has the surface of another level."""
+    result = _cells(level.approach, grid)
+    row, col = np.nonzero(result)
+    result[row, col] = level.weight(grid.eastings[col], grid.northings[row]) >= 1
+    return result
+
+
+def _any(grid: Grid, masks: list[Bools]) -> Bools:
+    return np.asarray(np.logical_or.reduce([np.zeros(grid.shape, np.bool_), *masks]))
+
+
+def _cells(area: shapely.Geometry, grid: Grid) -> Bools:
+    return rasterise.cells(np.array([area]), grid)

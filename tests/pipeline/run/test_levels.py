@@ -1,0 +1,152 @@
+"""A run over roads above roads: two heights at one place, and neighbours that meet on every level."""
+
+import io
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+
+import flexroad
+from flexroad.catalog import Catalog
+from flexroad.catalog.grid import Grid
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.export import npz
+from flexroad.tasks.spline.levelled import LevelledSurface
+from flexroad.tasks.synthetic.crossings import Crossings
+from tests.command_line import call
+
+SEED, SIZE_M = 0, 60
+WITH_LEVELS = ["segment.levels=true"]
+
+
+def made(folder, executor, settings=WITH_LEVELS):
+    catalog = Catalog.read(write_scenes(folder / "survey", 4, seed=SEED, size_m=SIZE_M, decks=True))
+    run = Run.create(folder / "run", load_config("production_vector", settings), catalog)
+    summary = run_tiles(run, executor)
+    assert (summary.done, summary.failed) == (4, 0)
+    return run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("levels"), SerialExecutor())
+
+
+@pytest.fixture(scope="module")
+def cells(run):
+    """Cell centres of the tiles, and the true heights of level 0 and 1 there."""
+    west, south, east, north = flexroad.open_run(run.path).tiles.total_bounds
+    grid = Grid("EPSG:25832", west, north, 1.0, round(east - west), round(north - south))
+    at = np.meshgrid(grid.eastings, grid.northings)
+    world = Crossings(SEED)
+    return (*at, world.height(0, *at), world.height(1, *at))
+
+
+def test_heights_are_those_of_the_level_that_is_asked_for(run, cells):
+    x, y, low, deck = cells
+    view = flexroad.open_run(run.path)
+    ground, above, top = view.height(x, y, 0), view.height(x, y, level=1), view.height(x, y)
+    on = np.isfinite(above)
+    assert on.sum() > 100
+    assert np.isnan(deck[on]).sum() == 0
+    assert np.abs(above - deck)[on].mean() < 0.02
+    assert np.abs(ground - low)[on].mean() < 0.5
+    np.testing.assert_array_equal(top, np.where(on, above, ground))
+    assert np.isnan(view.height(x, y, 2)).all()
+    assert view.height(x, y, -1).shape == x.shape
+
+
+def test_normals_are_those_of_the_highest_level(run, cells):
+    x, y, *_ = cells
+    view = flexroad.open_run(run.path)
+    on = np.isfinite(view.height(x, y, 1))
+    assert view.normal(x, y)[on, 2].min() > 0.98
+
+
+def test_query_has_a_row_for_each_level(run, cells, tmp_path):
+    x, y, low, deck = cells
+    on = np.isfinite(flexroad.open_run(run.path).height(x, y, 1))
+    high, beside = on & (deck - low > 4), (x[~on][:1], y[~on][:1])
+    places = np.column_stack([x[high][:3], y[high][:3]])
+    table = pd.DataFrame(np.vstack([places, np.column_stack(beside)]), columns=["easting", "northing"])
+    table.to_csv(tmp_path / "points.csv", index=False)
+
+    def query(*words):
+        said = call("query", run.path, "--points", tmp_path / "points.csv", *words).expected(0)
+        return pd.read_csv(io.StringIO(said.out)), said.err
+
+    every, _ = query("--level", "all")
+    assert every.level.tolist() == [0, 1, 0, 1, 0, 1, 0]
+    assert (every["class"][every.level == 1] == "road").all()
+    below, above = (query("--level", number)[0] for number in (0, 1))
+    assert (above.height_m[:3] - below.height_m[:3] > 3).all()
+    assert np.isnan(above.height_m[3])
+    top, notes = query()
+    assert "level" not in top
+    np.testing.assert_array_equal(top.height_m[:3], above.height_m[:3])
+    assert "lies on no road of level 1" in query("--level", 1)[1]
+    assert not notes
+    wrong = call("query", run.path, "--points", tmp_path / "points.csv", "--level", "top").expected(2)
+    assert "--level top: give a whole number, such as 0, or all" in wrong.err
+
+
+def test_profile_below_a_deck_has_the_grade_of_its_level(run, cells):
+    x, y, *_ = cells
+    on = np.isfinite(flexroad.open_run(run.path).height(x, y, 1))
+    east, north = x[on].mean(), y[on].mean()
+    line = f"{east - 4} {north}, {east + 4} {north}"
+    said = call("query", run.path, "--line", line, "--level", "all").expected(0)
+    table = pd.read_csv(io.StringIO(said.out))
+    assert set(table.level) == {0, 1}
+    assert table[table.level == 1].grade_percent.abs().max() < 15
+
+
+def test_rasters_and_archives_have_the_levels(run):
+    view = flexroad.open_run(run.path)
+    levelled = 0
+    for tile in run.catalog.tiles:
+        folder = run.folder(tile.id).path
+        surface = npz.decode(folder / f"{tile.id}_flexroad_surface.npz")
+        at = np.meshgrid(tile.grid.eastings, tile.grid.northings)
+        with rasterio.open(folder / f"{tile.id}_flexroad_height.tif") as raster:
+            np.testing.assert_allclose(raster.read(1), view.height(*at), atol=1e-4)
+        if isinstance(surface, LevelledSurface):
+            levelled += 1
+            np.testing.assert_array_equal(surface.height(*at), view.height(*at, 0))
+    assert levelled > 0
+
+
+def test_quality_of_tiles_with_decks_has_no_flags(run):
+    metrics = flexroad.open_run(run.path).metrics
+    assert not metrics["flags"].str.contains("patch|off-dtm|error-estimate|loose").any()
+    assert metrics.l2_road_m.max() < 0.03
+
+
+@pytest.mark.slow
+def test_dask_gives_the_same_products(run, tmp_path):
+    other = made(tmp_path, DaskExecutor(2))
+    for tile in run.catalog.tiles:
+        for path in run.folder(tile.id).path.glob(f"{tile.id}_*"):
+            assert (other.folder(tile.id).path / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["ecsrc=paper"], "segment.levels needs ecsrc: planar, not paper"),
+        (["fit=nurbs"], "segment.levels needs fit: smoothing_spline, not nurbs"),
+        (["load.halo_m=20"], "segment.levels needs load.halo_m of 40 or more, not 20"),
+        (["sample.method=uniform"], "segment.levels needs sample.method dynamic or adaptive, not uniform"),
+        (["sample.mask=filtered"], "segment.levels needs sample.mask raw, not filtered"),
+        (["segment.outlines=false"], "levels need the outlines of roads"),
+    ],
+)
+def test_stages_that_have_no_levels_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config("production_vector", [*WITH_LEVELS, *settings])

@@ -1,0 +1,141 @@
+"""Joints of decks and tubes, found from vectors and from heights near them."""
+
+import numpy as np
+import pytest
+import shapely
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.levels.joints import GAP_M, levels_of
+from flexroad.tasks.types import TileData
+
+GRID = Grid("EPSG:25832", 500_000.0, 5_600_100.0, 1.0, 100, 100)
+FLAT = np.zeros(GRID.shape)
+
+
+def strip(start, end, width=8.0, y=50.0):
+    """Return a road along x, by metres from the south-west corner of the grid."""
+    return shapely.box(
+        GRID.west + start, GRID.south + y - width / 2, GRID.west + end, GRID.south + y + width / 2
+    )
+
+
+def across(x, width=7.0, low=0.0, high=100.0):
+    return shapely.box(
+        GRID.west + x - width / 2, GRID.south + low, GRID.west + x + width / 2, GRID.south + high
+    )
+
+
+def found(*roads, dsm=FLAT, dtm=FLAT, grid=GRID):
+    """Return the levels of roads, given as (level, area), and notes."""
+    numbers, areas = zip(*roads, strict=True)
+    data = TileData("a", grid, grid, dsm, dtm)
+    return levels_of(np.array(areas, object), np.array(numbers), data)
+
+
+def joint_ends(level):
+    """Return west and east ends of joints along x, m from the west."""
+    lines = shapely.get_parts(level.joints)
+    return sorted(round(float(line.bounds[0] - GRID.west), 2) for line in lines)
+
+
+DECK = 1, strip(40, 60)
+WAYS = (0, strip(0, 40)), (0, strip(60, 100))
+BELOW = 0, across(50)
+
+
+def test_deck_between_two_roads_has_joints_at_both_ends():
+    (level,), notes = found(DECK, *WAYS, BELOW)
+    assert (level.number, joint_ends(level), notes) == (1, [40, 60], ())
+    assert level.joints.length == pytest.approx(16)
+    assert level.approach.bounds == pytest.approx(
+        (GRID.west + 24, GRID.south + 46, GRID.west + 76, GRID.south + 54)
+    )
+    assert level.approach.area == pytest.approx(2 * 16 * 8, rel=0.02)
+
+
+@pytest.mark.parametrize("gap", [-1.0, 0.0, 0.5, 1.0, 1.4])
+def test_joint_bridges_gaps_and_overlaps(gap):
+    (level,), _ = found(DECK, (0, strip(0, 40 - gap)), WAYS[1], BELOW)
+    assert joint_ends(level) == [40, 60]
+    # The gap belongs to the approach.
+    assert level.weight(GRID.west + 39.5, GRID.south + 50) == 1
+
+
+def test_gap_that_is_too_wide_gives_no_joint():
+    (level,), notes = found(DECK, (0, strip(0, 40 - GAP_M - 0.3)), BELOW)
+    assert level.joints.is_empty
+    assert "1 deck of level 1 without a joint" in notes[0]
+    assert "gaps above 1.5 m" in notes[0]
+
+
+def test_street_below_is_no_joint_also_beside_an_abutment():
+    # The street passes below the end of the deck.
+    (level,), _ = found(DECK, *WAYS, (0, across(44.5)))
+    assert joint_ends(level) == [40, 60]
+    assert level.joints.length == pytest.approx(16)
+
+
+def test_pavements_of_a_wider_deck_belong_to_the_joint():
+    (level,), _ = found((1, strip(40, 60, width=11)), *WAYS)
+    assert level.joints.length == pytest.approx(22)
+
+
+def test_ramp_at_the_side_of_a_long_deck_has_a_joint_of_its_width():
+    (level,), _ = found((1, strip(0, 100)), (0, across(50, low=54)))
+    assert level.joints.length == pytest.approx(7, abs=0.6)
+
+
+@pytest.mark.parametrize(("rise", "joints"), [(0.5, [40, 60]), (4.0, [60])])
+def test_joint_is_refused_where_visible_roads_differ_in_height(rise, joints):
+    x = np.arange(100) + 0.5
+    dsm = np.where((x < 40), 8.0 - rise, 8.0) + FLAT
+    (level,), _ = found(DECK, *WAYS, BELOW, dsm=dsm, dtm=FLAT)
+    assert joint_ends(level) == joints
+
+
+def test_hidden_roads_do_not_refuse_a_joint():
+    crowns = np.where(np.arange(100) < 40, 5 + np.random.default_rng(1).random(GRID.shape), 8.0)
+    (level,), _ = found(DECK, *WAYS, BELOW, dsm=crowns, dtm=np.full(GRID.shape, np.nan))
+    assert joint_ends(level) == [40, 60]
+
+
+def test_road_on_level_ground_alone_has_no_levels():
+    assert found(*WAYS, BELOW) == ((), ())
+
+
+def test_deck_far_from_the_tile_is_left_out():
+    far = Grid(GRID.crs, GRID.west - 90, GRID.north, 1.0, 100, 100)
+    levels, notes = found(DECK, *WAYS, grid=far)
+    assert (levels, notes) == ((), ())
+
+
+@pytest.mark.parametrize(("high", "kept"), [(70, True), (95, False)])
+def test_long_tube_is_left_out_with_a_note(high, kept):
+    levels, notes = found((-1, strip(40, high)), (0, strip(0, 40)), (0, strip(high, 100)))
+    assert bool(levels) == kept
+    if not kept:
+        assert notes == (
+            "segment: the tube at E 500068 N 5600050 (level -1) is longer than 50 m, so it is left out",
+        )
+
+
+def test_tube_without_second_portal_is_left_out_with_a_note():
+    levels, notes = found((-1, strip(40, 70)), (0, strip(0, 40)))
+    assert not levels
+    assert "has no two portals" in notes[0]
+
+
+def test_decks_of_two_levels_have_their_own_joints():
+    levels, _ = found(
+        DECK, *WAYS, (2, across(50, low=30, high=70)), (0, across(50, high=30)), (0, across(50, low=70))
+    )
+    assert [level.number for level in levels] == [1, 2]
+    assert [len(level.joints.geoms) for level in levels] == [2, 2]
+
+
+def test_damaged_polygons_are_mended():
+    bow = shapely.Polygon(
+        [(GRID.west + x, GRID.south + y) for x, y in ((40, 46), (60, 54), (60, 46), (40, 54))]
+    )
+    levels, _ = found((1, bow), *WAYS, (0, shapely.Polygon()))
+    assert levels[0].areas.is_valid
