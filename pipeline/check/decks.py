@@ -65,10 +65,12 @@ def deck_findings(tiles: Sequence[Tile], config: Config, catalog: Path, every: b
 
 def _told(found: Sequence[tuple[Tile, Deck]]) -> str:
     sure = sum(deck.is_sure for _, deck in found)
-    places = f"{count(sure, 'place')} look{'s' * (sure == 1)} like decks"
-    if sure < len(found):
-        places += f", {len(found) - sure} like decks or roofs"
-    return f"{places}; no road there has a level"
+    kinds = [(sure, "like decks"), (len(found) - sure, "like decks or roofs")]
+    first, *others = [(number, kind) for number, kind in kinds if number]
+    places = f"{count(first[0], 'place')} look{'s' * (first[0] == 1)} {first[1]}"
+    return "".join(
+        [places, *(f", {number} {kind}" for number, kind in others), "; no road there has a level"]
+    )
 
 
 def _written(path: Path, found: Sequence[tuple[Tile, Deck]]) -> Iterator[Finding]:

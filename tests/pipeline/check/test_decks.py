@@ -116,6 +116,23 @@ def test_tiles_in_local_coordinates_have_no_map(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("ends", "words"),
+    [
+        ([2], "1 place looks like decks"),
+        ([2, 3], "2 places look like decks"),
+        ([2, 3, 1], "2 places look like decks, 1 like decks or roofs"),
+        ([0], "1 place looks like decks or roofs"),
+        ([1, 0], "2 places look like decks or roofs"),
+    ],
+)
+def test_places_that_may_be_roofs_are_counted_apart(tmp_path, ends, words):
+    tile = Tile("a", Grid("EPSG:25832", 0, 60, 1.0, 60, 60), (), "", datetime.now(UTC))
+    found = [(tile, Deck(shapely.box(0, 0, 9, 9), 6.0, number)) for number in ends]
+    (line,) = decks._written(tmp_path / "decks.geojson", found)
+    assert line.text.startswith(f"{words}; no road there has a level: check {tmp_path}")
+
+
 def test_large_catalog_is_mapped_if_asked_for(unnamed, told, monkeypatch):
     monkeypatch.setattr(decks, "MOST_TILES", 3)
     path = unnamed.with_name("decks.geojson")
