@@ -245,7 +245,7 @@ def test_duplicate_ids_raise_error(tmp_path):
 
 def test_parquet_rows_equal_those_of_stac_geoparquet(tmp_path):
     """stac-geoparquet's own conversion is many times slower; it is the oracle here."""
-    from stac_geoparquet.arrow import parse_stac_items_to_arrow, stac_table_to_items
+    from stac_geoparquet.arrow import parse_stac_items_to_arrow, stac_table_to_items, to_parquet
 
     from flexroad.catalog.entries import TileReader
     from flexroad.catalog.index import _full_item, item
@@ -256,7 +256,10 @@ def test_parquet_rows_equal_those_of_stac_geoparquet(tmp_path):
     Catalog(tiles).write(tmp_path / "c.parquet")
     table = pq.read_table(tmp_path / "c.parquet")
     items = [_full_item(), *(item(tile) for tile in tiles)]
-    assert table.equals(parse_stac_items_to_arrow(items).read_all().slice(1).combine_chunks())
+    oracle = parse_stac_items_to_arrow(items).read_all().slice(1).combine_chunks()
+    assert table.equals(oracle)
+    to_parquet(oracle, tmp_path / "oracle.parquet", write_page_checksum=True)
+    assert (tmp_path / "c.parquet").read_bytes() == (tmp_path / "oracle.parquet").read_bytes()
     allowed = AllowedFolders.of(tmp_path)
     expected = TileReader(str(tmp_path), allowed, "row", "c.parquet").tiles(stac_table_to_items(table))
     assert Catalog.read(tmp_path / "c.parquet").tiles == expected
