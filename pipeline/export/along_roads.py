@@ -48,7 +48,7 @@ from flexroad.tasks.roads.local_frame import LocalFrame
 from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.roads.routes import Route
 
-VERSION = 4
+VERSION = 5
 """Of the roads themselves: their division, lines and grids."""
 INTERNAL = {"bounds", "lanes_assumed"}
 """Entries of a road's row that the report does not show."""

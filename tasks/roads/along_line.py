@@ -32,7 +32,7 @@ class HeightGrid:
     v: Floats
     """Distances from the line, ``(m,)``, m; ascending by equal steps, positive to the left."""
     heights: Floats
-    """``(n, m)``, m; NaN beyond the surface."""
+    """``(n, m)``, m; NaN beyond the surface, and beyond a gap in it: no row has NaN between heights."""
 
 
 def height_grid(
@@ -56,7 +56,15 @@ def height_grid(
     step = v_increment_m
     right, left = line.reach(float(line.width.max()) / 2 + margin_m)
     v = np.arange(-round(right // step), round(left // step) + 1, dtype=np.float64) * step
-    return HeightGrid(line, v, height(*line.beside(v)))
+    return HeightGrid(line, v, _without_gaps(v, height(*line.beside(v))))
+
+
+def _without_gaps(v: Floats, heights: Floats) -> Floats:
+    """Return the heights that reach from the line without a gap: readers of OpenCRG refuse gaps in a row."""
+    middle, known = int(np.argmin(np.abs(v))), np.isfinite(heights)
+    right = np.logical_and.accumulate(known[:, middle::-1], axis=1)[:, ::-1]
+    left = np.logical_and.accumulate(known[:, middle:], axis=1)
+    return np.where(np.hstack([right, left[:, 1:]]), heights, np.nan)
 
 
 def grid_error(grid: HeightGrid, height: HeightAt) -> tuple[float, float]:

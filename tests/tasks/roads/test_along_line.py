@@ -39,6 +39,16 @@ def test_height_grid_narrow_bend_has_no_margin_on_its_inside():
     assert (along[0] * across[1] - along[1] * across[0] > 0).all()
 
 
+def test_height_grid_beyond_a_gap_is_nan():
+    """Readers of OpenCRG refuse a cross-section with a gap."""
+    holed = lambda x, y: np.where((x == 12) & ((np.abs(y - 1.5) < 0.1) | (y < -3.8)), np.nan, x)  # noqa: E731
+    grid = height_grid(road(np.array([[0.0, 0.0], [40.0, 0.0]])), holed)
+    known = np.isfinite(grid.heights)
+    assert (grid.v[known[12]].min(), grid.v[known[12]].max()) == (-3.75, 1.25)
+    assert known[12].sum() == 21
+    assert known[np.arange(41) != 12].all()
+
+
 def test_grid_error_is_that_of_the_middle_of_cells():
     line = road(np.array([[0.0, 0.0], [40.0, 0.0]]))
     bowl = lambda x, y: 0.5 * (0.2 * x**2 + 0.4 * y**2)  # noqa: E731
