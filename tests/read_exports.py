@@ -1,12 +1,14 @@
 """Vertices of exported files, read literally by the formats' specifications."""
 
 import gzip
+import io
 import json
 from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
 from PIL import Image
+from pmtiles.reader import MmapSource, Reader, all_tiles
 from pyproj import Transformer
 
 from flexroad.pipeline.export.source import select
@@ -121,6 +123,24 @@ def heightfields(folder, names="*"):
         points.append(np.column_stack([x.ravel(), y.ravel(), heights.ravel()]))
         precision = max(precision, place["precision_m"])
     return np.concatenate(points), precision
+
+
+def pmtiles_pixels(path):
+    """x, y (m, Web Mercator) and height of the pixels that have one, of each map tile of the finest level."""
+    with path.open("rb") as stream:
+        archive = MmapSource(stream)
+        none, finest = Reader(archive).metadata()["no_height_m"], Reader(archive).header()["max_zoom"]
+        half = np.pi * 6378137
+        side = 2 * half / 2**finest
+        for (zoom, column, row), data in all_tiles(archive):
+            if zoom < finest:
+                continue
+            red, green, blue = np.moveaxis(np.asarray(Image.open(io.BytesIO(data)), float), -1, 0)
+            height = red * 256 + green + blue / 256 - 32768
+            parts = (np.arange(len(height)) + 0.5) / len(height)
+            x, y = np.meshgrid((column + parts) * side - half, half - (row + parts) * side)
+            known = height != none
+            yield x[known], y[known], height[known]
 
 
 def vertices(out, crs="EPSG:25832"):

@@ -1,7 +1,6 @@
 """Barbican, London, in all formats of exports: read back, the heights are those of the fitted surfaces."""
 
 import csv
-import io
 import json
 import shutil
 import zipfile
@@ -15,10 +14,10 @@ import rasterio
 import rhino3dm
 import shapely
 from PIL import Image
-from pmtiles.reader import MmapSource, Reader, all_tiles
 from pyproj import Transformer
 from rio_cogeo import cog_validate
 
+from flexroad import open_run
 from flexroad.catalog import Catalog
 from flexroad.catalog.ellipsoidal import Datum
 from flexroad.catalog.sources.rasters import index
@@ -30,27 +29,22 @@ from flexroad.pipeline.export.source import Options, select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.spline.stepped import without_steps
-from tests.read_exports import OFFSET_M, heightfields, off_surface, spline_heights, true_heights, vertices
+from tests.read_exports import (
+    OFFSET_M,
+    heightfields,
+    off_surface,
+    pmtiles_pixels,
+    spline_heights,
+    true_heights,
+    vertices,
+)
 from tests.read_opendrive import quality_issues
+from tests.real.streets import STREETS
 from tests.validators.gltf import gltf_issues
 from tests.validators.opencascade import read_step
+from tests.validators.opendrive import by_carla, by_sumo, in_crs, printed_mm
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
-
-STREETS = {
-    "Aldersgate Street": [
-        (532096, 181949),
-        (532103, 181881),
-        (532110, 181813),
-        (532119, 181745),
-        (532131, 181677),
-        (532135, 181625),
-    ],
-    "London Wall": [(532405, 181569), (532453, 181574), (532509, 181576), (532566, 181574), (532640, 181572)],
-    "Moor Lane": [(532583, 181796), (532566, 181733), (532552, 181688), (532538, 181637), (532526, 181591)],
-    "Wood Street": [(532308, 181370), (532328, 181438), (532351, 181506), (532368, 181540)],
-}
-"""Drawn by hand on the land cover; no data set of centre lines comes with the rasters."""
 
 
 @pytest.fixture(scope="module")
@@ -164,6 +158,20 @@ def test_opendrive_has_no_issue(exported, tmp_path):
     assert quality_issues(file) == []
 
 
+@pytest.mark.parametrize("program", ["carla", "sumo"])
+def test_opendrive_in_other_programs_is_within_the_error_of_the_report(barbican, exported, tmp_path, program):
+    (file,) = (exported / "xodr").glob("*.xodr")
+    roads, places = by_carla(file) if program == "carla" else by_sumo(file, tmp_path)
+    x, y = in_crs(file, "EPSG:27700", *places[:, :2].T)
+    error = 1000 * np.abs(places[:, 2] - open_run(barbican).height(x, y))
+    columns = ("elevation_max_mm", "carriageway_steps_max_mm")
+    printed = printed_mm(file.with_name("roads.csv"), *columns)
+    assert set(roads) == set(printed)
+    known = np.isfinite(error)
+    assert known.mean() > 0.99
+    assert (error <= [printed[road] for road in roads])[known].all()
+
+
 def test_mosaic_has_the_heights_of_the_surfaces(barbican, exported):
     for file in (exported / "mosaic").glob("*.tif"):
         assert cog_validate(file)[0]
@@ -191,22 +199,9 @@ def test_road_lines_lie_on_the_surface(barbican, exported):
 def test_map_tiles_have_the_heights_of_the_surfaces(barbican, exported):
     (file,) = (exported / "pmtiles").glob("*.pmtiles")
     plan = Transformer.from_crs("EPSG:3857", "EPSG:27700", always_xy=True)
-    with file.open("rb") as stream:
-        archive = MmapSource(stream)
-        none, finest = Reader(archive).metadata()["no_height_m"], Reader(archive).header()["max_zoom"]
-        side_m = 2 * np.pi * 6378137 / 2**finest
-        compared = 0
-        for (zoom, column, row), data in all_tiles(archive):
-            if zoom < finest:
-                continue
-            red, green, blue = np.moveaxis(np.asarray(Image.open(io.BytesIO(data)), float), -1, 0)
-            height = red * 256 + green + blue / 256 - 32768
-            parts = (np.arange(len(height)) + 0.5) / len(height)
-            x, y = np.meshgrid((column + parts) * side_m, (row + parts) * side_m)
-            half = side_m * 2**finest / 2
-            places = np.column_stack(plan.transform((x - half).ravel(), (half - y).ravel()))
-            known = height.ravel() != none
-            error = height.ravel()[known] - true_heights(barbican, places[known])
-            assert np.nanmax(np.abs(error)) <= FORMATS["pmtiles"].precision_m
-            compared += known.sum()
+    compared = 0
+    for x, y, height in pmtiles_pixels(file):
+        error = height - true_heights(barbican, np.column_stack(plan.transform(x, y)))
+        assert np.nanmax(np.abs(error)) <= FORMATS["pmtiles"].precision_m
+        compared += len(height)
     assert compared > 500 * 600

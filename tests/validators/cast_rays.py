@@ -1,6 +1,6 @@
-"""Print the heights at which rays from above hit height fields in MuJoCo, with the settings of their JSON.
+"""Print the heights at which rays from above hit height fields or OBJ meshes in MuJoCo, by their JSON.
 
-The points are read from the standard input: eastings and northings (m), as JSON.
+Usage: cast_rays.py FOLDER < JSON with eastings and northings of the rays (m)
 """
 
 import json
@@ -14,10 +14,17 @@ fields = [(file, json.loads(file.read_text())) for file in sorted(Path(sys.argv[
 origin = np.array(fields[0][1]["origin"])
 spec = mujoco.MjSpec()
 for number, (file, place) in enumerate(fields):
-    settings = place["mujoco"]
-    spec.add_hfield(name=str(number), file=str(file.with_suffix(".bin").absolute()), size=settings["size"])
-    position = np.add(settings["pos"], np.subtract(place["origin"], origin))
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=str(number), pos=position)
+    name, position = str(number), np.subtract(place["origin"], origin)
+    if settings := place.get("mujoco"):
+        spec.add_hfield(name=name, file=str(file.with_suffix(".bin").absolute()), size=settings["size"])
+        kind = {"type": mujoco.mjtGeom.mjGEOM_HFIELD, "hfieldname": name}
+        position = position + settings["pos"]
+    else:
+        # A surface without thickness has no volume.
+        shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        spec.add_mesh(name=name, file=str(file.with_suffix(".obj").absolute()), inertia=shell)
+        kind = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name}
+    spec.worldbody.add_geom(**kind, pos=position)
 model = spec.compile()
 data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)

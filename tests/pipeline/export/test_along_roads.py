@@ -13,6 +13,7 @@ import pytest
 import shapely
 from pyproj import CRS
 
+import flexroad
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.export import ground, pieces
 from flexroad.pipeline.export.driver import BEGUN, export
@@ -21,6 +22,7 @@ from flexroad.tasks.spline.stepped import without_steps
 from tests import validators
 from tests.make_city import TILE_M, bend, make_city, south_west, write_lines
 from tests.read_opendrive import quality_issues
+from tests.validators.opendrive import by_carla, by_sumo, in_crs, printed_mm
 
 FORMATS = ["crg", "xodr", "lines"]
 ACROSS = bend((10, 20), (190, 80), sag=8)
@@ -181,6 +183,31 @@ def test_xodr_passes_the_quality_checker_and_netconvert(exported, tmp_path):
     assert done.returncode == 0, done.stderr
     # The lanes of two-way roads are edges in either direction.
     assert net.read_text().count("<edge ") >= 2
+
+
+@pytest.mark.parametrize("program", ["carla", "sumo"])
+def test_xodr_in_other_programs_has_the_heights_of_the_surface_within_the_error_of_the_report(
+    city, exported, tmp_path, program
+):
+    """They read no superelevation, so that the error of each road is that by elevation alone."""
+    (file,) = (exported / "xodr").glob("*.xodr")
+    roads, places = by_carla(file, 0.5) if program == "carla" else by_sumo(file, tmp_path)
+    x, y = in_crs(file, "EPSG:25832", *places[:, :2].T)
+    smooth = np.abs(places[:, 2] - surface_heights(city, x, y))
+    known = np.isfinite(smooth)
+    assert known.mean() > 0.95
+    query = np.abs(places[:, 2] - flexroad.open_run(city).height(x, y))
+    # Where the surface of the tile ends, a place may have no height in one of both.
+    known &= np.isfinite(query)
+    assert known.sum() > 100
+    alone = printed_mm(file.with_name("roads.csv"), "elevation_max_mm")
+    steps = printed_mm(file.with_name("roads.csv"), "carriageway_steps_max_mm")
+    assert set(roads) == set(alone)
+    for road in alone:
+        here = known & (roads == road)
+        # Coordinates in CARLA have single precision.
+        assert 1000 * smooth[here].max() <= alone[road] + 0.1
+        assert 1000 * query[here].max() <= alone[road] + steps[road] + 0.1
 
 
 def test_xodr_refers_to_opencrg_only_if_it_is_written_too(city, streets, exported, tmp_path):
