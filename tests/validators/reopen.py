@@ -453,8 +453,8 @@ def _line(name: str, survey: Survey, found: Found) -> str:
         found.file,
         found.against,
         f"{known.sum():,}",
-        f"{found.difference_mm[known].max():.3g}",
-        f"{found.printed_mm[known].max():.3g}",
+        f"{found.difference_mm[known].max():,.4g}",
+        f"{found.printed_mm[known].max():,.4g}",
         "ok" if found.holds else "**more than printed**",
     ]
     return f"| {' | '.join(cells)} |"
