@@ -20,6 +20,7 @@ import numpy as np
 import startinpy
 from numpy.typing import NDArray
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.meshing.parts import middles
 from flexroad.tasks.types import Bools, Floats
 
@@ -120,10 +121,25 @@ def _has_edges(faces: Faces, segments: Edges, count: int) -> NDArray[np.bool_]:
 
 def _beside(points: Floats, faces: Faces, segments: Edges) -> NDArray[np.bool_]:
     """Return the faces whose rectangle meets that of a segment, ``(F,)``: among them all that it crosses."""
-    low, high = (bound(points[faces, :2], axis=1) for bound in (np.min, np.max))
-    result = np.zeros(len(faces), np.bool_)
-    for ends in points[segments, :2]:
-        result |= ((low <= ends.max(axis=0)) & (high >= ends.min(axis=0))).all(axis=1)
+    corners, ends = points[faces, :2], points[segments, :2]
+    return _meeting(corners.min(axis=1), corners.max(axis=1), ends.min(axis=1), ends.max(axis=1))
+
+
+@compiled()
+def _meeting(low: Floats, high: Floats, segment_low: Floats, segment_high: Floats) -> Bools:
+    """Return which rectangles, by two corners each, ``(F, 2)``, meet one of the others, ``(m, 2)``."""
+    result = np.zeros(len(low), np.bool_)
+    for f in range(len(low)):
+        west, south, east, north = low[f, 0], low[f, 1], high[f, 0], high[f, 1]
+        for s in range(len(segment_low)):
+            if (
+                west <= segment_high[s, 0]
+                and east >= segment_low[s, 0]
+                and south <= segment_high[s, 1]
+                and north >= segment_low[s, 1]
+            ):
+                result[f] = True
+                break
     return result
 
 
