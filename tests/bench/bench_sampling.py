@@ -3,7 +3,7 @@
 Usage: ``PYTHONPATH=. python tests/bench/bench_sampling.py CATALOG...``; each catalog gives a table, the mean
 over its tiles. Surfaces, masks and frames are those of production. Distances are those of
 `tasks.metrics.mesh_distance`, with the 99th percentile on roads and that of terrain from the surface without
-the steps that a mesh without breaklines leaves out. docs/method.md has the results.
+the steps that a mesh without breaklines leaves out. docs/archive/sampling.md has the results.
 """
 
 import os
