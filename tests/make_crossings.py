@@ -134,7 +134,11 @@ class Survey:
             number = {"deck": 1, "tube": -1}.get(name, 0)
             # Without levels there is one surface.
             own = result.surface.at(number) if number and result.road.levels else result.surface
-            off = own.height(x, y) - self.world.height(number, x, y)
+            height = own.height(x, y)
+            if name == "approach" and result.road.levels:
+                # Of a deck that is drawn too long, the end is an approach.
+                height = result.surface.top_lattice(core.eastings, core.northings)
+            off = height - self.world.height(number, x, y)
             errors[name] = float(np.abs(off[cells]).mean())
         return errors
 

@@ -124,6 +124,10 @@ def _of_level(data: TileData, road: RoadMask, level: Level, ecsrc: Filter) -> Ro
     if level.number < 0:
         labels = np.where(own, max(1, int(clusters.labels.max())), clusters.labels)
         clusters = replace(clusters, labels=labels.astype(np.int32))
+    if data.decks is not None and level.number > 0 and clusters.dtm_invalid is not None:
+        # The layer of decks has their height, also where it departs from the slope of the approaches.
+        valid = own & np.isfinite(data.decks)
+        clusters = replace(clusters, dtm_invalid=clusters.dtm_invalid & ~valid)
     return replace(_without(clusters, apart), beside=None, level=level)
 
 

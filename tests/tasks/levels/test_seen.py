@@ -25,13 +25,13 @@ def check_errors(survey, core, beside_m=BESIDE_M):
     assert before["under"] > 3
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, pytest.param(3, marks=pytest.mark.slow)])
 def test_levels_have_their_true_heights(tmp_path, seed):
     core = block(80)
     check_errors(Survey.of(tmp_path, seed, core, tubes=0), core)
 
 
-@pytest.mark.parametrize("seed", [1, 5])
+@pytest.mark.parametrize("seed", [5, pytest.param(1, marks=pytest.mark.slow)])
 def test_tube_has_its_true_height(tmp_path, seed):
     core = block(80)
     survey = Survey.of(tmp_path, seed, core, tubes=1)
