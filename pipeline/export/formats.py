@@ -34,12 +34,16 @@ from flexroad.tasks.export import cityjson, landxml, obj, opencrg, opendrive, rh
 from flexroad.tasks.export import road_lines as line_file
 from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.roads.extent import covered
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 
 MATERIALS = "materials.mtl"
 """Name of the file of materials that all OBJ files share."""
 BEYOND = "a part of the surface is beyond the survey (beyond_survey_m2)"
+OF_LEVEL_0 = (
+    "the surface is that of level 0, which within 20 m of the joints of decks and tubes is not the road's"
+)
 CUT = "surface cut to the rectangle that the survey covers"
 NO_PHOTO = "no orthophoto, in plain colours"
 
@@ -137,6 +141,7 @@ def _smooth_row(tile: FinishedTile, bounds: Bounds, beyond_m2: float) -> Row:
     """Return the largest step that a surface leaves out, and a note if it ends with the survey or goes on."""
     parts = [CUT] if bounds != tile.tile.grid.bounds else []
     parts += [BEYOND] if beyond_m2 else []
+    parts += [OF_LEVEL_0] if isinstance(tile.surface, LevelledSurface) else []
     return {"steps_max_m": _steps_m(tile)} | ({"note": "; ".join(parts)} if parts else {})
 
 

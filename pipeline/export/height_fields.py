@@ -21,6 +21,7 @@ from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import heightfield
 from flexroad.tasks.export.heightfield import HeightField
+from flexroad.tasks.spline.levelled import top_of
 
 VERSION = heightfield.VERSION
 SAME_M = 1e-3
@@ -145,4 +146,4 @@ def _field(tile: FinishedTile, scene: Scene) -> HeightField:
     # Neighbours take the same positions for nodes on their edge.
     bounds = tile.tile.grid.exact_bounds
     size = heightfield.size_at_spacing(bounds, SPACING_M, scene.nodes)
-    return heightfield.sampled(tile.surface, bounds, size, scene.limits, tile.road)
+    return heightfield.sampled(top_of(tile.surface), bounds, size, scene.limits, tile.road)

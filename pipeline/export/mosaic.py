@@ -31,6 +31,9 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.export import cog
+from flexroad.tasks.levels.seen import top_mask
+from flexroad.tasks.quality.support import top_support
+from flexroad.tasks.spline.levelled import LevelledSurface, top_of
 from flexroad.tasks.types import Floats
 
 rasterio = lazy("rasterio")
@@ -189,8 +192,10 @@ def _draft(folder: Path, layer: _Layer, grid: Grid, source: Source) -> Any:
 
 def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile) -> None:
     """Write the cells of a tile into the drafts."""
-    surface, road, core = tile.surface, tile.road, tile.tile.grid
-    kept, support = tile.clusters.mask, tile.quality.support
+    surface, road, core = top_of(tile.surface), tile.road, tile.tile.grid
+    kept, support = top_mask(tile.clusters), tile.quality.support
+    if isinstance(tile.surface, LevelledSurface):
+        support = top_support(tile.quality, tile.surface.top(*np.meshgrid(core.eastings, core.northings)))
     for part, column, line in _parts(grid, core.bounds):
         eastings, northings = part.eastings, part.northings
         outside = road.outside[_cells(road.grid, eastings, northings)]

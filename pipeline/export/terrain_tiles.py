@@ -27,6 +27,7 @@ from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.export import terrarium
 from flexroad.tasks.export.terrarium import SIZE
+from flexroad.tasks.spline.levelled import top_of
 from flexroad.tasks.types import Floats
 
 pmtiles = lazy("pmtiles")
@@ -110,7 +111,7 @@ def load_writer() -> Any:
 
 def _add(canvas: _Canvas, zoom: int, tile: FinishedTile) -> float:
     """Sample the pixels of a tile; return its lowest height (m), infinite without any."""
-    surface, road, grid = tile.surface, tile.road, tile.tile.grid
+    surface, road, grid = top_of(tile.surface), tile.road, tile.tile.grid
     placed, lowest = bounds_in(terrarium.CRS, grid.crs, grid.bounds), np.inf
     west, south, east, north = grid.bounds
     to_run = transformer(terrarium.CRS, grid.crs)

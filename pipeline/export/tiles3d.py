@@ -36,6 +36,7 @@ from flexroad.tasks.export import glb, tiles3d
 from flexroad.tasks.meshing import aerial, relief
 from flexroad.tasks.meshing.aerial import Aerial
 from flexroad.tasks.meshing.normals import mesh_normals
+from flexroad.tasks.meshing.parts import highest_first
 from flexroad.tasks.meshing.relief import Relief
 
 RECORDS, MESHES = ".coarse", "coarse"
@@ -293,7 +294,7 @@ def leaf_piece(leaf: TileItem, place: Place, drape: bool) -> Piece:
     uri = f"tiles/{name}{glb.NAME}"
     placed = tiles3d.placed(uri, grid.bounds, heights, place.origin, place.conversion)
     pixel_m = TILE.pixel_m
-    ground = relief.of_mesh(points, mesh.faces, TILE.spacing_m)
+    ground = relief.of_mesh(points, highest_first(mesh), TILE.spacing_m)
     colours = glb.ROAD_SRGB, glb.TERRAIN_SRGB
     image = aerial.of_classes(points, mesh.faces, mesh.road, colours, ground.bounds, pixel_m)
     if texture:

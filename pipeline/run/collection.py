@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import XMLGenerator, escape
@@ -35,12 +35,15 @@ from flexroad.pipeline.worker.exports import (
     COLLECTION,
     EXTENSIONS,
     GEOJSON,
+    HEIGHT,
     JSON,
     KINDS,
     Kind,
     file_name,
     item_assets,
+    of_level,
 )
+from flexroad.tasks.export import cog
 from flexroad.tasks.export.cog import BLOCK, NAME_STYLE, Band, encode_style
 
 MAP = "tiles.geojson"
@@ -155,7 +158,28 @@ def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
             xml = XMLGenerator(file, "utf-8", short_empty_elements=True)
             _write_vrt(xml, grid, kind, kind.band, done, run.config.export.variants[0])
         written.append(kind)
-    return written
+    return written + _write_level_0(run, grid, done)
+
+
+def _write_level_0(run: Run, grid: Grid | None, done: Sequence[Tile]) -> list[Kind]:
+    """Write the heights of the ground below decks as one, if there are any, and return their kind."""
+    kind, variant = of_level(HEIGHT, 0), run.config.export.variants[0]
+    path, names = run.path / vrt_name(kind), dict[str, str]()
+    if grid and getattr(run.config.chains[variant]["segment"], "levels", False):
+        with open_database(run) as database:
+            for tile in done:
+                record, name = database.lookup(tile.id), file_name(tile.id, variant, kind)
+                if record and name in record.sizes:
+                    names[tile.id] = name
+    if grid is None or not names:
+        remove(path)
+        _write_style(run, kind, None)
+        return []
+    with atomic_file(path, run.config.cluster.flush) as local, local.open("w", encoding="utf-8") as file:
+        xml = XMLGenerator(file, "utf-8", short_empty_elements=True)
+        _write_vrt(xml, grid, kind, cog.HEIGHT, done, variant, names)
+    _write_style(run, kind, cog.HEIGHT)
+    return [kind]
 
 
 def _write_style(run: Run, kind: Kind, band: Band | None) -> None:
@@ -175,15 +199,32 @@ def vrt_name(kind: Kind) -> str:
 
 
 def _write_vrt(
-    xml: XMLGenerator, grid: Grid, kind: Kind, band: Band, tiles: Sequence[Tile], variant: str
+    xml: XMLGenerator,
+    grid: Grid,
+    kind: Kind,
+    band: Band,
+    tiles: Sequence[Tile],
+    variant: str,
+    own: Mapping[str, str] | None = None,
 ) -> None:
+    """Write a mosaic of one kind of raster.
+
+    Parameters
+    ----------
+    own : Mapping of str to str, optional
+        Names of the files of tiles that have one of this kind, by tile; the others have the heights of their
+        highest level. By default all tiles have one.
+    """
     _begin(xml, "VRTDataset", rasterXSize=str(grid.width), rasterYSize=str(grid.height))
     _leaf(xml, "SRS", grid.crs)
     _leaf(xml, "GeoTransform", f"{grid.west!r}, {grid.cell!r}, 0.0, {grid.north!r}, 0.0, {-grid.cell!r}")
     _begin(xml, "VRTRasterBand", dataType=TYPES[band.dtype], band="1")
     _describe(xml, band)
     for tile in tiles:
-        name = f"tiles/{safe_name(tile.id)}/{file_name(tile.id, variant, kind)}"
+        file = file_name(tile.id, variant, kind if own is None else HEIGHT)
+        if own is not None:
+            file = own.get(tile.id, file)
+        name = f"tiles/{safe_name(tile.id)}/{file}"
         _source(xml, name, grid, tile.grid, band)
     xml.endElement("VRTRasterBand")
     xml.endElement("VRTDataset")

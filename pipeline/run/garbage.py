@@ -25,7 +25,7 @@ from flexroad.pipeline.run.record import RECORD, Run, check_links, check_models
 from flexroad.pipeline.run.status import open_database, peek_statuses
 from flexroad.pipeline.run.store_users import FOLDER, runs_using
 from flexroad.pipeline.store.records import DONE, FAILED
-from flexroad.pipeline.worker.exports import KINDS
+from flexroad.pipeline.worker.exports import KINDS, LEVEL_KINDS
 
 Kind = Literal["artefacts", "products", "tiles", "temporary files"]
 MEANING: dict[Kind, str] = {
@@ -159,6 +159,7 @@ def _in_tiles(run: Run) -> Iterator[Garbage]:
     tiles = {safe_name(tile.id): tile for tile in run.catalog.tiles}
     current = _ends(run.config.export.variants, run.config.export.formats)
     ever = _ends(run.exported, KINDS) | current
+    ever |= {f"_{variant}{kind.suffix}" for variant in run.exported for kind in LEVEL_KINDS}
     with open_database(run) as database:
         for folder, files in _folders(run.path / "tiles"):
             yield from _temporary(folder, files)

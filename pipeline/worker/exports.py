@@ -6,10 +6,14 @@ dictionaries: to import pystac would cost every worker a fifth of a second.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from flexroad.catalog import Grid
 from flexroad.catalog.ids import safe_name
@@ -20,10 +24,11 @@ from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.levels.seen import top_mask
 from flexroad.tasks.meshing.normals import mesh_normals
-from flexroad.tasks.quality.support import of_faces
-from flexroad.tasks.spline.levelled import LevelledSurface
+from flexroad.tasks.quality.support import of_faces, top_support
+from flexroad.tasks.roads.level_numbers import HIGHEST
+from flexroad.tasks.spline.levelled import LevelledSurface, top_of
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats, Quality
 
 rasterio = lazy("rasterio")
 
@@ -76,6 +81,19 @@ KINDS: dict[str, tuple[Kind, ...]] = {
 """The kinds of product of each format."""
 
 
+def of_level(kind: Kind, number: int) -> Kind:
+    """Return the kind of raster that shows one level, on tiles where another one is above it."""
+    stem, ending = kind.suffix.split(".")
+    title = f"{kind.title}, level {number}"
+    return replace(
+        kind, key=f"{kind.key}_level{number}", suffix=f"{stem}_level{number}.{ending}", title=title
+    )
+
+
+LEVEL_KINDS = tuple(of_level(kind, number) for kind in (HEIGHT, SUPPORT) for number in range(-HIGHEST, 1))
+"""Further kinds of the format ``cog``, for tiles with decks or tubes."""
+
+
 def file_name(tile_id: str, variant: str, kind: Kind) -> str:
     """Return the name of a product in the tile's folder."""
     return f"{safe_name(tile_id)}_{variant}{kind.suffix}"
@@ -83,7 +101,8 @@ def file_name(tile_id: str, variant: str, kind: Kind) -> str:
 
 def product_names(tile_id: str, files: Iterable[str]) -> tuple[str, ...]:
     """Return which of the files in a tile's folder are products, of any variant and format."""
-    start, ends = f"{safe_name(tile_id)}_", tuple(kind.suffix for kinds in KINDS.values() for kind in kinds)
+    kinds = (*itertools.chain(*KINDS.values()), *LEVEL_KINDS)
+    start, ends = f"{safe_name(tile_id)}_", tuple(kind.suffix for kind in kinds)
     return tuple(sorted(name for name in files if name.startswith(start) and name.endswith(ends)))
 
 
@@ -124,7 +143,7 @@ def products(
             else:
                 encoded = _npz(nodes, evaluate)
             for kind, data in encoded.items():
-                known = vertical if kind is HEIGHT else None
+                known = vertical if kind.band is cog.HEIGHT else None
                 files[file_name(graph.tile.id, variant, kind)] = Product(kind, variant, data, known)
     return files
 
@@ -142,18 +161,41 @@ def _cog(
     road, surface = evaluate(nodes["segment"]), evaluate(nodes["fit"])
     window = road.grid.window(core)
     # Rasters have the highest level, as the DSM.
-    lattice = surface.top_lattice if isinstance(surface, LevelledSurface) else surface.lattice
-    heights = lattice(core.eastings, core.northings)
+    heights = top_of(surface).lattice(core.eastings, core.northings)
     heights[road.outside[window]] = float("nan")
-    kept = top_mask(evaluate(nodes["ecsrc"]))[window]
-    support = evaluate(nodes["assess"]).support
+    kept, quality = top_mask(evaluate(nodes["ecsrc"]))[window], evaluate(nodes["assess"])
+    support = quality.support
+    others: dict[Kind, bytes] = {}
     # Without a common one, GDAL's environment is set up and cleared for each call.
     with rasterio.Env():
+        if isinstance(surface, LevelledSurface):
+            support, others = _of_levels(core, road.outside[window], surface, quality, vertical)
         return {
             HEIGHT: cog.encode_height(heights, core, vertical),
             ROAD: cog.encode_mask(kept, core),
             SUPPORT: cog.encode_support(support, core),
+            **others,
         }
+
+
+def _of_levels(
+    core: Grid, outside: Bools, surface: LevelledSurface, quality: Quality, vertical: str | None
+) -> tuple[NDArray[np.uint8], dict[Kind, bytes]]:
+    """Return the support of the highest level, and rasters of level 0 below decks and of tubes."""
+    at = np.meshgrid(core.eastings, core.northings)
+    top, lower = surface.top(*at), {}
+    if (top > 0).any():
+        lower[0] = surface.lattice(core.eastings, core.northings)
+        lower[0][outside] = np.nan
+    for number in surface.numbers:
+        here = surface.covers(number, *at) if number < 0 else np.zeros(core.shape, np.bool_)
+        if here.any():
+            lower[number] = np.where(here, surface.at(number).height(*at), np.nan)
+    files = {}
+    for number, heights in sorted(lower.items()):
+        files[of_level(HEIGHT, number)] = cog.encode_height(heights, core, vertical)
+        files[of_level(SUPPORT, number)] = cog.encode_support(quality.at(number).support, core)
+    return top_support(quality, top), files
 
 
 def _npz(nodes: dict[str, str], evaluate: Callable[[str], Any]) -> dict[Kind, bytes]:

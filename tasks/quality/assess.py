@@ -7,7 +7,7 @@ one should be checked first. A local fault appears as a patch of road that is fa
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import scipy
@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.tasks import options as base
+from flexroad.tasks.levels.seen import level_data, level_road
 from flexroad.tasks.metrics.statistics import mean, nmad
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.holdout import Refit, holdout
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.roads.dtm_validity import AGREE_M
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
 
@@ -112,8 +114,30 @@ def assess(
     Returns
     -------
     Quality
-        Figures over the road cells of the core; NaN where the tile or the surface has no such data.
+        Figures over the road cells of the core; NaN where the tile or the surface has no such data. With
+        levels, those of level 0, and of each other one on its decks or tubes, without a second fit.
     """
+    own = _assess(data, road, clusters, surface, options, refit)
+    if not isinstance(surface, LevelledSurface):
+        return own
+    others = []
+    for of_level in clusters.levels:
+        assert of_level.level
+        number = of_level.level.number
+        seen, there = level_data(data, clusters, number), level_road(road, number)
+        others.append((number, _assess(seen, there, of_level, surface.at(number), options)))
+    return replace(own, levels=tuple(others))
+
+
+def _assess(
+    data: TileData,
+    road: RoadMask,
+    clusters: RoadClusters,
+    surface: Surface,
+    options: Options,
+    refit: Refit | None = None,
+) -> Quality:
+    """Return the figures of one level."""
     cells = compare(data, road, clusters, surface, options.agree_m, only_road=True)
     on_road, kept, classes, height = cells.on_road, cells.kept, cells.classes, cells.height
     estimate, cell = cells.estimate, data.core.cell

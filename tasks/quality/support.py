@@ -75,3 +75,20 @@ def of_faces(
         for number, of_level in others:
             kinds = np.where(mesh.level == number, of_level.support[cells], kinds)
     return np.where(kinds == Support.NONE, np.uint8(Support.INFERRED), kinds)
+
+
+def top_support(quality: Quality, top: NDArray[np.int8]) -> NDArray[np.uint8]:
+    """Return the `Support` of the highest level in each cell of the core, ``(H, W)``.
+
+    Parameters
+    ----------
+    quality : Quality
+        That of level 0, with the other levels.
+    top : ndarray, (H, W)
+        Number of the highest level in each cell.
+    """
+    classes = quality.support.copy()
+    for number, of_level in quality.levels:
+        here = (top == number) & (number > 0)
+        classes[here] = of_level.support[here]
+    return classes

@@ -7,15 +7,16 @@ follow the end of an embankment.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.catalog.grid import Grid
+from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import BLEND_M, Bools, Floats, Level
+from flexroad.tasks.types import BLEND_M, Bools, Floats, Level, Surface
 
 GRADIENT_M = 0.01
 """Distance over which the slope of the weight of a level is taken (m)."""
@@ -131,6 +132,50 @@ class LevelledSurface(SteppedSurface):
             other = self.at(own.level.number).height(east[near], north[near])
             result[near] += weight[near] * (other - result[near])
         return result
+
+
+@dataclass(frozen=True, eq=False)
+class TopSurface:
+    """The highest level at each place: decks, and elsewhere the ground."""
+
+    levels: LevelledSurface
+
+    @property
+    def bounds(self) -> Bounds:
+        """The domain: west, south, east, north (m)."""
+        return self.levels.bounds
+
+    def height(self, easting: Floats, northing: Floats) -> Floats:
+        """Return heights (m) at scattered points, in their broadcast shape."""
+        return self._with_decks(self.levels.height(easting, northing), easting, northing, NurbsSurface.height)
+
+    def lattice(self, eastings: Floats, northings: Floats) -> Floats:
+        """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
+        return self.levels.top_lattice(eastings, northings)
+
+    def normal(self, easting: Floats, northing: Floats) -> Floats:
+        """Return upward unit normals at scattered points, ``(..., 3)``."""
+        return self._with_decks(self.levels.normal(easting, northing), easting, northing, NurbsSurface.normal)
+
+    def _with_decks(
+        self,
+        values: Floats,
+        easting: Floats,
+        northing: Floats,
+        of: Callable[[NurbsSurface, Floats, Floats], Floats],
+    ) -> Floats:
+        """Return values of level 0 at points, with those of higher levels on these."""
+        east, north = np.broadcast_arrays(easting, northing)
+        numbers, result = self.levels.top(east, north), np.array(values)
+        for number in np.unique(numbers[numbers > 0]).tolist():
+            here = numbers == number
+            result[here] = of(self.levels.at(number), east[here], north[here])
+        return result
+
+
+def top_of(surface: Surface) -> Surface:
+    """Return the surface of the highest levels; one without levels is returned as it is."""
+    return TopSurface(surface) if isinstance(surface, LevelledSurface) else surface
 
 
 def _rise(level: Level, easting: Floats, northing: Floats, aside: tuple[float, float]) -> Floats:

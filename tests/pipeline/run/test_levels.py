@@ -1,11 +1,13 @@
 """A run over roads above roads: two heights at one place, and neighbours that meet on every level."""
 
 import io
+import json
 
 import numpy as np
 import pandas as pd
 import pytest
 import rasterio
+import shapely
 
 import flexroad
 from flexroad.catalog import Catalog
@@ -14,12 +16,17 @@ from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.run.finished import FinishedTile
+from flexroad.pipeline.run.garbage import find_garbage
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.export import npz
+from flexroad.tasks.quality.support import Support
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.synthetic.crossings import Crossings
 from tests.command_line import call
+from tests.mesh_union import Union
 
 SEED, SIZE_M = 0, 60
 WITH_LEVELS = ["segment.levels=true"]
@@ -150,3 +157,72 @@ def test_dask_gives_the_same_products(run, tmp_path):
 def test_stages_that_have_no_levels_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         load_config("production_vector", [*WITH_LEVELS, *settings])
+
+
+def test_rasters_show_the_highest_level_and_the_ground_below_decks(run, cells):
+    x, y, *_ = cells
+    view = flexroad.open_run(run.path)
+    with rasterio.open(run.path / "height.vrt") as top, rasterio.open(run.path / "height_level0.vrt") as low:
+        np.testing.assert_allclose(top.read(1), view.height(x, y), atol=1e-4)
+        np.testing.assert_allclose(low.read(1), view.height(x, y, 0), atol=1e-4)
+    with rasterio.open(run.path / "support.vrt") as file:
+        deck = file.read(1)[np.isfinite(view.height(x, y, 1))]
+    assert (deck == Support.MEASURED).mean() > 0.5
+    assert (deck != Support.NONE).all()
+
+
+def test_tiles_with_decks_alone_have_rasters_of_level_0(run):
+    for tile in finished(run):
+        item = json.loads((run.path / "tiles" / tile.id / "item.json").read_bytes())
+        assert ("height_level0" in item["assets"]) == (1 in tile.mesh.numbers)
+        assert ("support_level0" in item["assets"]) == (1 in tile.mesh.numbers)
+    assert "height_level0" in json.loads((run.path / "collection.json").read_bytes())["assets"]
+    assert [waste.path.name for waste in find_garbage([run]) if waste.kind == "products"] == []
+
+
+def test_meshes_of_levels_meet_on_borders_and_joints(run):
+    tiles = finished(run)
+    inner_x, inner_y = max(t.tile.grid.west for t in tiles), min(t.tile.grid.north for t in tiles)
+    for number in (0, 1):
+        meshes = [tile.mesh for tile in tiles if number in tile.mesh.numbers]
+        whole = Union.of((mesh.at(number).vertices + mesh.origin, mesh.at(number).faces) for mesh in meshes)
+        gaps = np.abs(whole.middles[whole.uses == 1] - (inner_x, inner_y)).min(axis=1, initial=np.inf)
+        assert (gaps > 1e-6).all()
+        assert whole.uses.max() == 2
+    common = 0
+    for tile in tiles:
+        mesh, level = tile.mesh, tile.road.levels[0]
+        ground, deck = (on_joints(mesh.at(number), level) for number in (0, 1))
+        if 1 in mesh.numbers:
+            assert ground == deck
+            common += len(deck)
+    assert common > 10
+
+
+def on_joints(mesh, level):
+    near = shapely.dwithin(level.joints, shapely.points(mesh.vertices[:, :2] + mesh.origin[:2]), 0.02)
+    return {tuple(vertex) for vertex in mesh.vertices[near].astype(np.float32).tolist()}
+
+
+def finished(run):
+    statuses = peek_statuses(run, run.catalog.tiles)
+    return [FinishedTile.of(run, status, run.config.export.variants[0]) for status in statuses]
+
+
+def test_exports_of_heights_have_the_highest_level(run, cells, tmp_path):
+    x, y, *_ = cells
+    view = flexroad.open_run(run.path)
+    top, deck = view.height(x, y), np.isfinite(view.height(x, y, 1))
+    call("export", run.path, "--format", "mosaic", "-o", tmp_path).expected(0)
+    with rasterio.open(next(tmp_path.rglob("height.tif"))) as file:
+        np.testing.assert_allclose(file.read(1), top, atol=1e-3)
+    with rasterio.open(next(tmp_path.rglob("normal.tif"))) as file:
+        assert file.read(3)[deck].min() > 0.98 / file.scales[0]
+    with rasterio.open(next(tmp_path.rglob("road.tif"))) as file:
+        assert file.read(1)[deck].mean() > 0.5
+
+
+def test_smooth_formats_say_that_they_have_level_0(run, tmp_path):
+    call("export", run.path, "--format", "step", "-o", tmp_path).expected(0)
+    rows = json.loads((tmp_path / "export.json").read_bytes())
+    assert "the surface is that of level 0" in json.dumps(rows)
