@@ -119,8 +119,11 @@ class Level:
         if self.approach.is_empty:
             return result
         west, south, east, north = shapely.buffer(shapely.box(*self.approach.bounds), BLEND_M).bounds
-        near = (easting > west) & (easting < east) & (northing > south) & (northing < north)
+        near = np.array((easting > west) & (easting < east) & (northing > south) & (northing < north))
         places = shapely.points(easting[near], northing[near])
+        shapely.prepare(self.approach)
+        reached = shapely.dwithin(self.approach, places, BLEND_M)
+        near[near], places = reached, places[reached]
         share = np.clip(1 - shapely.distance(self.approach, places) / BLEND_M, 0.0, 1.0)
         away, from_joints = shapely.distance(self.areas, places), shapely.distance(self.joints, places)
         free = (away < from_joints - FREE_M) | ((away == 0.0) & (from_joints > ON_JOINT_M))
