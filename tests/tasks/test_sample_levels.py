@@ -125,3 +125,20 @@ def test_mesh_of_tile_far_from_decks_is_that_without_levels(method):
     assert mesh.level is None
     np.testing.assert_array_equal(mesh.vertices, plain.vertices)
     np.testing.assert_array_equal(mesh.faces, plain.faces)
+
+
+@pytest.mark.slow
+@METHODS
+@pytest.mark.parametrize("seed", range(30))
+def test_random_decks_and_tubes_meet_the_ground(seed, method):
+    rng = np.random.default_rng(seed)
+    crossing = Crossing(
+        middle=tuple(rng.uniform(28, 92, 2)),
+        angle=rng.choice([0, 45, 90, *rng.uniform(0, 360, 6)]),
+        length=rng.uniform(8, 40),
+        width=rng.uniform(2.5, 14),
+        number=int(rng.choice([1, -1, 2])),
+    )
+    test_levels_are_height_fields_with_common_vertices_on_joints(crossing, method)
+    test_levels_have_no_open_edge_over_borders(crossing, method)
+    test_edges_of_deck_on_joints_are_edges_of_ground(crossing, method)
