@@ -282,6 +282,19 @@ class Metrics:
     mesh_max_terrain_m: float
 
 
+@dataclass(frozen=True)
+class Structures:
+    """Figures of the decks or tubes of a level on a tile's core."""
+
+    area_m2: float
+    joints: int
+    """Number of joints whose middle lies on the core."""
+    clearance_m: float
+    """Median height of a deck above level 0, or of level 0 above a tube (m); NaN without cells."""
+    crossed: float
+    """Share of cells 2 m and more from joints with the deck below level 0, or the tube above it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Quality:
     """Quality figures of a surface without ground truth, on the core's road cells of the raw mask.
@@ -332,6 +345,8 @@ class Quality:
     """Class of the core's cells by `tasks.quality.support.Support`, ``(H, W)``."""
     levels: tuple[tuple[int, Quality], ...] = ()
     """Number and quality of each other level, on its decks or tubes: beyond them its support is none."""
+    structures: Structures | None = None
+    """Figures of these decks or tubes; None for level 0."""
 
     def at(self, number: int) -> Quality:
         """Return the quality of a level, that of level 0 if it has none."""

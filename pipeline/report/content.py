@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import pandas as pd
 import yaml
@@ -16,7 +17,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, Track, open_database, recorded, summary, untracked
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import TileState
-from flexroad.pipeline.store.tables import METRICS, metrics_frame, read_metrics
+from flexroad.pipeline.store.tables import METRICS, level_rows, metrics_frame, read_metrics
 from flexroad.tasks.errors import MeshFault
 from flexroad.tasks.quality.assess import NO_ROAD
 
@@ -69,6 +70,21 @@ ESTIMATE_MEANING = (
     "road L2; errors common to DSM and DTM are not detected. Flags are set by the thresholds of `assess`; "
     "docs/quality.md explains each flag."
 )
+DECKS = {
+    "tile_id": "tile",
+    "level": "level",
+    "area_m2": "area (m²)",
+    "joints": "joints",
+    "clearance_m": "clearance (m)",
+    "error_estimate_m": ESTIMATES["error_estimate_m"],
+    "measured_road": SUPPORT["measured_road"],
+    "flags": "flags",
+}
+"""Columns of the table of decks and tubes."""
+DECKS_MEANING = (
+    "Levels above 0 are decks, levels below 0 tubes. Joints are the ends where a road of level 0 goes on, "
+    "clearance is the median height between the level and level 0. docs/levels.md explains the flags."
+)
 HOLDOUT = "A second fit did without these squares of road (`assess.holdout`); 90% intervals hold 90% of them."
 
 
@@ -116,6 +132,8 @@ class Content:
     """Whether another process is computing tiles of the run."""
     results: Results = field(default_factory=dict)
     """Where the surfaces of the finished tiles are in the store."""
+    levels: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """Decks and tubes of the exported variant; empty if no tile has some."""
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
     """Second fits beside the squares withheld from them, per variant; empty if nothing was withheld."""
 
@@ -132,10 +150,13 @@ def gather(run: Run, track: Track = untracked) -> Content:
     done = rows[rows.status == "done"]
     states: dict[str, TileState] = {}
     results: Results = {}
+    of_levels: list[dict[str, Any]] = []
 
     def keep(status: TileStatus, state: TileState) -> None:
         states[status.graph.tile.id] = state
         add_results(results, status)
+        if status.done and status.last_record:
+            of_levels.extend(level_rows(status.last_record.rows))
 
     counts = summary(run, track, keep)
     variants = [name for name in run.config.chains if name in set(done.variant)]
@@ -158,6 +179,7 @@ def gather(run: Run, track: Track = untracked) -> Content:
         strata=_per_stratum(done, variants),
         worst=_worst(done, exported),
         quality=over_tiles(done, variants),
+        levels=decks_and_tubes(of_levels, exported),
         held_out=held_out(done, variants),
         worst_estimates=highest_error_estimates(done, exported, WORST),
         meshes=mesh_checks(rows, run.config.chains),
@@ -266,6 +288,16 @@ def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
     table = _labelled(table)
     table.insert(0, "flagged tiles", flagged.reindex(variants))
     return table.reset_index().rename(columns={"variant": "method"})
+
+
+def decks_and_tubes(rows: list[dict[str, Any]], variant: str) -> pd.DataFrame:
+    """Return one row per tile and level of a variant, those with flags first; empty if there are none."""
+    own = [row for row in rows if row["variant"] == variant]
+    if not own:
+        return pd.DataFrame()
+    table = pd.DataFrame(own)[list(DECKS)].sort_values("flags", key=lambda flags: flags == "", kind="stable")
+    table = table.assign(measured_road=100 * table.measured_road.astype("float64"))
+    return table.assign(flags=table["flags"].replace("", "–")).rename(columns=DECKS)
 
 
 def held_out(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:

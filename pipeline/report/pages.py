@@ -14,7 +14,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from flexroad.catalog.text import printable
-from flexroad.pipeline.report.content import ESTIMATE_MEANING, HOLDOUT, MESHES, Content
+from flexroad.pipeline.report.content import DECKS_MEANING, ESTIMATE_MEANING, HOLDOUT, MESHES, Content
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.quality.places import Place
 
@@ -85,6 +85,7 @@ def sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
         ("Worst tiles by road L2", content.worst, ""),
         (WORST_ESTIMATES, content.worst_estimates, ESTIMATE_MEANING),
         ("Error estimates and support, mean over tiles", content.quality, ""),
+        ("Decks and tubes", content.levels, DECKS_MEANING),
         ("Error estimates at withheld squares", content.held_out, HOLDOUT),
         ("Meshes", content.meshes, MESHES),
         ("Steps between neighbouring tiles", content.steps.check, content.steps.note),

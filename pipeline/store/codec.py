@@ -24,12 +24,12 @@ from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
 from flexroad.tasks.spline.moving import MovingNurbs
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Level, Mesh, Metrics, Quality, RoadClusters, RoadMask
+from flexroad.tasks.types import Level, Mesh, Metrics, Quality, RoadClusters, RoadMask, Structures
 
 HEADER = "header.json"
 SEPARATOR = "."
 """Between the names of a field and of a field of the result in it, in the names of arrays."""
-LEVELS = ("level", "levels")
+LEVELS = ("level", "levels", "structures")
 """Fields that are left out if they are empty: results without levels have the bytes of earlier versions."""
 SHA256_BYTES = 32
 
@@ -125,7 +125,7 @@ def _plain(item: Any, arrays: Mapping[str, Any]) -> Any:
 def _types() -> dict[str, type]:
     shared = (
         Corner, Edge, Level, LevelledSurface, LevelSpline, Mesh, Metrics, MovingNurbs, NurbsSurface, Quality,
-        RoadClusters, RoadMask, SteppedSurface,
+        RoadClusters, RoadMask, SteppedSurface, Structures,
     )  # fmt: skip
     types: dict[str, type] = {result.__name__: result for result in shared}
     for module in methods("fit").values():

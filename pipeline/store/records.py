@@ -12,7 +12,9 @@ from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.quality.assess import NO_ROAD
 
 MetricsRow = dict[str, Any]
-"""One row of metrics.parquet, by column."""
+"""One row of metrics.parquet, by column; for a tile with decks or tubes also its rows of levels.csv."""
+LEVELS = "levels"
+"""Name of these rows."""
 MeshDistances = dict[str, dict[str, float]]
 """Largest distances of meshes from their surfaces (m), by variant and column of metrics.parquet."""
 TileState = Literal["cached", "done", "failed", "pending"]

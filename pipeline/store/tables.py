@@ -10,11 +10,11 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.storage.paths import Location, exists, read
+from flexroad.catalog.storage.paths import Location, exists, read, remove
 from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import access_reason, no_formula
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.store.records import Failure, MetricsRow
+from flexroad.pipeline.store.records import LEVELS, Failure, MetricsRow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,6 +24,8 @@ pyarrow = lazy("pyarrow")
 
 METRICS, PREVIOUS = "metrics.parquet", "metrics.previous.parquet"
 """Tables of a run, and before its last execution."""
+OF_LEVELS = "levels.csv"
+"""Figures of decks and tubes: a row per tile, variant and level."""
 CHUNK = 10_000
 """Rows held in memory at a time; also the row groups of metrics.parquet."""
 
@@ -100,7 +102,7 @@ def _schema() -> Any:
 def write_tables(
     run: Location, rows: Iterable[MetricsRow], failures: Iterable[Failure], flushed: bool = False
 ) -> None:
-    """Write metrics.parquet and failures.csv in chunks.
+    """Write metrics.parquet and failures.csv in chunks, and levels.csv if a tile has decks or tubes.
 
     With ``flushed`` their contents are on the disk before they replace the old tables.
 
@@ -109,18 +111,37 @@ def write_tables(
     OSError
         If they cannot be written, for example on a full disk.
     """
-    schema = _schema()
+    schema, of_levels = _schema(), list[dict[str, Any]]()
     with (
         atomic_file(run / METRICS, flushed) as path,
         pyarrow.parquet.ParquetWriter(path, schema, write_page_checksum=True) as table,
     ):
         for chunk in _chunks(rows):
             table.write_table(_table(chunk, schema))
+            of_levels += level_rows(chunk)
     names = [field.name for field in fields(Failure) if field.name != "trace"]
-    with atomic_file(run / "failures.csv", flushed) as path, path.open("w", newline="") as file:
+    values = ([getattr(failure, name) for name in names] for failure in failures)
+    _write_csv(run / "failures.csv", names, values, flushed)
+    if of_levels:
+        _write_csv(run / OF_LEVELS, list(of_levels[0]), (row.values() for row in of_levels), flushed)
+    else:
+        remove(run / OF_LEVELS)
+
+
+def level_rows(rows: Iterable[MetricsRow]) -> list[dict[str, Any]]:
+    """Return the figures of the decks and tubes in the rows of tiles, with tile and variant."""
+    return [
+        {"tile_id": row["tile_id"], "variant": row["variant"], **level}
+        for row in rows
+        for level in row.get(LEVELS, ())
+    ]
+
+
+def _write_csv(path: Location, names: Sequence[str], rows: Iterable[Iterable[Any]], flushed: bool) -> None:
+    with atomic_file(path, flushed) as written, written.open("w", newline="") as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(names)
-        lines.writerows([no_formula(getattr(failure, name)) for name in names] for failure in failures)
+        lines.writerows([no_formula(value) for value in row] for row in rows)
 
 
 def csv_text(table: pd.DataFrame, **options: Any) -> str:

@@ -19,6 +19,7 @@ from flexroad.pipeline.graph.stages import STAGE_NAMES, stage_version
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import (
+    LEVELS,
     MARKERS,
     Failure,
     MarkerStat,
@@ -178,6 +179,7 @@ def failed_row(graph: TileGraph, variant: str, error: str) -> MetricsRow:
 
 
 def _failed(head: MetricsRow, error: str) -> MetricsRow:
+    head = {name: value for name, value in head.items() if name != LEVELS}
     nothing = dict.fromkeys((*Metrics.__annotations__, *QUALITY, "seconds"))
     return {**head, **nothing, "status": "failed", "error": error, "flags": ""}
 
@@ -195,7 +197,22 @@ def _row(graph: TileGraph, variant: str, evaluator: Evaluator) -> MetricsRow:
     metrics |= {name: getattr(quality, name) for name in QUALITY}
     seconds = sum(evaluator.chain_seconds[node].values())
     status = {"seconds": seconds, "error": "", "flags": ", ".join(quality.flags)}
-    return no_nan(_head(graph, variant, "done") | metrics | status)
+    levels = _of_levels(quality)
+    return no_nan(_head(graph, variant, "done") | metrics | status | ({LEVELS: levels} if levels else {}))
+
+
+def _of_levels(quality: Quality) -> list[dict[str, Any]]:
+    """Return the figures of the decks and tubes of a tile, for each level that has some."""
+    return [
+        no_nan(
+            {"level": number}
+            | asdict(of_level.structures)
+            | {name: getattr(of_level, name) for name in QUALITY if not name.startswith("holdout")}
+            | {"flags": ", ".join(of_level.flags)}
+        )
+        for number, of_level in quality.levels
+        if of_level.structures
+    ]
 
 
 def _head(graph: TileGraph, variant: str, status: TileState) -> MetricsRow:

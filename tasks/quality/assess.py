@@ -19,6 +19,7 @@ from flexroad.tasks.levels.seen import level_data, level_road
 from flexroad.tasks.metrics.statistics import mean, nmad
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.holdout import Refit, holdout
+from flexroad.tasks.quality.structures import STRUCTURE_FLAGS, structures
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.roads.dtm_validity import AGREE_M
 from flexroad.tasks.spline.levelled import LevelledSurface
@@ -115,7 +116,8 @@ def assess(
     -------
     Quality
         Figures over the road cells of the core; NaN where the tile or the surface has no such data. With
-        levels, those of level 0, and of each other one on its decks or tubes, without a second fit.
+        levels, those of level 0, and of each other one on its decks or tubes, without a second fit; flags
+        of decks and tubes are those of level 0, too.
     """
     own = _assess(data, road, clusters, surface, options, refit)
     if not isinstance(surface, LevelledSurface):
@@ -125,8 +127,14 @@ def assess(
         assert of_level.level
         number = of_level.level.number
         seen, there = level_data(data, clusters, number), level_road(road, number)
-        others.append((number, _assess(seen, there, of_level, surface.at(number), options)))
-    return replace(own, levels=tuple(others))
+        quality = _assess(seen, there, of_level, surface.at(number), options)
+        found, flags = structures(road, surface, number)
+        # Away from its decks a level has no figures: it is no road that was lost.
+        own_flags = (*quality.flags, *flags) if found else ()
+        others.append((number, replace(quality, structures=found, flags=own_flags)))
+    raised = {flag for _, quality in others for flag in quality.flags}
+    flags = (*own.flags, *(flag for flag in STRUCTURE_FLAGS if flag in raised))
+    return replace(own, flags=flags, levels=tuple(others))
 
 
 def _assess(

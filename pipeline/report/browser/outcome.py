@@ -18,6 +18,7 @@ from flexroad.pipeline.report.content import Content
 from flexroad.tasks.io.height_offset import is_offset
 from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, Options
 from flexroad.tasks.quality.places import Place
+from flexroad.tasks.quality.structures import BELOW, LEAST_RISE_M, NO_JOINT, NO_RISE
 
 OF_HEIGHTS = ("dropped", NO_ROAD)
 """Flags that a DSM far from the DTM gives."""
@@ -78,6 +79,18 @@ MEANINGS = {
         "{value} of the NURBS weights are at their limit (limit {limit})",
         "use fit.weights: unit",
         percent=True,
+    ),
+    BELOW: _Meaning(
+        "a deck lies partly below the ground under it, or a tube above it",
+        "look at the table of decks and tubes, and at the heights and the outline of the deck",
+    ),
+    NO_RISE: _Meaning(
+        f"a deck hardly lies above the ground, or a tube below it (less than {LEAST_RISE_M:g} m)",
+        "a culvert is right; otherwise check the level and the outline of this road",
+    ),
+    NO_JOINT: _Meaning(
+        "at a deck no road of level 0 goes on",
+        "check the level of the roads at its ends, and gaps there; level 0 ends by itself",
     ),
     NO_ROAD: _Meaning(
         "no road was found on the tile, so its surface is the terrain",

@@ -156,7 +156,7 @@ def _data(
     limits = _limits(options)
     for column in data["columns"]:
         column["limit"] = limits.get(column["key"])
-    data["meanings"] = described(options)
+    data["meanings"] = {flag: one for flag, one in described(options).items() if flag in data["flagNames"]}
     data["viewer"] = viewer
     data["places"] = {
         i: {flag: [round(float(value), 2) for value in place] for flag, place in found.places.items()}

@@ -18,6 +18,7 @@ from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import printable
 from flexroad.pipeline.report.content import Content
 from flexroad.tasks.quality.assess import FLAGS, NO_ROAD
+from flexroad.tasks.quality.structures import STRUCTURE_FLAGS
 
 pyproj = lazy("pyproj")
 
@@ -167,7 +168,8 @@ def map_data(
     """
     finite = table.bounds[np.isfinite(table.bounds[:, 0])]
     west, south, east, north = (*finite[:, :2].min(0), *finite[:, 2:].max(0)) if len(finite) else (0.0,) * 4
-    flag_names = [*FLAGS, NO_ROAD]
+    raised = {name for flags in table.frame["flags"].dropna() for name in flags.split(", ")}
+    flag_names = [*FLAGS, NO_ROAD, *(name for name in STRUCTURE_FLAGS if name in raised)]
     columns: list[dict[str, Any]] = [
         {
             "key": key,

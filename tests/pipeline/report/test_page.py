@@ -28,6 +28,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import COLUMNS, METRICS, metrics_frame
 from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, Options
+from flexroad.tasks.quality.structures import STRUCTURE_FLAGS
 from tests.made_report import failed_row, made_content, made_row, made_run
 
 EVIL = "<script>alert(1)</script>"
@@ -60,7 +61,7 @@ def test_all_columns_of_the_metrics_have_a_label():
 
 
 def test_all_flags_have_words_and_a_remedy():
-    assert set(MEANINGS) == {*FLAGS, NO_ROAD}
+    assert set(MEANINGS) == {*FLAGS, NO_ROAD, *STRUCTURE_FLAGS}
     for meaning in MEANINGS.values():
         assert meaning.words
         assert meaning.remedy

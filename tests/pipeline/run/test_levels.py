@@ -135,6 +135,28 @@ def test_quality_of_tiles_with_decks_has_no_flags(run):
     assert metrics.l2_road_m.max() < 0.03
 
 
+def test_decks_have_figures_in_a_table_and_in_the_report(run):
+    table = pd.read_csv(run.path / "levels.csv")
+    tiles = {tile.tile.id: tile for tile in finished(run)}
+    assert set(table.tile_id) == {name for name, tile in tiles.items() if 1 in tile.mesh.numbers}
+    assert set(table.level) == {1}
+    for row in table.itertuples():
+        mesh = tiles[row.tile_id].mesh.at(1)
+        area = shapely.area(shapely.polygons(mesh.vertices[mesh.faces][:, :, :2])).sum()
+        assert row.area_m2 == pytest.approx(area, abs=0.5)
+    assert table.joints.sum() == 2
+    assert table.clearance_m.max() > 5
+    assert table.error_estimate_m.max() < 0.05
+    assert table["flags"].isna().all()
+    call("report", run.path).expected(0)
+    text = (run.path / "report.md").read_text()
+    assert "| tile | level | area (m²) | joints | clearance (m) |" in text.partition("## Decks and tubes")[2]
+    call("report", run.path, "--format", "html").expected(0)
+    page = (run.path / "report.html").read_text()
+    assert "<summary>Decks and tubes</summary>" in page
+    assert '"no-rise"' not in page
+
+
 @pytest.mark.slow
 def test_dask_gives_the_same_products(run, tmp_path):
     other = made(tmp_path, DaskExecutor(2))

@@ -72,6 +72,24 @@ def test_failures_in_csv_are_no_formulas(tmp_path):
         assert list(csv.reader(file))[1] == ["'=1", "load", "TaskError", "'@message", "'-file"]
 
 
+def test_levels_have_a_table_of_their_own_while_tiles_have_some(tmp_path):
+    tile = {"tile_id": "=a", "variant": "flexroad", "status": "done"}
+    levels = [
+        {"level": 1, "area_m2": 160.0, "flags": "below, no-rise"},
+        {"level": 2, "area_m2": 9.5, "flags": ""},
+    ]
+    write_tables(tmp_path, [{**tile, "levels": levels}, {**tile, "tile_id": "b"}], [])
+    lines = (tmp_path / "levels.csv").read_text().splitlines()
+    assert lines == [
+        "tile_id,variant,level,area_m2,flags",
+        '\'=a,flexroad,1,160.0,"below, no-rise"',
+        "'=a,flexroad,2,9.5,",
+    ]
+    assert read_metrics(tmp_path).tile_id.tolist() == ["=a", "b"]
+    write_tables(tmp_path, [tile], [])
+    assert not (tmp_path / "levels.csv").exists()
+
+
 def test_read_metrics_unknown_column_raises(tmp_path):
     pd.DataFrame({"tile_ie": ["a"]}).to_parquet(tmp_path / "metrics.parquet")
     with pytest.raises(ConfigError, match=r"is damaged: it has the columns 'tile_ie'.*flexroad rerun"):

@@ -1,0 +1,60 @@
+"""Figures and flags of the decks and tubes of a tile: area, joints, clearance, wrong order of levels."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+
+from flexroad.tasks.levels.joints import APART_M
+from flexroad.tasks.levels.seen import level_road
+from flexroad.tasks.spline.levelled import LevelledSurface
+from flexroad.tasks.types import Level, RoadMask, Structures
+
+BELOW, NO_RISE, NO_JOINT = "below", "no-rise", "no-joint"
+STRUCTURE_FLAGS = (BELOW, NO_RISE, NO_JOINT)
+"""Flags of decks and tubes, which their tile has as well."""
+MOST_CROSSED = 0.01
+"""Largest share of a deck below level 0 without a flag."""
+LEAST_RISE_M = 0.3
+"""Least median clearance without a flag (m)."""
+FROM_JOINTS_M = 2.0
+"""Nearer to a joint both levels have nearly the same height (m)."""
+
+
+def structures(
+    road: RoadMask, surface: LevelledSurface, number: int
+) -> tuple[Structures | None, tuple[str, ...]]:
+    """Return the figures and flags of the decks or tubes of a level; None if none lies on the tile's core."""
+    level = next(level for level in road.levels if level.number == number)
+    west, south, east, north = road.core.bounds
+    core = shapely.box(west, south, east, north)
+    area = shapely.intersection(level.areas, core).area
+    if area == 0.0:
+        return None, ()
+    lines = shapely.get_parts(level.joints)
+    x, y = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True)).T
+    # Of two tiles that share a border, one has the joints on it.
+    joints = int(np.count_nonzero((west <= x) & (x < east) & (south <= y) & (y < north)))
+    window = road.grid.window(road.core)
+    rows, cols = np.nonzero(level_road(road, number).mask[window] & ~road.outside[window])
+    x, y = road.core.eastings[cols], road.core.northings[rows]
+    rise = np.sign(number) * (surface.at(number).height(x, y) - surface.height(x, y))
+    # Without joints the distance is NaN.
+    inner = rise[~(shapely.distance(level.joints, shapely.points(x, y)) < FROM_JOINTS_M)]
+    found = Structures(
+        float(area),
+        joints,
+        float(np.median(rise)) if rise.size else float("nan"),
+        float(np.mean(inner < 0)) if inner.size else 0.0,
+    )
+    raised = (found.crossed > MOST_CROSSED, found.clearance_m < LEAST_RISE_M, _lacks_joint(level, road))
+    return found, tuple(flag for flag, is_raised in zip(STRUCTURE_FLAGS, raised, strict=True) if is_raised)
+
+
+def _lacks_joint(level: Level, road: RoadMask) -> bool:
+    """Return whether a deck on the core has no joint; one that goes on beyond what is known may have some."""
+    parts, window = shapely.get_parts(level.areas), shapely.box(*road.grid.bounds)
+    known = shapely.contains_properly(window, parts) & shapely.intersects(
+        parts, shapely.box(*road.core.bounds)
+    )
+    return bool((known & ~shapely.dwithin(parts, level.joints, APART_M)).any())

@@ -1,0 +1,72 @@
+"""Figures and flags of decks: of level planes they are exact."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+
+from flexroad.pipeline.store import codec
+from flexroad.tasks.quality.assess import Options, assess
+from flexroad.tasks.quality.structures import BELOW, NO_JOINT, NO_RISE, structures
+from flexroad.tasks.types import Level, RoadClusters, RoadMask, Structures, TileData
+from tests.tasks.spline.test_levelled import GRID, LEVEL, SOUTH, WEST, made_surface
+
+NOWHERE = np.zeros(GRID.shape, np.bool_)
+
+
+def road(level=LEVEL, core=GRID):
+    return RoadMask(GRID, core, NOWHERE, NOWHERE, levels=(level,))
+
+
+def of_plane(rise, level=LEVEL):
+    surface = made_surface(100.0, 100.0 + rise)
+    if level is not LEVEL:
+        surface = replace(surface, levels=(replace(surface.levels[0], level=level),))
+    return structures(road(level), surface, level.number)
+
+
+@pytest.mark.parametrize(
+    ("rise", "crossed", "flags"),
+    [(7.0, 0, ()), (0.31, 0, ()), (0.29, 0, (NO_RISE,)), (-1.0, 1, (BELOW, NO_RISE))],
+)
+def test_figures_of_deck(rise, crossed, flags):
+    found, raised = of_plane(rise)
+    assert found == Structures(pytest.approx(160), 1, pytest.approx(rise, abs=1e-9), crossed)
+    assert raised == flags
+
+
+def test_tube_is_below_the_ground():
+    found, raised = of_plane(-5.0, replace(LEVEL, number=-1))
+    assert (found.clearance_m, found.crossed, raised) == (pytest.approx(5, abs=1e-9), 0, ())
+
+
+@pytest.mark.parametrize(("east", "flags"), [(45, (NO_JOINT,)), (60, ())])
+def test_deck_without_joint_is_flagged_if_its_ends_are_known(east, flags):
+    deck = shapely.multipolygons([shapely.box(WEST + 25, SOUTH + 20, WEST + east, SOUTH + 28)])
+    found, raised = of_plane(7.0, Level(1, deck, shapely.MultiLineString(), shapely.MultiPolygon()))
+    assert (found.joints, raised) == (0, flags)
+
+
+def test_deck_beside_the_core_has_no_figures():
+    west = replace(GRID, width=20)
+    assert structures(road(core=west), made_surface(), 1) == (None, ())
+
+
+def test_deck_below_the_ground_at_one_end_is_flagged():
+    found, raised = structures(road(), made_surface(100.0, 96.5, slope=0.1), 1)
+    assert 0.4 < found.crossed < 0.6
+    assert BELOW in raised
+
+
+def test_flags_of_decks_are_those_of_the_tile_and_results_keep_them():
+    heights = np.full(GRID.shape, 100.0)
+    data = TileData("a", GRID, GRID, heights, heights)
+    deck = RoadClusters(GRID, NOWHERE.astype(np.int32), level=LEVEL)
+    clusters = RoadClusters(GRID, NOWHERE.astype(np.int32), levels=(deck,))
+    quality = assess(data, road(), clusters, made_surface(100.0, 99.0), Options())
+    (own,) = quality.levels
+    assert own[1].structures.clearance_m == pytest.approx(-1, abs=1e-9)
+    assert {BELOW, NO_RISE} <= set(quality.flags)
+    assert {BELOW, NO_RISE} <= set(own[1].flags)
+    assert codec.decode(codec.encode(quality, {})).value.levels[0][1].structures == own[1].structures
