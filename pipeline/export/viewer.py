@@ -29,17 +29,20 @@ from flexroad.pipeline.export.source import TileItem, layer_state
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run, check_links
 from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
+from flexroad.pipeline.store.records import LEVELS
 from flexroad.pipeline.worker.texture import tile_photo
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import glb, viewer
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.load import layer_source
 from flexroad.tasks.meshing.normals import mesh_normals
+from flexroad.tasks.quality.support import top_support
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.centre_lines import read_centre_lines
 from flexroad.tasks.roads.rasterise import DEFAULTS
 from flexroad.tasks.roads.rasterise import Options as RoadOptions
 from flexroad.tasks.roads.routes import CentreLine
+from flexroad.tasks.spline.levelled import LevelledSurface, top_of
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats
 
@@ -247,7 +250,7 @@ def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any
         "origin": list(run.origin),
         "measures": {key: dict(zip(("title", "unit"), MEASURES[key], strict=True)) for key in known},
         "tiles": columns,
-    }
+    } | ({"levels": True} if any(LEVELS in row for row in rows) else {})
     return index, [tile for tile, state in zip(tiles, states, strict=True) if state == DONE]
 
 
@@ -335,9 +338,13 @@ def piece(item: TileItem, look: Look) -> Piece:
     tile = item.tile
     source, notes = tile.tile, list[str]()
     photo = _photo(source, look.photo_px, notes)
-    quality, surface = tile.quality, tile.surface
+    quality, surface, core = tile.quality, tile.surface, source.grid
+    top, support = None, quality.support
+    if isinstance(surface, LevelledSurface):
+        top = surface.top(*np.meshgrid(core.eastings, core.northings))
+        support = top_support(quality, top)
     try:
-        data, (estimate, _) = tile.data, tile.cell_errors
+        data, (estimate, _) = tile.data, tile.top_errors
     except ConfigError as error:
         dsm = dtm = estimate = None
         seen, places = "", {}
@@ -345,21 +352,23 @@ def piece(item: TileItem, look: Look) -> Piece:
     else:
         window = data.grid.window(data.core)
         dsm, dtm = data.dsm[window], data.dtm[window]
-        height = surface.lattice(data.core.eastings, data.core.northings)
+        height = top_of(surface).lattice(data.core.eastings, data.core.northings)
         height[tile.road.outside[window]] = np.nan
+        road = tile.road.mask[window] if top is None else tile.road.mask[window] | (top > 0)
         places = {flag: list(place) for flag, place in tile.flag_places.items()}
-        small = viewer.picture(height, tile.road.mask[window], data.core.cell)
+        small = viewer.picture(height, road, data.core.cell)
         seen = base64.b64encode(small).decode("ascii")
     scene = viewer.TileScene(
         tile.id,
         glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
         corners(source),
-        quality.support,
+        support,
         dsm,
         dtm,
         estimate,
-        surface if isinstance(surface, NurbsSurface) else None,
+        surface if isinstance(surface, NurbsSurface) and top is None else None,
+        None if top is None else top_of(surface).lattice(core.eastings, core.northings),
         _lines(source, look.roads, notes),
     )
     name = f"tiles/{safe_name(tile.id)}{viewer.NAME_TILE}"

@@ -285,6 +285,11 @@ class FinishedTile:
         return assess.cell_errors(self.data, self.road, self.clusters, self.surface, self.assessment)
 
     @property
+    def top_errors(self) -> tuple[Floats, NDArray[np.uint8]]:
+        """The same of the highest level."""
+        return assess.top_errors(self.data, self.road, self.clusters, self.surface, self.assessment)
+
+    @property
     def flag_places(self) -> dict[str, Place]:
         """Easting and northing (m) by raised flag, of those that have a place; needs the source files."""
         flags = self.quality.flags

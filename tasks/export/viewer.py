@@ -64,7 +64,9 @@ class TileScene:
     estimate: Floats | None = None
     """Error estimate of the surface, ``(H, W)``, m."""
     surface: NurbsSurface | None = None
-    """None if the surface is of another kind: the viewer then takes heights from the mesh."""
+    """None if the surface is of another kind or has levels: the viewer then takes heights from the mesh."""
+    top: Floats | None = None
+    """Height of the highest level, ``(H, W)``, m; None if there are no levels."""
     lines: tuple[CentreLine, ...] = ()
     """Road lines on the tile."""
 
@@ -94,6 +96,8 @@ def encode_tile(scene: TileScene) -> bytes:
         "steps": _steps(scene.surface),
         "lines": [_line(line, scene.grid) for line in scene.lines],
     }
+    if scene.top is not None:
+        content["top"] = _heights(scene.top, thinned)
     return _call("tile", scene.id, content)
 
 

@@ -188,6 +188,25 @@ def cell_errors(
     return np.where(cells.classes == Support.NONE, np.nan, cells.estimate), cells.classes
 
 
+def top_errors(
+    data: TileData, road: RoadMask, clusters: RoadClusters, surface: Surface, options: Options
+) -> tuple[Floats, NDArray[np.uint8]]:
+    """Return `cell_errors` of the highest level in each cell."""
+    estimate, classes = cell_errors(data, road, clusters, surface, options)
+    if not isinstance(surface, LevelledSurface):
+        return estimate, classes
+    top = surface.top(*np.meshgrid(data.core.eastings, data.core.northings))
+    for of_level in clusters.levels:
+        assert of_level.level
+        number = of_level.level.number
+        here = (top == number) & (number > 0)
+        if here.any():
+            seen, there = level_data(data, clusters, number), level_road(road, number)
+            own = cell_errors(seen, there, of_level, surface.at(number), options)
+            estimate, classes = np.where(here, own[0], estimate), np.where(here, own[1], classes)
+    return estimate, classes
+
+
 def _second_differences(height: Floats, on_road: Bools) -> Floats:
     """Return absolute second differences along rows and columns of three road cells each, ``(n,)``, m."""
     parts = []

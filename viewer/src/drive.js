@@ -1,6 +1,7 @@
 // A drive along a road line: the camera goes at the eye's height of a driver, from line to line where they meet.
 
 import { continuation, lengths, nearestLine, placeAt } from "./lines.js";
+import { nearest } from "./stage.js";
 
 const EYE_M = 2.2;
 const AHEAD_M = 18;
@@ -24,7 +25,7 @@ export class Drive {
 
   /** Starts at the place nearest to the one looked at; returns whether there is a line. */
   start() {
-    const [easting, northing] = this.stage.toGround(this.stage.controls.target);
+    const [easting, northing, height] = this.stage.toGround(this.stage.controls.target);
     const found = nearestLine(this.lines, easting, northing, START_WITHIN_M);
     if (!found) return false;
     const [eye, target] = [this.stage.camera.position, this.stage.controls.target];
@@ -36,6 +37,8 @@ export class Drive {
     this.stage.controls.enabled = false;
     this.last = null;
     this.heights = null;
+    // Where decks lie above streets the drive stays on the level that it is on.
+    this.ground = height;
     requestAnimationFrame((now) => this.step(now));
     return true;
   }
@@ -77,7 +80,9 @@ export class Drive {
     const { easting, northing, direction } = placeAt(this.points, this.along, this.at);
     const object = this.stage.objectAt(easting, northing);
     const surface = object?.at(easting, northing);
+    const levels = this.stage.levelsAt(easting, northing);
     if (surface) this.passed({ easting, northing, ...surface, drawn: surface.height, kind: "road", object, direction });
+    else if (levels.length) this.passed({ ...nearest(levels, this.ground), direction });
   }
 
   goOn(length) {
@@ -93,9 +98,10 @@ export class Drive {
   look(seconds) {
     const here = placeAt(this.points, this.along, this.at);
     const there = this.ahead();
-    const near = this.stage.heightAt(here.easting, here.northing);
+    const near = this.stage.heightAt(here.easting, here.northing, this.ground);
     if (near === null) return;
-    const far = this.stage.heightAt(...there) ?? near;
+    this.ground = near;
+    const far = this.stage.heightAt(...there, near) ?? near;
     // Seams and lost tiles do not shake the camera.
     const share = this.heights ? 1 - Math.exp(-seconds * 6) : 1;
     const before = this.heights ?? [near, far, ...there];

@@ -7,7 +7,7 @@ import { DONE, runOf } from "./run.js";
 import { TileScripts } from "./tile_scripts.js";
 import { OUTLINE, TileView } from "./tile_view.js";
 
-const LAYERS = { road: true, terrain: true, wire: false, points: false };
+const LAYERS = { road: true, terrain: true, levels: true, wire: false, points: false };
 const scripts = new TileScripts();
 let received = null;
 

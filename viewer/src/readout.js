@@ -9,9 +9,10 @@ import { SUPPORT } from "./words.js";
 const LINE_WITHIN_M = 12;
 
 export class Readout {
-  constructor(element, run) {
+  constructor(element, run, stage) {
     this.element = element;
     this.run = run;
+    this.stage = stage;
   }
 
   /** Shows a place that `Stage.pick` found; null clears the card. */
@@ -22,8 +23,12 @@ export class Readout {
     Object.assign(this.element.dataset, { easting, northing, height, drawn, kind: pick.kind, tile: object.tile.id });
     const [longitude, latitude] = lonLat(object.tile, object.data.corners, easting, northing);
     const cells = object.cellsAt(easting, northing);
+    const levels = this.stage.levelsAt(easting, northing);
+    // Cells have what is seen from above: it tells nothing of what lies below.
+    if (levels.length > 1 && pick.level < levels[0].level) Object.assign(cells, { support: 0, estimate: NaN });
     const rows = [
       ["Height", `${metres(height)} m`, "strong"],
+      ...(levels.length > 1 ? levels.map((found) => [`Level ${found.level}`, `${metres(found.height)} m`]) : []),
       ["East, north", `${metres(easting, 2)}, ${metres(northing, 2)}`],
       ["Lat, lon", `${latitude.toFixed(6)}°, ${longitude.toFixed(6)}°`],
       ...this.slopes(pick),

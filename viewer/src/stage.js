@@ -21,6 +21,11 @@ const CLOSE_M = 40;
 const OUTLINE_POINTS = 64;
 const EDGE_M = 0.05;
 
+/** Returns the pick of several whose height is nearest to a height (m). */
+export function nearest(picks, height) {
+  return picks.reduce((best, pick) => (Math.abs(pick.height - height) < Math.abs(best.height - height) ? pick : best));
+}
+
 export class Stage {
   /** Draws into a canvas; `events` are changed(), entered(tile), loading(number), failed(tile, error), frame(). */
   constructor(canvas, run, scripts, events) {
@@ -40,7 +45,7 @@ export class Stage {
     this.controls.addEventListener("change", () => this.moved());
     this.objects = new Map();
     this.missing = new Set();
-    this.look = { colour: "class", road: true, terrain: true, wire: false, points: false, z: 1 };
+    this.look = { colour: "class", road: true, terrain: true, levels: true, wire: false, points: false, z: 1 };
     this.base = 0;
     this.active = false;
     new ResizeObserver(() => this.resize()).observe(canvas);
@@ -212,13 +217,26 @@ export class Stage {
     return [x + east, north - z, y / this.look.z + this.base];
   }
 
-  /** Returns the height of the surface at a place (m); null where no tile is loaded. */
-  heightAt(easting, northing) {
+  /**
+   * Returns the height of the surface at a place (m); null where no tile is loaded. With decks or tubes it is that
+   * of what is seen from above, or of the level that is nearest to a height.
+   */
+  heightAt(easting, northing, near = null) {
+    const levels = near === null ? [] : this.levelsAt(easting, northing);
+    if (levels.length) return nearest(levels, near).height;
     for (const object of this.objects.values()) {
       const found = object.at(easting, northing);
       if (found) return found.height;
     }
     return this.meshHeight(easting, northing);
+  }
+
+  /** Returns what each level has at a place, as `pick`, the highest first; nothing on tiles with level 0 alone. */
+  levelsAt(easting, northing) {
+    const object = this.objectAt(easting, northing);
+    if (!object?.data.top) return [];
+    const found = object.levels.map((level) => this.hit(this.down(easting, northing), object.meshesOf(level)));
+    return found.filter(Boolean).sort((a, b) => b.height - a.height);
   }
 
   /** Returns the loaded tile under a place. */
@@ -232,16 +250,22 @@ export class Stage {
     const { clientWidth, clientHeight } = this.renderer.domElement;
     const ray = new Raycaster();
     ray.setFromCamera(new Vector2((2 * x) / clientWidth - 1, 1 - (2 * y) / clientHeight), this.camera);
-    return this.hit(ray);
+    return this.hit(ray, this.visible());
   }
 
   meshHeight(easting, northing) {
-    const ray = new Raycaster(this.toScene(easting, northing, this.base + 1e5), new Vector3(0, -1, 0));
-    return this.hit(ray, false)?.height ?? null;
+    return this.hit(this.down(easting, northing), this.visible(), false)?.height ?? null;
   }
 
-  hit(ray, exact = true) {
-    const meshes = [...this.objects.values()].flatMap((object) => Object.values(object.meshes).filter((mesh) => mesh.visible));
+  down(easting, northing) {
+    return new Raycaster(this.toScene(easting, northing, this.base + 1e5), new Vector3(0, -1, 0));
+  }
+
+  visible() {
+    return [...this.objects.values()].flatMap((object) => Object.values(object.meshes).filter((mesh) => mesh.visible));
+  }
+
+  hit(ray, meshes, exact = true) {
     const [first] = ray.intersectObjects(meshes, false);
     if (!first) return null;
     const [easting, northing, height] = this.toGround(first.point);
@@ -256,6 +280,7 @@ export class Stage {
       byEasting: surface?.byEasting ?? -x / y,
       byNorthing: surface?.byNorthing ?? z / y,
       kind: first.object.name,
+      level: first.object.userData.level,
       object,
     };
   }

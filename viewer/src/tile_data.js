@@ -30,6 +30,7 @@ export async function unpacked(tile, data) {
       grid,
       at: (index) => (estimate[index] === NO_ESTIMATE ? NaN : (estimate[index] - 1) * ESTIMATE_STEP),
     },
+    top: await raster(data.top),
     surface: data.surface && spline(numbers(data.surface)),
     steps: await raster(data.steps, data.steps?.grid),
     corners: data.corners,

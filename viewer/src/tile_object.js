@@ -58,10 +58,10 @@ export class TileObject {
     const { west, north, cell, rows, cols } = this.data.grid;
     const [x, , z] = part.translation;
     const box = [west - this.origin[0] - x, this.origin[1] - north - z, cols * cell, rows * cell];
-    const mesh = new Mesh(geometry, surfaceMaterial(shared, OWN[name] ?? OWN.terrain, box, this.textures));
+    const mesh = new Mesh(geometry, surfaceMaterial(shared, OWN[part.kind] ?? OWN.terrain, box, this.textures));
     mesh.position.set(...part.translation);
-    mesh.name = name;
-    mesh.userData.owner = this;
+    mesh.name = part.kind;
+    mesh.userData = { owner: this, level: part.level };
     const wire = new Mesh(
       geometry,
       new MeshBasicMaterial({ wireframe: true, color: 0x10222c, transparent: true, opacity: 0.35, depthWrite: false }),
@@ -74,14 +74,24 @@ export class TileObject {
   }
 
   /** Shows the parts and layers that are wanted. */
-  apply({ road, terrain, wire, points }) {
+  apply({ road, terrain, levels, wire, points }) {
     const wanted = { road, terrain };
-    for (const name of Object.keys(this.meshes)) {
-      this.meshes[name].visible = wanted[name] ?? true;
+    for (const [name, { kind, level }] of Object.entries(this.data.parts)) {
+      this.meshes[name].visible = (wanted[kind] ?? true) && (levels || level === 0);
       this.wires[name].visible = wire && this.meshes[name].visible;
     }
     if (points && !this.points) this.points = this.scanPoints();
     if (this.points) this.points.visible = points;
+  }
+
+  /** The numbers of its levels: 0, and those of decks and tubes. */
+  get levels() {
+    return [...new Set(Object.values(this.data.parts).map(({ level }) => level))];
+  }
+
+  /** Returns the meshes of a level. */
+  meshesOf(level) {
+    return Object.values(this.meshes).filter((mesh) => mesh.userData.level === level);
   }
 
   /** Returns height (m) and slopes of the surface at a place; null beside the tile. */
@@ -139,7 +149,7 @@ export class TileObject {
       if (Number.isNaN(height)) continue;
       const [easting, northing] = centre(grid, index);
       places.push(easting - x0, height - base, z0 - northing);
-      const surface = this.at(easting, northing)?.height ?? height;
+      const surface = this.data.top?.at(index) ?? this.at(easting, northing)?.height ?? height;
       colours.push(...pointColour(height - surface));
     }
     geometry.setAttribute("position", new BufferAttribute(new Float32Array(places), 3));

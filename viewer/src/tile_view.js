@@ -12,7 +12,7 @@ import { Stage } from "./stage.js";
 import { POINTS } from "./tile_object.js";
 
 const CLICK_PX = 5;
-const KEYS = { r: "road", t: "terrain", w: "wire", s: "points" };
+const KEYS = { r: "road", t: "terrain", w: "wire", s: "points", l: "levels" };
 const COLOUR_KEYS = ["class", "photo", "support", "estimate"];
 /** Name of the line around the tile. */
 export const OUTLINE = "outline";
@@ -36,7 +36,7 @@ export class TileView {
       frame: () => this.overlay.update(),
     });
     this.overlay = new Overlay(this.stage);
-    this.readout = new Readout(byId("readout"), run);
+    this.readout = new Readout(byId("readout"), run, this.stage);
     this.drive = new Drive(this.stage, { passed: (pick) => this.readout.show(pick), ended: () => this.driveEnded() });
     this.places = [];
     this.listen();
@@ -105,6 +105,7 @@ export class TileView {
         "Show",
         layer("road", "Road"),
         layer("terrain", "Terrain"),
+        this.run.levels ? layer("levels", "Decks and tubes") : null,
         layer("wire", "Wireframe"),
         layer("points", "Scan points (DSM)", lacks(data?.dsm, "scan to compare with")),
         look.points ? legend(POINTS) : null,

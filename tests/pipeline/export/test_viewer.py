@@ -59,6 +59,7 @@ def handed_over(path):
 
 def test_index_has_all_tiles_with_their_states_and_errors(city, folder):
     (index,) = handed_over(folder / "run.js")
+    assert "levels" not in index
     tiles = index["tiles"]
     assert sorted(tiles["state"]) == [viewer.PENDING, viewer.DONE, viewer.DONE, viewer.FAILED]
     failed = tiles["state"].index(viewer.FAILED)

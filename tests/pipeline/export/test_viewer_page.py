@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import flexroad
 from flexroad.catalog import Catalog
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
@@ -490,3 +491,45 @@ def test_folder_without_a_script_says_so(tmp_path, missing):
     assert "run.js" in text
     assert "flexroad view" in text
     assert answer["requests"] == []
+
+
+def test_decks_are_hidden_by_a_key_and_a_drive_stays_on_its_level(tmp_path):
+    catalog = Catalog.read(write_scenes(tmp_path / "survey", 4, seed=0, size_m=60, decks=True))
+    run = Run.create(tmp_path / "run", load_config("production_vector", ["segment.levels=true"]), catalog)
+    run_tiles(run, SerialExecutor())
+    page = write_viewer(run, tmp_path / "viewer", SerialExecutor()).page
+    tiles = select(run.path).finished()
+    tile = next(tile for tile in tiles if 1 in tile.mesh.numbers)
+    x, y = np.meshgrid(tile.tile.grid.eastings, tile.tile.grid.northings)
+    rise = np.where(
+        tile.surface.covers(1, x, y), tile.surface.at(1).height(x, y) - tile.surface.height(x, y), 0
+    )
+    highest = np.unravel_index(rise.argmax(), rise.shape)
+    east, north = x[highest], y[highest]
+    deck = tile.surface.at(1).height(east, north)
+    camera = f"&camera={east:.1f},{north - 9:.1f},{deck + 40:.1f},{east:.1f},{north:.1f},{deck:.1f}"
+    middle = [(1000 - 330) / 2, 320]
+    card = "document.getElementById('readout')"
+    shown = f"({{...{card}.dataset, text: {card}.innerText}})"
+    checks = "[...document.querySelectorAll('#panel-content label')].map((one) => one.innerText.trim())"
+    _, _, names, _, above, _, _, below, _, _, _, driven = browse(
+        page,
+        {"wait": SETTLED},
+        {"wait": SETTLED},
+        {"eval": checks},
+        {"move": middle},
+        {"eval": shown},
+        {"key": "l"},
+        {"move": [middle[0] + 1, middle[1]]},
+        {"eval": shown},
+        {"key": "l"},
+        {"key": "d"},
+        {"wait": f"() => {card}.innerText.includes('Grade')"},
+        {"eval": shown},
+        fragment=f"#tile={tile.id}{camera}",
+    )
+    assert "Decks and tubes" in names
+    assert {"Level 0", "Level 1"} <= set(above["text"].splitlines())
+    assert float(above["height"]) - float(below["height"]) > 0.7 * rise.max()
+    places = np.array([[float(driven["easting"])], [float(driven["northing"])]])
+    assert abs(float(driven["height"]) - flexroad.open_run(run.path).height(*places)[0]) < 0.1

@@ -16,6 +16,7 @@ from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.export.viewer import write_viewer
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.garbage import find_garbage
 from flexroad.pipeline.run.record import Run
@@ -27,6 +28,7 @@ from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.synthetic.crossings import Crossings
 from tests.command_line import call
 from tests.mesh_union import Union
+from tests.tasks.export.test_viewer import content, heights
 
 SEED, SIZE_M = 0, 60
 WITH_LEVELS = ["segment.levels=true"]
@@ -155,6 +157,31 @@ def test_decks_have_figures_in_a_table_and_in_the_report(run):
     page = (run.path / "report.html").read_text()
     assert "<summary>Decks and tubes</summary>" in page
     assert '"no-rise"' not in page
+
+
+def test_viewer_has_heights_and_estimates_of_the_highest_level(run, tmp_path):
+    write_viewer(run, tmp_path, SerialExecutor())
+    index = (tmp_path / "run.js").read_text()
+    assert json.loads(index[index.index("(") + 1 : index.rindex(")")])["levels"] is True
+    view, on_decks = flexroad.open_run(run.path), []
+    for tile in finished(run):
+        made = content((tmp_path / "tiles" / f"{tile.tile.id}.js").read_bytes())
+        if not isinstance(tile.surface, LevelledSurface):
+            assert "top" not in made
+            assert made["surface"]
+            continue
+        assert made["surface"] is None
+        at = np.meshgrid(tile.tile.grid.eastings, tile.tile.grid.northings)
+        np.testing.assert_allclose(heights(made["top"], made["grid"]), view.height(*at), atol=1e-3)
+        deck = np.isfinite(view.height(*at, 1))
+        (top, support), (low, _) = tile.top_errors, tile.cell_errors
+        np.testing.assert_array_equal(top[~deck], low[~deck])
+        on_decks.append((top[deck], low[deck], support[deck]))
+    top, low, support = (np.concatenate(values) for values in zip(*on_decks, strict=True))
+    assert len(top) > 100
+    assert top.mean() < 0.05
+    assert low.mean() > 0.2
+    assert (support == Support.MEASURED).mean() > 0.5
 
 
 @pytest.mark.slow
