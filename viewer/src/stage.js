@@ -266,6 +266,8 @@ export class Stage {
   }
 
   hit(ray, meshes, exact = true) {
+    // Tiles that were not drawn yet have no places otherwise.
+    this.ground.updateMatrixWorld();
     const [first] = ray.intersectObjects(meshes, false);
     if (!first) return null;
     const [easting, northing, height] = this.toGround(first.point);

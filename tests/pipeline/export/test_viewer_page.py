@@ -512,10 +512,10 @@ def test_decks_are_hidden_by_a_key_and_a_drive_stays_on_its_level(tmp_path):
     card = "document.getElementById('readout')"
     shown = f"({{...{card}.dataset, text: {card}.innerText}})"
     checks = "[...document.querySelectorAll('#panel-content label')].map((one) => one.innerText.trim())"
-    _, _, names, _, above, _, _, below, _, _, _, driven = browse(
+    _, around, names, _, above, _, _, below, _, _, _, driven = browse(
         page,
         {"wait": SETTLED},
-        {"wait": SETTLED},
+        {"eval": f"{INSPECT}.outline"},
         {"eval": checks},
         {"move": middle},
         {"eval": shown},
@@ -529,7 +529,12 @@ def test_decks_are_hidden_by_a_key_and_a_drive_stays_on_its_level(tmp_path):
         fragment=f"#tile={tile.id}{camera}",
     )
     assert "Decks and tubes" in names
+    heights = flexroad.open_run(run.path).height
+    x, y, z = np.array(around).T
+    off = np.abs(z - heights(x, y))
+    # The mesh is steep where the surface has steps.
+    assert (np.median(off) < 0.05, off.max() < 3) == (True, True)
     assert {"Level 0", "Level 1"} <= set(above["text"].splitlines())
     assert float(above["height"]) - float(below["height"]) > 0.7 * rise.max()
     places = np.array([[float(driven["easting"])], [float(driven["northing"])]])
-    assert abs(float(driven["height"]) - flexroad.open_run(run.path).height(*places)[0]) < 0.1
+    assert abs(float(driven["height"]) - heights(*places)[0]) < 0.1
