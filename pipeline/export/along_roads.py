@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexroad.catalog.storage.paths import Location, read, stat, write
 from flexroad.catalog.text import count, no_formula
@@ -32,6 +33,7 @@ from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import opencrg, opendrive
+from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
 from flexroad.tasks.roads import reference_line as lines
 from flexroad.tasks.roads.along_line import (
     HeightAt,
@@ -47,6 +49,7 @@ from flexroad.tasks.roads.along_line import (
 from flexroad.tasks.roads.local_frame import LocalFrame
 from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.roads.routes import Route
+from flexroad.tasks.types import Floats
 
 VERSION = 5
 """Of the roads themselves: their division, lines and grids."""
@@ -82,6 +85,8 @@ class RouteUnit:
     """From 1."""
     route: Route
     tiles: tuple[GroundTile, ...]
+    levelled: bool = False
+    """Whether the roads of the export have levels."""
 
     @property
     def id(self) -> str:
@@ -100,6 +105,8 @@ class RouteUnit:
         for part in self.route.parts:
             text.update(repr((part.width_m, part.lanes, part.oneway, part.name)).encode())
             text.update(part.points.tobytes())
+            if self.levelled:
+                text.update(repr(part.level).encode())
         return text.hexdigest()
 
     def height(self, work: Work) -> HeightAt:
@@ -110,8 +117,21 @@ class RouteUnit:
         """Return the height of the surface with steps above it, in the local frame."""
         return self._local(Ground(self.tiles).step, work)
 
-    def _local(self, of: HeightAt, work: Work) -> HeightAt:
-        return lambda x, y: of(*work.frame.to_run(x, y))
+    def levels(self, x: Floats, y: Floats) -> PlaceLevels | None:
+        """Return the levels of places in the local frame; None if the route is on level 0 alone."""
+        return None if self._levels is None else self._levels.at(x, y)
+
+    def levels_on(self, x: Floats, y: Floats) -> NDArray[np.int8]:
+        """Return the levels of the centre line at places on it."""
+        found = self.levels(x, y)
+        return np.zeros(x.shape, np.int8) if found is None else found.of_line
+
+    @cached_property
+    def _levels(self) -> RouteLevels | None:
+        return RouteLevels.of(self.route)
+
+    def _local(self, of: Callable[[Floats, Floats, PlaceLevels | None], Floats], work: Work) -> HeightAt:
+        return lambda x, y: of(*work.frame.to_run(x, y), self.levels(x, y))
 
     def road_id(self, part: int) -> int:
         """Return the number of a road: OpenDRIVE's readers want whole numbers."""
@@ -129,7 +149,7 @@ def units(roads: Network, tiles: Iterable[FinishedTile]) -> Iterator[RouteUnit]:
         passed[index] = GroundTile.of(tile)
         for number in waiting.pop(index, ()):
             touching = tuple(passed[int(k)] for k in roads.tiles[number])
-            yield RouteUnit(number + 1, roads.routes[number], touching)
+            yield RouteUnit(number + 1, roads.routes[number], touching, roads.levels)
 
 
 def write_crg(
@@ -226,7 +246,9 @@ def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
         road = unit.road_id(part)
         fitted = profiles(grid)
         crg = None if work.crg is None else f"{work.crg}{road}{opencrg.NAME}"
-        texts.append(opendrive.encode(opendrive.Road(str(road), grid.line, fitted, crg), work.left_hand))
+        decks = structures(unit.levels_on(grid.line.x, grid.line.y), grid.line.s)
+        written = opendrive.Road(str(road), grid.line, fitted, crg, decks)
+        texts.append(opendrive.encode(written, work.left_hand))
         rows.append(row(road, grid, height, step, fitted))
     return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, rows, problem))
 

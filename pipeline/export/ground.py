@@ -6,7 +6,7 @@ beside roads. `Ground.step` and the texts here say by how much that differs from
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds, Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import FinishedTile
-from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
+from flexroad.tasks.levels.along_route import PlaceLevels
+from flexroad.tasks.spline.levelled import LevelledSurface
+from flexroad.tasks.spline.stepped import SteppedSurface
+from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Surface
 
 SURFACES, ESTIMATES = 128, 32
@@ -66,45 +69,63 @@ class Ground:
 
     tiles: tuple[GroundTile, ...]
 
-    def height(self, easting: Floats, northing: Floats) -> Floats:
+    def height(self, easting: Floats, northing: Floats, levels: PlaceLevels | None = None) -> Floats:
         """Return heights (m) at points (m, in the run's CRS), in their broadcast shape.
 
         NaN off the tiles and beyond the survey. Where tiles meet, the first one with a height counts.
+
+        Parameters
+        ----------
+        levels : PlaceLevels, optional
+            The levels of the points, of which heights are; level 0 where the tile does not have it, but NaN
+            in tubes. None: all of level 0.
 
         Raises
         ------
         ConfigError
             If a result of a tile cannot be read, or the tile has changed.
         """
-        return self._first(_Patch.height, easting, northing)
+        return self._first(_Patch.height, easting, northing, levels)
 
-    def step(self, easting: Floats, northing: Floats) -> Floats:
+    def step(self, easting: Floats, northing: Floats, levels: PlaceLevels | None = None) -> Floats:
         """Return by how much the surface with steps is higher (m); the rest is as of `height`."""
-        return self._first(_Patch.step, easting, northing)
+        return self._first(_Patch.step, easting, northing, levels)
 
     def _first(
-        self, of: Callable[[_Patch, Floats, Floats], Floats], easting: Floats, northing: Floats
+        self,
+        of: Callable[[_Patch, Floats, Floats, PlaceLevels | None], Floats],
+        easting: Floats,
+        northing: Floats,
+        levels: PlaceLevels | None,
     ) -> Floats:
         easting, northing = np.broadcast_arrays(easting, northing)
         values = np.full(easting.shape, np.nan)
         for tile in self.tiles:
             here = np.isnan(values) & _within(tile.grid.bounds, easting, northing)
             if here.any():
-                values[here] = of(_patch(tile), easting[here], northing[here])
+                values[here] = of(
+                    _patch(tile), easting[here], northing[here], None if levels is None else levels[here]
+                )
         return values
 
-    def error(self, easting: Floats, northing: Floats) -> tuple[Floats, NDArray[np.uint8]]:
+    def error(
+        self, easting: Floats, northing: Floats, levels: PlaceLevels | None = None
+    ) -> tuple[Floats, NDArray[np.uint8]]:
         """Return the estimated error (m) of the surface and its `tasks.quality.support.Support`, ``(n,)``.
 
-        They are those of the cell at each point. NaN and 0 where no surface is, or its input is gone.
+        They are those of the cell at each point, on its own level. NaN and 0 where no surface is, or its
+        input is gone.
         """
+        numbers = np.zeros(easting.shape, np.int8) if levels is None else levels.number * levels.own
         error, support = np.full(easting.shape, np.nan), np.zeros(easting.shape, np.uint8)
         for tile in self.tiles:
-            here = (support == 0) & _within(tile.grid.bounds, easting, northing)
-            estimate = _estimate(tile) if here.any() else None
-            if estimate is not None:
-                cells = tile.grid.cells(easting[here], northing[here])
-                error[here], support[here] = (values[cells] for values in estimate)
+            within = (support == 0) & _within(tile.grid.bounds, easting, northing)
+            for number in np.unique(numbers[within]).tolist():
+                here = within & (numbers == number)
+                estimate = _estimate(tile, number)
+                if estimate is not None:
+                    cells = tile.grid.cells(easting[here], northing[here])
+                    error[here], support[here] = (values[cells] for values in estimate)
         return error, support
 
 
@@ -115,15 +136,44 @@ class _Patch:
     outside: Bools
     """Cells beyond the survey, ``(H, W)``."""
 
-    def height(self, easting: Floats, northing: Floats) -> Floats:
-        beyond = self.outside[self.grid.cells(easting, northing)]
-        return np.where(beyond, np.nan, without_steps(self.surface).height(easting, northing))
-
-    def step(self, easting: Floats, northing: Floats) -> Floats:
-        beyond = self.outside[self.grid.cells(easting, northing)]
+    def height(self, easting: Floats, northing: Floats, levels: PlaceLevels | None) -> Floats:
         surface = self.surface
-        steps = surface.step(easting, northing) if isinstance(surface, SteppedSurface) else 0.0
-        return np.where(beyond, np.nan, steps)
+        smooth = surface.smooth if isinstance(surface, SteppedSurface) else surface.height
+        heights = np.array(smooth(easting, northing))
+        for own, here in self._others(easting, northing, levels):
+            heights[here] = own.height(easting[here], northing[here]) if own else np.nan
+        return self._known(heights, easting, northing)
+
+    def step(self, easting: Floats, northing: Floats, levels: PlaceLevels | None) -> Floats:
+        surface = self.surface
+        steps = np.zeros(easting.shape)
+        if isinstance(surface, SteppedSurface):
+            steps[:] = surface.step(easting, northing)
+        for _, here in self._others(easting, northing, levels):
+            steps[here] = 0.0
+        return self._known(steps, easting, northing)
+
+    def _known(self, values: Floats, easting: Floats, northing: Floats) -> Floats:
+        return np.where(self.outside[self.grid.cells(easting, northing)], np.nan, values)
+
+    def _others(
+        self, easting: Floats, northing: Floats, levels: PlaceLevels | None
+    ) -> Iterator[tuple[NurbsSurface | None, Bools]]:
+        """Yield the surface of each level but 0 with the points that have it; None for an unknown tube."""
+        if levels is None:
+            return
+        surface = self.surface
+        splines = surface.levels if isinstance(surface, LevelledSurface) else ()
+        known = {own.level.number: own.level for own in splines}
+        for number in np.unique(levels.number[levels.number != 0]).tolist():
+            here = levels.number == number
+            if number in known:
+                level, at = known[number], (easting, northing)
+                # Beyond deck and approach, nothing holds this surface.
+                assert isinstance(surface, LevelledSurface)
+                yield surface.at(number), here & (levels.own | level.covers(*at) | (level.weight(*at) > 0))
+            elif number < 0:
+                yield None, here & levels.own
 
 
 def _within(bounds: Bounds, easting: Floats, northing: Floats) -> Bools:
@@ -140,10 +190,10 @@ def _patch(tile: GroundTile) -> _Patch:
 
 
 @lru_cache(maxsize=ESTIMATES)
-def _estimate(tile: GroundTile) -> tuple[NDArray[np.float32], NDArray[np.uint8]] | None:
-    """Return the estimates and the support of a tile; None if its input cannot be read any more."""
+def _estimate(tile: GroundTile, number: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]] | None:
+    """Return the estimates and the support of a level; None if the tile's input cannot be read any more."""
     try:
-        error, support = tile.unread.cell_errors
+        error, support = tile.unread.level_errors(number)
     except ConfigError:
         return None
     return error.astype(np.float32), support

@@ -26,6 +26,7 @@ from flexroad.tasks.roads import routes as routing
 from flexroad.tasks.roads.centre_lines import CentreLines, read_centre_lines
 from flexroad.tasks.roads.local_frame import LocalFrame
 from flexroad.tasks.roads.routes import CentreLine, Route
+from flexroad.tasks.segment import vector
 
 BEYOND_M = 25.0
 """Centre lines are cut this far beyond the tiles (m), so that their smoothing at the limit is the same."""
@@ -47,6 +48,8 @@ class Network:
     areas: int
     """Number of road polygons that were left out."""
     notes: tuple[str, ...]
+    levels: bool = False
+    """Whether the run has levels, and one of the roads is on a deck or in a tube."""
 
 
 @lru_cache(maxsize=1)
@@ -76,24 +79,27 @@ def network(source: Source, options: Options) -> Network:
     shapes = [shapely.LineString(np.column_stack(frame.to_run(*route.points.T))) for route in routes]
     touched = tuple(_touched(routes, shapes, boxes))
     lengths = tuple(map(float, shapely.length(shapely.intersection(shapes, ground))))
-    return Network(frame, routes, touched, lengths, found.areas, found.notes)
+    return Network(
+        frame, routes, touched, lengths, found.areas, found.notes, any(line.level for line in lines)
+    )
 
 
 def _read(source: Source, options: Options) -> CentreLines:
     """Return the centre lines whose boxes touch the tiles."""
+    stage = source.run.config.chains[source.variant]["segment"]
     if options.roads is not None:
         layer = _given(Path(options.roads), options.roads_layer, source.crs)
         places = {layer: union([tile.grid.bounds for tile in source.tiles])}
         chosen = rasterise.Options()
     else:
         places = _of_catalog(source)
-        stage = source.run.config.chains[source.variant]["segment"]
         chosen = stage if isinstance(stage, rasterise.Options) else rasterise.Options()
+    levels = stage.read_levels if isinstance(stage, vector.Options) else None
     parts = []
     for (path, crs, sublayer), bounds in places.items():
         layer_source = types.Source("roads", (path,), crs, sublayer=sublayer)
         try:
-            parts.append(read_centre_lines(layer_source, bounds, source.crs, chosen))
+            parts.append(read_centre_lines(layer_source, bounds, source.crs, chosen, levels))
         except TaskError as error:
             raise ConfigError(str(error)) from error
     lines = {line.points.tobytes(): line for part in parts for line in part.lines}

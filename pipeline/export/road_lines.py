@@ -78,8 +78,16 @@ def lines_piece(unit: RouteUnit, work: Work) -> Piece:
     rows, arrays = list[Row](), dict[str, Any]()
     for number, part in enumerate(parts):
         along = stations(part, height)
-        rows.append(_road(unit.road_id(number), part, along, stations(part, step)))
-        arrays |= {f"{number}.{name}": values for name, values in _arrays(along, unit, work).items()}
+        own, segments = (
+            _road(unit.road_id(number), part, along, stations(part, step)),
+            _arrays(along, unit, work),
+        )
+        if unit.levelled:
+            levels = unit.levels_on(along.middle_x, along.middle_y)
+            own["level"] = max(levels.tolist(), key=abs)
+            segments["level"] = levels.astype(np.int32)
+        rows.append(own)
+        arrays |= {f"{number}.{name}": values for name, values in segments.items()}
     if not rows and not problem:
         problem = "no part of it has a surface for long enough"
     buffer = io.BytesIO()
@@ -123,7 +131,8 @@ def _mean(values: Any) -> float | None:
 
 def _arrays(along: Stations, unit: RouteUnit, work: Work) -> dict[str, Any]:
     easting, northing = work.frame.to_run(along.x, along.y)
-    error, support = Ground(unit.tiles).error(*work.frame.to_run(along.middle_x, along.middle_y))
+    levels = unit.levels(along.middle_x, along.middle_y)
+    error, support = Ground(unit.tiles).error(*work.frame.to_run(along.middle_x, along.middle_y), levels)
     return {
         "points": np.column_stack([easting, northing, along.z]),
         "support": support,

@@ -282,7 +282,12 @@ class FinishedTile:
     @property
     def cell_errors(self) -> tuple[Floats, NDArray[np.uint8]]:
         """Estimated error (m) and support of each cell of the core; needs the source files."""
-        return assess.cell_errors(self.data, self.road, self.clusters, self.surface, self.assessment)
+        return self.level_errors(0)
+
+    def level_errors(self, number: int) -> tuple[Floats, NDArray[np.uint8]]:
+        """Return `cell_errors` of a level; those of level 0 if the tile does not have it."""
+        inputs = self.data, self.road, self.clusters, self.surface
+        return assess.cell_errors(*inputs, self.assessment, number)
 
     @property
     def top_errors(self) -> tuple[Floats, NDArray[np.uint8]]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.text import printable
+from flexroad.tasks.levels.along_route import Structure
 from flexroad.tasks.roads.along_line import Profiles
 from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.types import Floats
@@ -58,6 +59,8 @@ class Road:
     profiles: Profiles
     crg: str | None = None
     """Name of the OpenCRG file of the same line, relative to the OpenDRIVE file; None if it has none."""
+    structures: tuple[Structure, ...] = ()
+    """Its bridges and tunnels."""
 
 
 def encode(road: Road, left_hand: bool = False) -> bytes:
@@ -122,9 +125,21 @@ def _road(road: Road, left_hand: bool) -> ET.Element:
         for s, (d, c, b, a) in zip(spline.x[:-1], spline.c.T, strict=True):
             ET.SubElement(parent, tag, _attributes(s=s, a=a, b=b, c=c, d=d))
     element.append(_lanes(road.line, left_hand))
+    if road.structures:
+        element.append(_objects(road))
     if road.crg is not None:
         ET.SubElement(ET.SubElement(element, "surface"), "CRG", _crg(road.line, road.crg, lengths[-1]))
     return element
+
+
+def _objects(road: Road) -> ET.Element:
+    """Return the bridges and tunnels; the schema wants tunnels first, and a material of bridges."""
+    objects = ET.Element("objects")
+    for number, part in sorted(enumerate(road.structures, 1), key=lambda each: each[1].level > 0):
+        kind = ("bridge", "concrete") if part.level > 0 else ("tunnel", "standard")
+        places = _attributes(s=part.start, length=part.end - part.start)
+        ET.SubElement(objects, kind[0], {"id": f"{road.id}_{number}", "type": kind[1], **places})
+    return objects
 
 
 def _geometry(curve: PPoly, start: float, end: float, s: float, s_end: float) -> ET.Element:

@@ -131,7 +131,8 @@ def assess(
         found, flags = structures(road, surface, number)
         # Away from its decks a level has no figures: it is no road that was lost.
         own_flags = (*quality.flags, *flags) if found else ()
-        others.append((number, replace(quality, structures=found, flags=own_flags)))
+        support = _hidden(quality.support) if number < 0 else quality.support
+        others.append((number, replace(quality, structures=found, flags=own_flags, support=support)))
     raised = {flag for _, quality in others for flag in quality.flags}
     flags = (*own.flags, *(flag for flag in STRUCTURE_FLAGS if flag in raised))
     return replace(own, flags=flags, levels=tuple(others))
@@ -178,14 +179,30 @@ def _assess(
 
 
 def cell_errors(
-    data: TileData, road: RoadMask, clusters: RoadClusters, surface: Surface, options: Options
+    data: TileData,
+    road: RoadMask,
+    clusters: RoadClusters,
+    surface: Surface,
+    options: Options,
+    number: int = 0,
 ) -> tuple[Floats, NDArray[np.uint8]]:
     """Return the estimated error (m) and the `Support` of each cell of the core, ``(H, W)``; see `assess`.
 
-    The estimate is NaN beyond the survey.
+    They are those of a level, or of level 0 if the tile does not have it. The estimate is NaN beyond the
+    survey, and beyond decks and tubes.
     """
+    own = [own for own in clusters.levels if own.level and own.level.number == number]
+    if own and isinstance(surface, LevelledSurface):
+        data, road, surface = level_data(data, clusters, number), level_road(road, number), surface.at(number)
+        clusters = own[0]
     cells = compare(data, road, clusters, surface, options.agree_m)
-    return np.where(cells.classes == Support.NONE, np.nan, cells.estimate), cells.classes
+    classes = _hidden(cells.classes) if number < 0 else cells.classes
+    return np.where(classes == Support.NONE, np.nan, cells.estimate), classes
+
+
+def _hidden(classes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the support in tubes, of which no height is measured."""
+    return np.where(classes == Support.NONE, classes, np.uint8(Support.INFERRED))
 
 
 def top_errors(
@@ -201,8 +218,7 @@ def top_errors(
         number = of_level.level.number
         here = (top == number) & (number > 0)
         if here.any():
-            seen, there = level_data(data, clusters, number), level_road(road, number)
-            own = cell_errors(seen, there, of_level, surface.at(number), options)
+            own = cell_errors(data, road, clusters, surface, options, number)
             estimate, classes = np.where(here, own[0], estimate), np.where(here, own[1], classes)
     return estimate, classes
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.io.vectors import Query, encoding_notes, read_near
-from flexroad.tasks.roads import widths
+from flexroad.tasks.roads import level_numbers, widths
 from flexroad.tasks.roads.attributes import has_value
-from flexroad.tasks.roads.rasterise import Options, columns, selected
+from flexroad.tasks.roads.rasterise import LevelColumns, Options, columns, selection
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.types import Source
 
@@ -41,7 +41,9 @@ class CentreLines:
     notes: tuple[str, ...] = ()
 
 
-def read_centre_lines(source: Source, bounds: Bounds, crs: str, options: Options) -> CentreLines:
+def read_centre_lines(
+    source: Source, bounds: Bounds, crs: str, options: Options, levels: LevelColumns | None = None
+) -> CentreLines:
     """Return the centre lines whose boxes touch an area.
 
     Parameters
@@ -52,6 +54,9 @@ def read_centre_lines(source: Source, bounds: Bounds, crs: str, options: Options
         West, south, east and north (m, in ``crs``).
     crs : str
         CRS of the result.
+    levels : LevelColumns, optional
+        Columns with the level of a road. Roads below level 0 are then kept, whatever ``options.tunnels``
+        says.
 
     Raises
     ------
@@ -59,36 +64,41 @@ def read_centre_lines(source: Source, bounds: Bounds, crs: str, options: Options
         If a file is missing or cannot be read, or has no such layer or no CRS.
     """
     names = (*columns(options), *NAMES, *DIRECTIONS, JUNCTION)
+    names += level_numbers.columns(*levels) if levels else ()
     found: dict[bytes, CentreLine] = {}
     areas, notes = 0, list[str]()
     for path in source.paths:
         layer = options.layer or source.sublayer
         table = read_near(Query(path, layer, options.where, names, source.crs, crs), bounds)
-        part = from_table(table, options)
+        part = from_table(table, options, levels)
         found |= {line.points.tobytes(): line for line in part.lines}
         areas += part.areas
         notes += (*encoding_notes(table, path), *part.notes)
     return CentreLines(tuple(found.values()), areas, tuple(dict.fromkeys(notes)))
 
 
-def from_table(table: Any, options: Options) -> CentreLines:
+def from_table(table: Any, options: Options, levels: LevelColumns | None = None) -> CentreLines:
     """Return the centre lines of a table of features, whose columns are in lower case."""
-    table, classes = selected(table, options)
+    numbers, unread = np.zeros(len(table), np.int64), tuple[str, ...]()
+    if levels:
+        numbers, unread = level_numbers.level_numbers(table, *levels)
+    classes, chosen = selection(table, options, numbers < 0)
+    table, classes, numbers = table[chosen], classes[chosen], numbers[chosen]
     members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
     shapes, member = shapely.get_parts(members, return_index=True)
     row, kinds = row[member], shapely.get_type_id(shapes)
     is_line = np.isin(kinds, (1, 2)) & (shapely.length(shapes) > 0)
     rows, row_of = np.unique(row[is_line], return_inverse=True)
-    table, classes = table.iloc[rows], classes[rows]
+    table, classes, numbers = table.iloc[rows], classes[rows], numbers[rows]
     width, notes = widths.widths(table, classes, options)
     lanes = [int(number) if np.isfinite(number) else None for number in widths.lanes(table, options)]
     way, name = _direction(table, classes), _texts(table, NAMES)
     lines = []
     for shape, k in zip(shapes[is_line], row_of, strict=True):
         points = shapely.get_coordinates(shape)
-        line = CentreLine(points, float(width[k]), lanes[k], bool(way[k]), name[k])
+        line = CentreLine(points, float(width[k]), lanes[k], bool(way[k]), name[k], int(numbers[k]))
         lines.append(line.reverse if way[k] < 0 else line)
-    return CentreLines(tuple(lines), int((kinds == 3).sum()), notes)
+    return CentreLines(tuple(lines), int((kinds == 3).sum()), (*unread, *notes))
 
 
 def _direction(table: Any, classes: NDArray[np.object_]) -> NDArray[np.int8]:

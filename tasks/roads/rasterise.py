@@ -161,7 +161,7 @@ def _from_table(table: Any, options: Options, columns: LevelColumns | None) -> R
     numbers, unread = np.zeros(len(table), np.int64), tuple[str, ...]()
     if columns:
         numbers, unread = level_numbers.level_numbers(table, *columns)
-    classes, chosen = _selection(table, options, numbers < 0)
+    classes, chosen = selection(table, options, numbers < 0)
     table, classes, numbers = table[chosen], classes[chosen], numbers[chosen]
     # A collection of multi-part features needs two steps to be split into simple parts.
     members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
@@ -185,14 +185,11 @@ def _from_table(table: Any, options: Options, columns: LevelColumns | None) -> R
     )
 
 
-def selected(table: Any, options: Options) -> tuple[Any, NDArray[np.object_]]:
-    """Return the rows of a table that are roads, and the class of each, in lower case or empty."""
-    classes, chosen = _selection(table, options, np.zeros(len(table), np.bool_))
-    return table[chosen], classes[chosen]
+def selection(table: Any, options: Options, tubes: Bools) -> tuple[NDArray[np.object_], Bools]:
+    """Return the class of each row of a table, in lower case or empty, and which rows are roads.
 
-
-def _selection(table: Any, options: Options, tubes: Bools) -> tuple[NDArray[np.object_], Bools]:
-    """Return the class of each row of a table, and which rows are roads; tubes are not left out as hidden."""
+    Tubes, given by row, are not left out as hidden.
+    """
     classes = _classes(table, options.class_columns)
     return classes, _is_road(table, classes, options, tubes)
 

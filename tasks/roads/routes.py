@@ -42,6 +42,8 @@ class CentreLine:
     oneway: bool = False
     """Whether traffic goes only from the first point to the last."""
     name: str = ""
+    level: int = 0
+    """0 on the ground, above 0 on a deck, below 0 in a tube."""
 
     @property
     def length_m(self) -> float:

@@ -51,6 +51,12 @@ class Options(rasterise.Options):
             raise ValueError("levels need the outlines of roads; leave out cleanup, and set outlines to true")
         return self
 
+    @property
+    def read_levels(self) -> rasterise.LevelColumns | None:
+        """The columns with the level of a road; None if levels are not read."""
+        columns = rasterise.LevelColumns(self.level_columns, self.structure_columns)
+        return columns if self.levels else None
+
 
 def segment(data: TileData, options: Options) -> RoadMask:
     """Return the cells whose centre lies on a road of the catalog's vectors, with those on bridges flagged.
@@ -66,8 +72,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
         note = "segment: no file of the roads layer reaches this tile, so it counts as a tile without roads"
         nowhere = np.zeros(data.grid.shape, np.bool_)
         return RoadMask(data.grid, data.core, nowhere, beyond_extent(data), bridge=nowhere, notes=(note,))
-    columns = rasterise.LevelColumns(options.level_columns, options.structure_columns)
-    roads = rasterise.roads(data.roads, data.grid, options, columns if options.levels else None)
+    roads = rasterise.roads(data.roads, data.grid, options, options.read_levels)
     levels, left_out = levels_of(roads.areas, roads.level, data)
     areas, bridge = roads.areas[roads.level == 0], roads.bridge[roads.level == 0]
     mask = clean(rasterise.cells(areas, data.grid), data, options.cleanup)

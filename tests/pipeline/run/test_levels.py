@@ -2,7 +2,10 @@
 
 import io
 import json
+import shutil
+from xml.etree import ElementTree
 
+import geopandas
 import numpy as np
 import pandas as pd
 import pytest
@@ -28,7 +31,9 @@ from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.synthetic.crossings import Crossings
 from tests.command_line import call
 from tests.mesh_union import Union
+from tests.read_opendrive import numbers, plan, polynomial, quality_issues
 from tests.tasks.export.test_viewer import content, heights
+from tests.validators.opendrive import by_sumo, in_crs
 
 SEED, SIZE_M = 0, 60
 WITH_LEVELS = ["segment.levels=true"]
@@ -275,3 +280,99 @@ def test_smooth_formats_say_that_they_have_level_0(run, tmp_path):
     call("export", run.path, "--format", "step", "-o", tmp_path).expected(0)
     rows = json.loads((tmp_path / "export.json").read_bytes())
     assert "the surface is that of level 0" in json.dumps(rows)
+
+
+@pytest.fixture(scope="module")
+def along(run, tmp_path_factory):
+    """Exports along the roads of the run."""
+    folder = tmp_path_factory.mktemp("along")
+    call("export", run.path, "--format", "crg,xodr,lines", "-o", folder).expected(0)
+    return folder
+
+
+def truth(number, x, y):
+    """Heights of the main road (1) or of the crossing road (0) at places on them."""
+    world = Crossings(SEED)
+    low, deck = world.height(0, x, y), world.height(1, x, y)
+    return np.where(np.isfinite(deck) & (number == 1), deck, low), np.isfinite(deck)
+
+
+def test_lines_have_the_heights_of_their_level(along):
+    (file,) = (along / "lines").glob("*.gpkg")
+    roads, segments = (geopandas.read_file(file, layer=layer) for layer in ("roads", "segments"))
+    assert roads.level.tolist() == [1, 0]
+    for road in roads.itertuples():
+        x, y, z = shapely.get_coordinates(road.geometry, include_z=True).T
+        expected, crossing = truth(road.level, x, y)
+        assert np.abs(z - expected).max() < 0.05
+        grade, true_grade = np.diff(z), np.diff(expected)
+        assert np.abs(grade - true_grade).max() < 0.02
+        own = segments[segments.road_id == road.id]
+        middle = np.array([shapely.get_coordinates(line).mean(axis=0) for line in own.geometry])
+        at = truth(road.level, *middle.T)[1]
+        if road.level:
+            assert ((own.level == 1) == at).mean() > 0.98
+            assert own.error_m[at].max() < 0.1
+            assert (own.support[at] == "measured").all()
+        else:
+            assert np.abs(own.grade_percent[at]).max() < 2
+            assert (own.level == 0).all()
+            assert (own.support[at] == "inferred").mean() > 0.5
+        assert crossing.sum() > 5
+
+
+def test_grids_across_a_joint_are_on_the_deck(along):
+    """Bilinear interpolation between the nodes of a grid would show a fall of 7 m."""
+    report = pd.read_csv(along / "crg" / "roads.csv")
+    assert len(report) == 2
+    assert report.crg_max_mm.max() < 20
+    assert report.profiles_mean_mm.max() < 30
+
+
+def test_opendrive_has_two_heights_at_a_crossing_and_a_bridge(along):
+    (file,) = (along / "xodr").glob("*.xodr")
+    upper, lower = ElementTree.parse(file).getroot().findall("road")
+    heights = []
+    for number, road in ((1, upper), (0, lower)):
+        # At the ends of the tiles, cross-sections are cut.
+        s = np.arange(4.0, float(road.attrib["length"]) - 4, 0.5)
+        x, y, heading = np.array([plan(road, at) for at in s]).T[..., None]
+        # A profile is straight across a road, and its crown is some centimetres higher.
+        v = np.linspace(-3.4, 3.4, 35)
+        x, y = in_crs(file, "EPSG:25832", x - v * np.sin(heading), y + v * np.cos(heading))
+        z = np.array([polynomial(road, "elevationProfile/elevation", at) for at in s])
+        expected, deck = truth(number, x, y)
+        assert np.abs(z - expected.mean(axis=1)).max() < 0.05
+        deck = deck[:, 17]
+        heights.append(z[deck].mean())
+        if number:
+            (bridge,) = road.findall("objects/bridge")
+            start, length = numbers(bridge, "s", "length")
+            assert start == pytest.approx(s[deck][0], abs=1)
+            assert start + length == pytest.approx(s[deck][-1], abs=1)
+        else:
+            assert np.abs(np.diff(z)[deck[1:]] / 0.5).max() < 0.02
+    assert heights[0] - heights[1] > 5
+    assert lower.find("objects") is None
+
+
+def test_opendrive_with_levels_passes_the_quality_checker_and_netconvert(along, tmp_path):
+    file = shutil.copy(next((along / "xodr").glob("*.xodr")), tmp_path / "roads.xodr")
+    assert quality_issues(file) == []
+    roads, places = by_sumo(file, tmp_path)
+    x, y = in_crs(file, "EPSG:25832", *places[:, :2].T)
+    upper, lower = ElementTree.parse(file).getroot().findall("road")
+    crossing = truth(1, x, y)[1]
+    means = [places[crossing & (roads == int(road.attrib["id"])), 2].mean() for road in (upper, lower)]
+    assert means[0] - means[1] > 5
+
+
+def test_roads_of_a_run_without_levels_have_no_column_of_them(run, tmp_path):
+    catalog = Catalog.read(run.path.parent / "survey" / "catalog.parquet")
+    plain = Run.create(tmp_path / "run", load_config("production_vector"), catalog)
+    run_tiles(plain, SerialExecutor(), only=lambda tile: tile.id == catalog.tiles[0].id)
+    call("export", plain.path, "--format", "xodr,lines", "-o", tmp_path / "out").expected(0)
+    (file,) = (tmp_path / "out" / "lines").glob("*.gpkg")
+    assert "level" not in geopandas.read_file(file, layer="roads")
+    assert "level" not in geopandas.read_file(file, layer="segments")
+    assert "<objects>" not in next((tmp_path / "out" / "xodr").glob("*.xodr")).read_text()

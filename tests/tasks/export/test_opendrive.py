@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flexroad.tasks.export import opendrive
+from flexroad.tasks.levels.along_route import Structure
 from flexroad.tasks.roads.along_line import HeightAt, elevation_error, height_grid, profile_error, profiles
 from flexroad.tasks.roads.reference_line import Options as LineOptions
 from flexroad.tasks.roads.reference_line import ReferenceLine, reference_line
@@ -239,3 +240,16 @@ def test_write_passes_the_asam_quality_checker(tmp_path):
     lines = [reference(**known) for known in kinds] + [reference(LOOP).part(3, 50)]
     path.write_bytes(written(*(road(line, name=str(k), crg=f"{k}.crg") for k, line in enumerate(lines))))
     assert quality_issues(path) == []
+
+
+def test_bridges_and_tunnels_are_objects_between_lanes_and_surface(tmp_path):
+    structures = (Structure(2, 10.0, 24.5), Structure(-1, 40.0, 52.0))
+    one = replace(road(reference(), crg="1.crg"), structures=structures)
+    element = only(one)
+    assert [child.tag for child in element][-3:] == ["lanes", "objects", "surface"]
+    tunnel, bridge = element.find("objects")
+    assert tunnel.attrib == {"id": "1_2", "type": "standard", "s": "40.0", "length": "12.0"}
+    assert (bridge.tag, bridge.attrib["id"], *numbers(bridge, "s", "length")) == ("bridge", "1_1", 10.0, 14.5)
+    file = tmp_path / "roads.xodr"
+    file.write_bytes(written(replace(one, crg=None)))
+    assert quality_issues(file) == []

@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from flexroad.tasks.roads.centre_lines import from_table, read_centre_lines
-from flexroad.tasks.roads.rasterise import Options
+from flexroad.tasks.roads.rasterise import LevelColumns, Options
 from flexroad.tasks.types import Source
 from tests.make_roads import GRID, in_cp1252, on_grid, write
 
@@ -122,3 +122,20 @@ def test_name_in_another_encoding_than_declared_is_read_with_a_note(suffix, data
     (note,) = [note for note in found.notes if "encoding" in note]
     assert note.startswith(f"roads: the text of {path.name} is not in the encoding that it declares")
     assert f"was read as {encoding};" in note
+
+
+def test_levels_are_read_and_tubes_kept_if_they_are_asked_for():
+    columns = {
+        "highway": ["primary"] * 4,
+        "bridge": ["yes", None, None, None],
+        "tunnel": [None, "yes", None, None],
+        "layer": ["2", None, "1", None],
+        "level": [None, None, None, "7"],
+    }
+    streets = table([ALONG] * 4, **columns)
+    plain = from_table(streets, Options())
+    assert [line.level for line in plain.lines] == [0, 0, 0]
+    found = from_table(streets, Options(), LevelColumns())
+    assert [line.level for line in found.lines] == [2, -1, 0, 0]
+    assert any("cannot be read as levels" in note for note in found.notes)
+    assert found.lines[0].reverse.level == 2

@@ -1,0 +1,99 @@
+"""The level of each place along a route: that of its centre lines, and beyond the ends of decks and tubes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+
+import numpy as np
+import shapely
+import shapely.ops
+from numpy.typing import NDArray
+
+from flexroad.tasks.levels.joints import APPROACH_M
+from flexroad.tasks.roads.routes import Route
+from flexroad.tasks.types import Bools, Floats
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceLevels:
+    """The level of each of some places, in their shape."""
+
+    number: NDArray[np.int8]
+    own: Bools
+    """Whether the centre line there is of this level; else it is of level 0, near a deck or tube."""
+
+    def __getitem__(self, places: Bools | NDArray[np.intp]) -> PlaceLevels:
+        return PlaceLevels(self.number[places], self.own[places])
+
+    @property
+    def of_line(self) -> NDArray[np.int8]:
+        """The levels of the centre line at the places."""
+        return np.where(self.own, self.number, 0).astype(np.int8)
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A piece of a road on a deck or in a tube, by distances along the road (m)."""
+
+    level: int
+    start: float
+    end: float
+
+
+def structures(levels: NDArray[np.int8], s: Floats) -> tuple[Structure, ...]:
+    """Return the decks and tubes of a road from its levels at points, and their distances along it (m)."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(levels)) + 1, [len(levels)]])
+    return tuple(
+        Structure(int(levels[a]), float(s[a]), float(s[b - 1]))
+        for a, b in pairwise(starts.tolist())
+        if levels[a] and b - a > 1
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RouteLevels:
+    """The levels along a route of which a part is on a deck or in a tube."""
+
+    spans: NDArray[np.object_]
+    """Lines, of one level each, in the route's coordinates."""
+    levels: PlaceLevels
+    """Those of the spans."""
+
+    @classmethod
+    def of(cls, route: Route) -> RouteLevels | None:
+        """Return the levels of a route, None if all of it is on level 0."""
+        if not any(part.level for part in route.parts):
+            return None
+        spans, numbers, own = zip(*_spans(route), strict=True)
+        return cls(np.array(spans, object), PlaceLevels(np.array(numbers, np.int8), np.array(own)))
+
+    def at(self, x: Floats, y: Floats) -> PlaceLevels:
+        """Return the levels of places on and beside the route, in their broadcast shape."""
+        x, y = np.broadcast_arrays(x, y)
+        nearest = shapely.STRtree(self.spans).nearest(shapely.points(x.ravel(), y.ravel()))
+        return self.levels[np.asarray(nearest).reshape(x.shape)]
+
+
+def _spans(route: Route) -> Iterator[tuple[shapely.LineString, int, bool]]:
+    """Yield lines with their level, and whether it is their own; decks go on for the length of an approach.
+
+    Between two decks that are so near that their approaches would overlap, each goes on to the middle.
+    """
+    groups = [(level, list(parts)) for level, parts in groupby(route.parts, lambda part: part.level)]
+    for k, (level, parts) in enumerate(groups):
+        line = shapely.LineString(Route(tuple(parts)).points)
+        before = groups[k - 1][0] if k else 0
+        after = groups[k + 1][0] if k + 1 < len(groups) else 0
+        if level or not (before or after):
+            yield line, level, True
+            continue
+        reach = min(APPROACH_M, line.length / 2 if before and after else line.length)
+        first, last = reach if before else 0.0, line.length - (reach if after else 0.0)
+        if before:
+            yield shapely.ops.substring(line, 0.0, first), before, False
+        if last > first:
+            yield shapely.ops.substring(line, first, last), 0, True
+        if after:
+            yield shapely.ops.substring(line, last, line.length), after, False
