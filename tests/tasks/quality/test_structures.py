@@ -7,8 +7,9 @@ import pytest
 import shapely
 
 from flexroad.pipeline.store import codec
-from flexroad.tasks.quality.assess import Options, assess
+from flexroad.tasks.quality.assess import Options, assess, cell_errors
 from flexroad.tasks.quality.structures import BELOW, NO_JOINT, NO_RISE, structures
+from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Level, RoadClusters, RoadMask, Structures, TileData
 from tests.tasks.spline.test_levelled import GRID, LEVEL, SOUTH, WEST, made_surface
 
@@ -70,3 +71,23 @@ def test_flags_of_decks_are_those_of_the_tile_and_results_keep_them():
     assert {BELOW, NO_RISE} <= set(quality.flags)
     assert {BELOW, NO_RISE} <= set(own[1].flags)
     assert codec.decode(codec.encode(quality, {})).value.levels[0][1].structures == own[1].structures
+
+
+@pytest.mark.parametrize(("number", "support"), [(1, Support.MEASURED), (-1, Support.INFERRED)])
+def test_heights_in_tubes_are_inferred_and_those_of_decks_measured(number, support):
+    """The DSM of a tube is made from its approaches."""
+    level = replace(LEVEL, number=number)
+    surface = made_surface(100.0, 107.0)
+    surface = replace(surface, levels=(replace(surface.levels[0], level=level),))
+    heights = np.full(GRID.shape, 107.0)
+    data = TileData("a", GRID, GRID, heights, heights)
+    easting, northing = np.meshgrid(GRID.eastings, GRID.northings)
+    covered = level.covers(easting, northing)
+    own = RoadClusters(GRID, covered.astype(np.int32), level=level)
+    clusters = RoadClusters(GRID, NOWHERE.astype(np.int32), levels=(own,))
+    inputs = data, road(level), clusters, surface, Options()
+    error, classes = cell_errors(*inputs, number)
+    assert (classes[covered] == support).all()
+    assert (classes[~covered] == Support.NONE).all()
+    assert np.isfinite(error[covered]).all()
+    np.testing.assert_array_equal(assess(*inputs).levels[0][1].support, classes)
