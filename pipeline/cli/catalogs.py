@@ -261,7 +261,10 @@ def catalog_synthetic(
 
     path = write_scenes(output, tiles, seed, tile_size, dop, preset, decks)
     echo(f"{count(len(Catalog.read(path).tiles), 'tile')} in {path}")
-    echo(after_catalog(path, {"gerod": "paper"}.get(preset or "", preset)))
+    if decks:
+        echo(after_catalog(path, "production_vector", ["segment.levels=true"]))
+    else:
+        echo(after_catalog(path, {"gerod": "paper"}.get(preset or "", preset)))
 
 
 @app.command("show", cls=Command)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 from flexroad.catalog import Catalog
@@ -13,7 +14,7 @@ from flexroad.pipeline.graph.layers import fitting_config
 from flexroad.pipeline.run.record import check_inputs
 
 
-def after_catalog(path: Path, config: str | None = None) -> str:
+def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] = ()) -> str:
     """Return the command that runs a catalog, ready to be pasted, or what a run lacks.
 
     Parameters
@@ -22,17 +23,20 @@ def after_catalog(path: Path, config: str | None = None) -> str:
         The catalog's file.
     config : str, optional
         The configuration; default: the one for production that fits the catalog's layers.
+    changes : sequence of str
+        Values of ``--set``.
     """
     catalog = Catalog.read(path)
     name = config or fitting_config(catalog)
-    settings = load_config(name)
+    settings = load_config(name, changes)
     try:
         check_inputs(settings, catalog)
     except ConfigError as error:
         return f"before a run: {error}"
     # Many catalogs are called catalog.parquet: their folder tells them apart.
     title = path.stem if path.stem != "catalog" else path.absolute().parent.name or "run"
-    words = ["flexroad", "run", "--config", name, "--catalog", str(path), "--out", f"runs/{title}"]
+    words = ["flexroad", "run", "--config", name, *(word for change in changes for word in ("--set", change))]
+    words += ["--catalog", str(path), "--out", f"runs/{title}"]
     # Of all layers, so that the same options suit `catalog check` and `train`.
     for folder in needed(catalog, path.parent):
         words += ["--allow", folder]

@@ -30,6 +30,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import sample
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface, uniform_knots
 from flexroad.tasks.types import Floats
@@ -263,7 +264,7 @@ class RunView:
         ------
         ConfigError
             If there is no finished tile in the bounds, or the tiles have no common lattice: only the method
-            ``smoothing_spline`` fits one surface.
+            ``smoothing_spline`` fits one surface; or one of them has decks or tubes (``segment.levels``).
 
         Examples
         --------
@@ -291,9 +292,9 @@ class RunView:
             raise ConfigError(
                 f"{self.run.path} has no finished tile in {bounds or 'its catalog'}; see `flexroad status`"
             )
-        surfaces = (FinishedTile.of(self.run, status, self.variant).surface for status in done)
+        surfaces = _of_one_level(FinishedTile.of(self.run, status, self.variant) for status in done)
         grids = [status.graph.tile.grid for status in done]
-        whole = _joined(grids, cast("Iterator[NurbsSurface]", surfaces))
+        whole = _joined(grids, surfaces)
         west, south, east, north = whole.bounds
         if bounds is not None:
             west, south = max(west, bounds[0]), max(south, bounds[1])
@@ -436,6 +437,18 @@ def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str |
     2 tiles: 1 done, 1 pending
     """
     return RunView(*open_variant(path, variant, allow), tuple(allow))
+
+
+def _of_one_level(tiles: Iterable[FinishedTile]) -> Iterator[NurbsSurface]:
+    """Yield the surfaces of tiles; one with levels raises an error, since it is more than its spline."""
+    for tile in tiles:
+        surface = tile.surface
+        if isinstance(surface, LevelledSurface):
+            raise ConfigError(
+                f"tile {tile.id} has roads above roads, which are no single surface: give bounds without it; "
+                "open_run(...).height(x, y, level=0) has its ground"
+            )
+        yield cast("NurbsSurface", surface)
 
 
 def _joined(grids: Sequence[Grid], surfaces: Iterable[NurbsSurface]) -> NurbsSurface:

@@ -137,3 +137,15 @@ def test_catalog_with_own_layout_next_line_names_it(rasters, flexroad, tmp_path,
     arguments = shlex.split(said.out.splitlines()[-1].removeprefix("next: flexroad "))
     assert arguments[:3] == ["run", "--config", str(layout)]
     assert "1 tile: 1 done" in flexroad(*arguments, "--executor", "serial").expected(0).out
+
+
+def test_next_line_after_scenes_with_decks_uses_their_levels(flexroad, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = flexroad("catalog", "synthetic", "--decks", "--tiles", 1, "--tile-size", 60, "-o", "decks")
+    line = made.expected(0).out.splitlines()[-1]
+    assert line.startswith(
+        "next: flexroad run --config production_vector --set segment.levels=true --catalog "
+    )
+    arguments = shlex.split(line.removeprefix("next: flexroad "))
+    assert "1 tile: 1 done" in flexroad(*arguments, "--executor", "serial").expected(0).out
+    assert list((tmp_path / "runs" / "decks" / "tiles").glob("*/*_height_level0.tif"))

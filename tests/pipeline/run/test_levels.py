@@ -376,3 +376,19 @@ def test_roads_of_a_run_without_levels_have_no_column_of_them(run, tmp_path):
     assert "level" not in geopandas.read_file(file, layer="roads")
     assert "level" not in geopandas.read_file(file, layer="segments")
     assert "<objects>" not in next((tmp_path / "out" / "xodr").glob("*.xodr")).read_text()
+
+
+def test_one_surface_of_tiles_with_decks_is_refused_with_a_remedy(run):
+    """Its spline would be that of level 0 alone, which is up to a metre wrong on approaches."""
+    view = flexroad.open_run(run.path)
+    levelled = {tile.id: isinstance(tile.surface, LevelledSurface) for tile in finished(run)}
+    assert True in levelled.values()
+    for tile in run.catalog.tiles:
+        west, south, east, north = tile.grid.bounds
+        inside = west + 1, south + 1, east - 1, north - 1
+        if levelled[tile.id]:
+            with pytest.raises(ConfigError, match=rf"tile {tile.id} has roads above roads.*level=0"):
+                view.surface(inside)
+        else:
+            x, y = (west + east) / 2, (south + north) / 2
+            assert view.surface(inside).height(x, y) == pytest.approx(float(view.height(x, y)), abs=1e-9)
