@@ -124,7 +124,7 @@ def write_tables(
     _write_csv(run / "failures.csv", names, values, flushed)
     if of_levels:
         _write_csv(run / OF_LEVELS, list(of_levels[0]), (row.values() for row in of_levels), flushed)
-    else:
+    elif exists(run / OF_LEVELS):
         remove(run / OF_LEVELS)
 
 
