@@ -217,18 +217,21 @@ _FUNCTIONS = {
 
 
 def _parquet_writer():
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     class ThroughPython(pq.ParquetWriter):
-        """Writes a table through a Python file, not in C++."""
+        """Writes a table through a Python file, not in C++; one in memory as it is."""
 
         def __init__(self, where, schema, **options) -> None:
-            self._python_file = Path(where).open("wb")  # noqa: SIM115 (closed with the table)
+            in_memory = isinstance(where, pa.NativeFile)
+            self._python_file = where if in_memory else Path(where).open("wb")  # noqa: SIM115 (closed with the table)
             super().__init__(self._python_file, schema, **options)
 
         def close(self) -> None:
             super().close()
-            self._python_file.close()
+            if not isinstance(self._python_file, pa.NativeFile):
+                self._python_file.close()
 
     return ThroughPython
 

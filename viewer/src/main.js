@@ -47,7 +47,8 @@ class Page {
     byId("back").addEventListener("click", () => this.showMap());
     byId("help").addEventListener("click", () => byId("help-text").showModal());
     byId("panel-toggle").addEventListener("click", () => byId("panel").classList.toggle("open"));
-    window.addEventListener("hashchange", () => {
+    // Unlike hashchange it comes before any timer, which would write the view that was left into the new entry.
+    window.addEventListener("popstate", () => {
       if (window.location.hash !== this.hash) this.obey();
     });
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.theme());
