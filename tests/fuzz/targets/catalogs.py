@@ -24,4 +24,4 @@ def read(path: Path) -> None:
     for tile in catalog.usable:
         for layer in tile.layers:
             tile.paths(layer)
-    list(check(catalog, load_config("production")))
+    list(check(catalog, load_config("production"), path))
