@@ -186,6 +186,11 @@ class RoadClusters:
         """Filtered road cells, ``(H, W)``."""
         return self.labels > 0
 
+    @property
+    def number(self) -> int:
+        """The number of their level."""
+        return self.level.number if self.level else 0
+
 
 @runtime_checkable
 class Surface(Protocol):

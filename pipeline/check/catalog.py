@@ -25,7 +25,7 @@ from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.check.decks import deck_findings
-from flexroad.pipeline.check.finding import Finding
+from flexroad.pipeline.check.finding import Finding, evenly
 from flexroad.pipeline.check.heights import height_findings
 from flexroad.pipeline.check.trial import trials
 from flexroad.pipeline.config.models import Config
@@ -272,8 +272,7 @@ def _photos(tiles: Sequence[Tile]) -> Iterator[Finding]:
     tiles = [tile for tile in tiles if coregistration.large_enough(tile.grid)]
     cells = Counter(tile.grid.cell for tile in tiles)
     tiles = [tile for tile in tiles if tile.grid.cell == cells.most_common(1)[0][0]]
-    most = min(MAX_PHOTO_TILES, len(tiles))
-    sample = [tiles[i * len(tiles) // most] for i in range(most)]
+    sample = evenly(tiles, MAX_PHOTO_TILES)
     pairs: list[coregistration.Pair] = []
     for tile in sample:
         try:

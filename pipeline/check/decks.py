@@ -16,7 +16,7 @@ from flexroad.catalog import Tile
 from flexroad.catalog.crs import transformer
 from flexroad.catalog.storage.paths import exists, read, remove, write
 from flexroad.catalog.text import count, write_reason
-from flexroad.pipeline.check.finding import Finding
+from flexroad.pipeline.check.finding import Finding, evenly
 from flexroad.pipeline.config.models import Config
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
@@ -53,12 +53,11 @@ def deck_findings(tiles: Sequence[Tile], config: Config, catalog: Path, every: b
     """
     chain = next(iter(config.chains.values()))
     tiles = [tile for tile in tiles if tile.layer("road_mask") or tile.layer("roads")]
-    number = len(tiles) if every else min(MOST_TILES, len(tiles))
-    sample = [tiles[k * len(tiles) // number] for k in range(number)]
+    sample = tiles if every else evenly(tiles, MOST_TILES)
     found = [(tile, deck) for tile in sample for deck in _decks(tile, chain["load"], chain["segment"])]
-    if number < len(tiles):
+    if len(sample) < len(tiles):
         if found:
-            yield Finding(f"{_told(found)}, on {number} of {len(tiles)} tiles: look at all with --decks")
+            yield Finding(f"{_told(found)}, on {len(sample)} of {len(tiles)} tiles: look at all with --decks")
     elif tiles:
         yield from _written(catalog.parent / FILE, found)
 

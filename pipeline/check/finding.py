@@ -1,8 +1,11 @@
-"""One line of a check before a run."""
+"""One line of a check before a run, and the tiles that a check looks at."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from flexroad.catalog import Tile
 
 
 @dataclass(frozen=True)
@@ -12,3 +15,9 @@ class Finding:
     text: str
     fault: bool = False
     """Whether this should be corrected before a run."""
+
+
+def evenly(tiles: Sequence[Tile], most: int) -> list[Tile]:
+    """Return so many of the tiles at most, spread evenly over them."""
+    number = min(most, len(tiles))
+    return [tiles[k * len(tiles) // number] for k in range(number)]

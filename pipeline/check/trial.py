@@ -12,7 +12,7 @@ import numpy as np
 
 from flexroad.catalog import LAYERS, Tile
 from flexroad.catalog.text import some
-from flexroad.pipeline.check.finding import Finding
+from flexroad.pipeline.check.finding import Finding, evenly
 from flexroad.pipeline.config.models import Config
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
@@ -143,13 +143,8 @@ def _sample(tiles: Sequence[Tile], doubtful: Collection[str]) -> list[Tile]:
     chosen: dict[str, Tile] = {}
     for kind in kinds:
         left = [tile for tile in kind if tile.id not in chosen]
-        chosen |= {tile.id: tile for tile in _evenly(left, MOST_TILES - len(chosen))}
+        chosen |= {tile.id: tile for tile in evenly(left, MOST_TILES - len(chosen))}
     return list(chosen.values())
-
-
-def _evenly(tiles: Sequence[Tile], most: int) -> list[Tile]:
-    number = min(most, len(tiles))
-    return [tiles[k * len(tiles) // number] for k in range(number)]
 
 
 def _files(tile: Tile, names: Collection[str]) -> tuple[tuple[str, tuple[str, ...]], ...]:

@@ -6,7 +6,7 @@ The folder lies outside the run, and one export at a time writes it; existing fi
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
@@ -34,7 +34,7 @@ from flexroad.pipeline.export.formats import FORMATS, Format
 from flexroad.pipeline.export.source import Options, Source, check_photos
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import Track, untracked
+from flexroad.pipeline.run.status import Track, ended, untracked
 from flexroad.tasks.errors import TaskError
 
 SAME = ("variant", "crs", "tiles", "results")
@@ -108,14 +108,11 @@ def _written(
     if isinstance(folder, Path):
         folder.mkdir(parents=True, exist_ok=True)
     tiles = track(source.finished(), f"writing {name}", len(source.tiles))
-    try:
-        more = kind.write(source, tiles, folder, options, executor) or {}
-    except TaskError as error:
-        raise ConfigError(f"{name}: {error}") from error
-    finally:
-        # Else an error, which refers to the iterator, would keep its progress lines going.
-        if isinstance(tiles, Generator):
-            tiles.close()
+    with ended(tiles):
+        try:
+            more = kind.write(source, tiles, folder, options, executor) or {}
+        except TaskError as error:
+            raise ConfigError(f"{name}: {error}") from error
     files = file_sizes(folder)
     if removed := len(before.keys() - files.keys()):
         notify(f"removed {count(removed, 'file')} of an earlier export from {folder}")

@@ -37,7 +37,7 @@ MARKERS = ".pieces"
 """Folder of the marks of tiles, areas or roads."""
 PARTS = ".parts"
 """Folder of the parts of a joined file."""
-LARGEST = {"height_error_m", "steps_max_m"}
+LARGEST = ("height_error_m", "steps_max_m")
 """Entries of the rows of tiles of which the manifest has the largest."""
 Row = dict[str, Any]
 """What the files of the complete run need of a tile, as JSON values."""
@@ -184,7 +184,7 @@ def figures(rows: Iterable[Row]) -> dict[str, Any]:
     """Return what the manifest says of all tiles: the largest error and step, and the number of each note."""
     largest, notes = dict[str, Any](), Counter[str]()
     for row in rows:
-        for name in LARGEST & row.keys():
+        for name in (name for name in LARGEST if name in row):
             largest[name] = max(row[name], largest.get(name, row[name]))
         notes.update([row["note"]] if row.get("note") else [])
     left_out = steps_left_out(largest.get("steps_max_m"))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -28,7 +28,7 @@ from flexroad.pipeline.export.pieces import Piece, write_pieces
 from flexroad.pipeline.export.source import TileItem, layer_state
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run, check_links
-from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
+from flexroad.pipeline.run.status import TileStatus, Track, ended, peek_statuses, untracked
 from flexroad.pipeline.store.records import LEVELS
 from flexroad.pipeline.worker.texture import tile_photo
 from flexroad.tasks.errors import TaskError
@@ -123,12 +123,8 @@ def write_viewer(
     roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
     look = Look(run.origin, photo_px, roads)
     finished = track(_finished(run, done, variant), "writing tiles", len(done))
-    try:
+    with ended(finished):
         rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
-    finally:
-        # Else an error, which refers to the iterator, would keep its progress lines going.
-        if isinstance(finished, Generator):
-            finished.close()
     for file in built_files():
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())

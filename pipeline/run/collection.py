@@ -149,14 +149,10 @@ def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
     grid = Grid.holding([tile.grid for tile in done]) if "cog" in run.config.export.formats else None
     written = []
     for kind in KINDS["cog"]:
-        path = run.path / vrt_name(kind)
-        _write_style(run, kind, kind.band if grid else None)
         if grid is None or kind.band is None:
-            remove(path)
+            _remove_vrt(run, kind)
             continue
-        with atomic_file(path, run.config.cluster.flush) as local, local.open("w", encoding="utf-8") as file:
-            xml = XMLGenerator(file, "utf-8", short_empty_elements=True)
-            _write_vrt(xml, grid, kind, kind.band, done, run.config.export.variants[0])
+        _write_vrt(run, grid, kind, kind.band, done)
         written.append(kind)
     return written + _write_level_0(run, grid, done)
 
@@ -164,7 +160,7 @@ def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
 def _write_level_0(run: Run, grid: Grid | None, done: Sequence[Tile]) -> list[Kind]:
     """Write the heights of the ground below decks as one, if there are any, and return their kind."""
     kind, variant = of_level(HEIGHT, 0), run.config.export.variants[0]
-    path, names = run.path / vrt_name(kind), dict[str, str]()
+    names = dict[str, str]()
     if grid and getattr(run.config.chains[variant]["segment"], "levels", False):
         with open_database(run) as database:
             for tile in done:
@@ -172,25 +168,20 @@ def _write_level_0(run: Run, grid: Grid | None, done: Sequence[Tile]) -> list[Ki
                 if record and name in record.sizes:
                     names[tile.id] = name
     if grid is None or not names:
-        remove(path)
-        _write_style(run, kind, None)
+        _remove_vrt(run, kind)
         return []
-    with atomic_file(path, run.config.cluster.flush) as local, local.open("w", encoding="utf-8") as file:
-        xml = XMLGenerator(file, "utf-8", short_empty_elements=True)
-        _write_vrt(xml, grid, kind, cog.HEIGHT, done, variant, names)
-    _write_style(run, kind, cog.HEIGHT)
+    _write_vrt(run, grid, kind, cog.HEIGHT, done, names)
     return [kind]
 
 
-def _write_style(run: Run, kind: Kind, band: Band | None) -> None:
-    """Write the style of a mosaic for QGIS, or remove it; in a bucket QGIS would not look for it."""
-    if not isinstance(run.path, Path):
-        return
-    style = run.path / f"{kind.key}{NAME_STYLE}"
-    if band is None:
-        remove(style)
-    else:
-        write(style, encode_style(band), run.config.cluster.flush)
+def _remove_vrt(run: Run, kind: Kind) -> None:
+    remove(run.path / vrt_name(kind))
+    if isinstance(run.path, Path):
+        remove(run.path / _style_name(kind))
+
+
+def _style_name(kind: Kind) -> str:
+    return f"{kind.key}{NAME_STYLE}"
 
 
 def vrt_name(kind: Kind) -> str:
@@ -199,15 +190,14 @@ def vrt_name(kind: Kind) -> str:
 
 
 def _write_vrt(
-    xml: XMLGenerator,
+    run: Run,
     grid: Grid,
     kind: Kind,
     band: Band,
     tiles: Sequence[Tile],
-    variant: str,
     own: Mapping[str, str] | None = None,
 ) -> None:
-    """Write a mosaic of one kind of raster.
+    """Write a mosaic of one kind of raster, and on disk its style: in a bucket QGIS would not look for it.
 
     Parameters
     ----------
@@ -215,19 +205,22 @@ def _write_vrt(
         Names of the files of tiles that have one of this kind, by tile; the others have the heights of their
         highest level. By default all tiles have one.
     """
-    _begin(xml, "VRTDataset", rasterXSize=str(grid.width), rasterYSize=str(grid.height))
-    _leaf(xml, "SRS", grid.crs)
-    _leaf(xml, "GeoTransform", f"{grid.west!r}, {grid.cell!r}, 0.0, {grid.north!r}, 0.0, {-grid.cell!r}")
-    _begin(xml, "VRTRasterBand", dataType=TYPES[band.dtype], band="1")
-    _describe(xml, band)
-    for tile in tiles:
-        file = file_name(tile.id, variant, kind if own is None else HEIGHT)
-        if own is not None:
-            file = own.get(tile.id, file)
-        name = f"tiles/{safe_name(tile.id)}/{file}"
-        _source(xml, name, grid, tile.grid, band)
-    xml.endElement("VRTRasterBand")
-    xml.endElement("VRTDataset")
+    variant, flush = run.config.export.variants[0], run.config.cluster.flush
+    with atomic_file(run.path / vrt_name(kind), flush) as local, local.open("w", encoding="utf-8") as file:
+        xml = XMLGenerator(file, "utf-8", short_empty_elements=True)
+        _begin(xml, "VRTDataset", rasterXSize=str(grid.width), rasterYSize=str(grid.height))
+        _leaf(xml, "SRS", grid.crs)
+        _leaf(xml, "GeoTransform", f"{grid.west!r}, {grid.cell!r}, 0.0, {grid.north!r}, 0.0, {-grid.cell!r}")
+        _begin(xml, "VRTRasterBand", dataType=TYPES[band.dtype], band="1")
+        _describe(xml, band)
+        for tile in tiles:
+            name = file_name(tile.id, variant, kind if own is None else HEIGHT)
+            name = name if own is None else own.get(tile.id, name)
+            _source(xml, f"tiles/{safe_name(tile.id)}/{name}", grid, tile.grid, band)
+        xml.endElement("VRTRasterBand")
+        xml.endElement("VRTDataset")
+    if isinstance(run.path, Path):
+        write(run.path / _style_name(kind), encode_style(band), flush)
 
 
 def _describe(xml: XMLGenerator, band: Band) -> None:

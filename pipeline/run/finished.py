@@ -7,7 +7,6 @@ is kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -29,7 +28,7 @@ from flexroad.pipeline.run.status import Folders, TileStatus, peek_statuses
 from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.products import TileProducts
-from flexroad.pipeline.store.records import DONE, MarkerStat, MeshDistances, from_item, with_distances
+from flexroad.pipeline.store.records import DONE, MarkerStat, distances_of, from_item
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
@@ -88,9 +87,7 @@ class Snapshot:
         graph, record = status.graph, status.last_record
         if record is None:
             return cls(graph.fingerprint, graph.variants[variant], None, files)
-        distances = MeshDistances()
-        deque(with_distances(record.rows, distances), maxlen=0)
-        own = distances.get(variant, {})
+        own = next((distances_of(row) for row in record.rows if row["variant"] == variant), {})
         return cls(graph.fingerprint, graph.variants[variant], record.marker, files, own)
 
 

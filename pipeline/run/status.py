@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property, partial
@@ -47,6 +48,16 @@ Track = Callable[[Iterable[Any], str, int], Iterable[Any]]
 def untracked(items: Iterable[Any], step: str, total: int) -> Iterable[Any]:
     """Return the items; a `Track` that shows nothing."""
     return items
+
+
+@contextmanager
+def ended(items: Iterable[Any]) -> Iterator[Iterable[Any]]:
+    """Give the items of a `Track`, and end it: an error refers to it, and would keep its lines going."""
+    try:
+        yield items
+    finally:
+        if isinstance(items, Generator):
+            items.close()
 
 
 @dataclass(frozen=True)

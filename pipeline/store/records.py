@@ -148,12 +148,15 @@ def with_distances(rows: Iterable[MetricsRow], largest: MeshDistances) -> Iterat
     Rows of failed tiles and of older versions have none.
     """
     for row in rows:
-        for name in FIGURES:
-            value = row.get(name)
-            if isinstance(value, float | int):
-                own = largest.setdefault(row["variant"], {})
-                own[name] = max(value, own.get(name, 0.0))
+        for name, value in distances_of(row).items():
+            own = largest.setdefault(row["variant"], {})
+            own[name] = max(value, own.get(name, 0.0))
         yield row
+
+
+def distances_of(row: MetricsRow) -> dict[str, float]:
+    """Return the distances of a mesh from its surface (m) in a row, by column."""
+    return {name: row[name] for name in FIGURES if isinstance(row.get(name), float | int)}
 
 
 def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:

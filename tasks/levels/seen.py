@@ -48,7 +48,7 @@ def level_data(data: TileData, clusters: RoadClusters, number: int = 0) -> TileD
         return data
     levels = tuple(own.level for own in clusters.levels if own.level)
     result = _masked(data, levels, number)
-    own = next((own for own in clusters.levels if own.level and own.level.number == number), None)
+    own = next((own for own in clusters.levels if own.number == number), None)
     if own is None or own.level is None or number > 0:
         return result
     return replace(result, dsm=_inferred(result, own.level, own.mask & np.isfinite(result.dsm)))

@@ -124,8 +124,7 @@ def assess(
         return own
     others = []
     for of_level in clusters.levels:
-        assert of_level.level
-        number = of_level.level.number
+        number = of_level.number
         seen, there = level_data(data, clusters, number), level_road(road, number)
         quality = _assess(seen, there, of_level, surface.at(number), options)
         found, flags = structures(road, surface, number)
@@ -191,7 +190,7 @@ def cell_errors(
     They are those of a level, or of level 0 if the tile does not have it. The estimate is NaN beyond the
     survey, and beyond decks and tubes.
     """
-    own = [own for own in clusters.levels if own.level and own.level.number == number]
+    own = [own for own in clusters.levels if own.number == number]
     if own and isinstance(surface, LevelledSurface):
         data, road, surface = level_data(data, clusters, number), level_road(road, number), surface.at(number)
         clusters = own[0]
@@ -213,9 +212,7 @@ def top_errors(
     if not isinstance(surface, LevelledSurface):
         return estimate, classes
     top = surface.top(*np.meshgrid(data.core.eastings, data.core.northings))
-    for of_level in clusters.levels:
-        assert of_level.level
-        number = of_level.level.number
+    for number in (of_level.number for of_level in clusters.levels):
         here = (top == number) & (number > 0)
         if here.any():
             own = cell_errors(data, road, clusters, surface, options, number)

@@ -33,6 +33,12 @@ def changed(width=1.0, shift=0.0, ends=0.0, gap=0.0):
     return change
 
 
+def _deck_heights(survey):
+    """Return the true heights of the decks at the cells of a survey (m); NaN elsewhere."""
+    grid = survey.data.grid
+    return survey.world.height(1, *np.meshgrid(grid.eastings, grid.northings))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "deck", "approach"),
@@ -73,9 +79,7 @@ def test_gap_beyond_reach_is_noted_and_ends_the_ground_by_itself(tmp_path):
 def test_terrain_models_tell_nothing_of_the_ground_below_decks(tmp_path, dtm):
     core = block(80)
     survey = Survey.of(tmp_path, 0, core, tubes=0)
-    grid = survey.data.grid
-    at = np.meshgrid(grid.eastings, grid.northings)
-    decks = binary_dilation(np.isfinite(survey.world.height(1, *at)))
+    decks = binary_dilation(np.isfinite(_deck_heights(survey)))
     heights = survey.data.dsm if dtm == "with decks" else np.nan
     data = replace(survey.data, dtm=np.where(decks, heights, survey.data.dtm))
     survey = replace(survey, data=data, parts={})
@@ -88,9 +92,7 @@ def test_terrain_models_tell_nothing_of_the_ground_below_decks(tmp_path, dtm):
 def test_deck_without_any_height_follows_its_approaches(tmp_path):
     core = block(80)
     survey = Survey.of(tmp_path, 1, core, tubes=0)
-    grid = survey.data.grid
-    at = np.meshgrid(grid.eastings, grid.northings)
-    decks = np.isfinite(survey.world.height(1, *at))
+    decks = np.isfinite(_deck_heights(survey))
     data = replace(survey.data, dsm=np.where(decks, np.nan, survey.data.dsm))
     survey = replace(survey, data=data, parts={})
     errors = survey.errors(survey.tile(core))
@@ -103,11 +105,9 @@ def test_layer_of_decks_gives_the_deck_its_height(tmp_path):
     """Where crowns hide it."""
     core = block(80)
     survey = Survey.of(tmp_path, 0, core, tubes=0)
-    grid = survey.data.grid
-    at = np.meshgrid(grid.eastings, grid.northings)
-    deck = survey.world.height(1, *at)
+    deck = _deck_heights(survey)
     hidden = np.where(
-        np.isfinite(deck), deck + 6 + np.random.default_rng(1).random(grid.shape), survey.data.dsm
+        np.isfinite(deck), deck + 6 + np.random.default_rng(1).random(deck.shape), survey.data.dsm
     )
     errors = {}
     for name, decks in (("without", None), ("with", deck)):
