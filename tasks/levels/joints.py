@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.text import count
 from flexroad.tasks.io.vectors import has_place
+from flexroad.tasks.meshing.road_outline import polygons_of
 from flexroad.tasks.roads.flat_patches import flat_patches
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import BLEND_M, Bools, Floats, Level, TileData
@@ -80,7 +81,7 @@ def levels_of(
     window, near = _grown(data.grid, 0.0), _grown(data.core, REACH_M)
     levels, notes = [], list[str]()
     for number in np.unique(numbers[numbers != 0]).tolist():
-        level = _level(number, polygons(shapely.union_all(areas[numbers == number])), streets, data)
+        level = _level(number, _polygons(shapely.union_all(areas[numbers == number])), streets, data)
         if number < 0:
             level, left_out = _with_portals(level, data.core)
             notes += left_out
@@ -88,15 +89,14 @@ def levels_of(
             continue
         if number > 0:
             notes += _without_joint(level, data.core)
-        cut = polygons(shapely.intersection(level.areas, window))
+        cut = _polygons(shapely.intersection(level.areas, window))
         levels.append(replace(level, areas=cut))
     return tuple(levels), tuple(notes)
 
 
-def polygons(geometry: shapely.Geometry) -> shapely.MultiPolygon:
+def _polygons(geometry: shapely.Geometry) -> shapely.MultiPolygon:
     """Return the polygons of a geometry of any kind."""
-    parts = shapely.get_parts(shapely.get_parts(geometry))
-    return shapely.MultiPolygon(list(parts[(shapely.get_type_id(parts) == 3) & ~shapely.is_empty(parts)]))
+    return shapely.MultiPolygon(list(polygons_of(geometry)))
 
 
 def _grown(grid: Grid, distance_m: float) -> shapely.Polygon:
@@ -119,11 +119,11 @@ def _level(number: int, areas: shapely.MultiPolygon, streets: Lines, data: TileD
         lines = [line for line in lines if _is_level(line, deck, street, data)]
     joints = shapely.MultiLineString(lines)
     ground = shapely.difference(shapely.union_all(near[~passes]), shapely.buffer(areas, APART_M))
-    road = _touching(polygons(shapely.intersection(ground, shapely.buffer(joints, APPROACH_M))), joints)
+    road = _touching(_polygons(shapely.intersection(ground, shapely.buffer(joints, APPROACH_M))), joints)
     gaps = shapely.difference(shapely.buffer(joints, GAP_M, cap_style="flat"), areas)
-    approach = polygons(shapely.union(road, gaps))
+    approach = _polygons(shapely.union(road, gaps))
     beside = shapely.intersection(shapely.union_all(near[passes]), shapely.buffer(joints, REACH_M))
-    return Level(number, areas, joints, approach, polygons(shapely.difference(beside, approach)))
+    return Level(number, areas, joints, approach, _polygons(shapely.difference(beside, approach)))
 
 
 def _passes(streets: Lines, areas: shapely.MultiPolygon) -> Bools:

@@ -59,11 +59,11 @@ def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
     west, south, east, north = core.bounds
     within = shapely.box(west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M)
     near = areas[~shapely.is_empty(areas) & has_place(areas)]
-    valid = _polygons(np.where(shapely.is_valid(near), near, shapely.make_valid(near)))
+    valid = polygons_of(np.where(shapely.is_valid(near), near, shapely.make_valid(near)))
     valid = valid[shapely.intersects(valid, within)]
     cut = shapely.transform(shapely.intersection(valid, within), lambda points: points - core.origin)
-    united = shapely.union_all(shapely.set_precision(_polygons(cut), GRID_M), grid_size=GRID_M)
-    polygons = _polygons(shapely.union(united, _closed(united), grid_size=GRID_M))
+    united = shapely.union_all(shapely.set_precision(polygons_of(cut), GRID_M), grid_size=GRID_M)
+    polygons = polygons_of(shapely.union(united, _closed(united), grid_size=GRID_M))
     if not len(polygons):
         return None
     return np.frombuffer(shapely.to_wkb(shapely.multipolygons(polygons)), np.uint8)
@@ -111,7 +111,7 @@ def _closed(areas: shapely.Geometry) -> shapely.Geometry:
     return shapely.buffer(wider, -GAP_M / 2, join_style="mitre")
 
 
-def _polygons(geometries: Any) -> NDArray[np.object_]:
+def polygons_of(geometries: Any) -> NDArray[np.object_]:
     """Return the polygons in geometries of any kind."""
     parts = shapely.get_parts(shapely.get_parts(geometries))
     return np.asarray(parts[(shapely.get_type_id(parts) == 3) & ~shapely.is_empty(parts)])

@@ -14,7 +14,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.tasks.io.vectors import Query, encoding_notes, read_near
 from flexroad.tasks.roads import level_numbers, widths
 from flexroad.tasks.roads.attributes import has_value
-from flexroad.tasks.roads.rasterise import LevelColumns, Options, columns, selection
+from flexroad.tasks.roads.rasterise import LevelColumns, Options, columns, selected
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.types import Source
 
@@ -79,11 +79,7 @@ def read_centre_lines(
 
 def from_table(table: Any, options: Options, levels: LevelColumns | None = None) -> CentreLines:
     """Return the centre lines of a table of features, whose columns are in lower case."""
-    numbers, unread = np.zeros(len(table), np.int64), tuple[str, ...]()
-    if levels:
-        numbers, unread = level_numbers.level_numbers(table, *levels)
-    classes, chosen = selection(table, options, numbers < 0)
-    table, classes, numbers = table[chosen], classes[chosen], numbers[chosen]
+    table, classes, numbers, unread = selected(table, options, levels)
     members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
     shapes, member = shapely.get_parts(members, return_index=True)
     row, kinds = row[member], shapely.get_type_id(shapes)

@@ -158,11 +158,7 @@ def columns(options: Options) -> tuple[str, ...]:
 
 def _from_table(table: Any, options: Options, columns: LevelColumns | None) -> Roads:
     """Return the roads of one table."""
-    numbers, unread = np.zeros(len(table), np.int64), tuple[str, ...]()
-    if columns:
-        numbers, unread = level_numbers.level_numbers(table, *columns)
-    classes, chosen = selection(table, options, numbers < 0)
-    table, classes, numbers = table[chosen], classes[chosen], numbers[chosen]
+    table, classes, numbers, unread = selected(table, options, columns)
     # A collection of multi-part features needs two steps to be split into simple parts.
     members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
     parts, member = shapely.get_parts(members, return_index=True)
@@ -185,13 +181,19 @@ def _from_table(table: Any, options: Options, columns: LevelColumns | None) -> R
     )
 
 
-def selection(table: Any, options: Options, tubes: Bools) -> tuple[NDArray[np.object_], Bools]:
-    """Return the class of each row of a table, in lower case or empty, and which rows are roads.
+def selected(
+    table: Any, options: Options, levels: LevelColumns | None
+) -> tuple[Any, NDArray[np.object_], NDArray[np.int64], tuple[str, ...]]:
+    """Return the rows of a table that are roads, the class of each, in lower case or empty, and its level.
 
-    Tubes, given by row, are not left out as hidden.
+    And notes on levels that cannot be read. With levels, tubes are not left out as hidden.
     """
+    numbers, notes = np.zeros(len(table), np.int64), tuple[str, ...]()
+    if levels:
+        numbers, notes = level_numbers.level_numbers(table, *levels)
     classes = _classes(table, options.class_columns)
-    return classes, _is_road(table, classes, options, tubes)
+    chosen = _is_road(table, classes, options, numbers < 0)
+    return table[chosen], classes[chosen], numbers[chosen], notes
 
 
 def _classes(table: Any, columns: tuple[str, ...]) -> NDArray[np.object_]:
