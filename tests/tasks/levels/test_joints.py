@@ -29,7 +29,8 @@ def found(*roads, dsm=FLAT, dtm=FLAT, grid=GRID):
     """Return the levels of roads, given as (level, area), and notes."""
     numbers, areas = zip(*roads, strict=True)
     data = TileData("a", grid, grid, dsm, dtm)
-    return levels_of(np.array(areas, object), np.array(numbers), data)
+    areas = np.array(areas, object)
+    return levels_of(areas, areas, np.array(numbers), data)
 
 
 def joint_ends(level):
@@ -66,6 +67,13 @@ def test_gap_that_is_too_wide_gives_no_joint():
     assert level.joints.is_empty
     assert "1 deck of level 1 without a joint" in notes[0]
     assert "gaps above 1.5 m" in notes[0]
+
+
+@pytest.mark.parametrize(("west", "east", "noted"), [(-60, 160, False), (-60, 99, False), (1, 99, True)])
+def test_deck_without_joint_is_noted_if_its_ends_are_known(west, east, noted):
+    """The middle tile of a long deck sees none of its joints."""
+    levels, notes = found((1, strip(west, east)), BELOW)
+    assert (len(levels), len(notes)) == (1, noted)
 
 
 def test_street_below_is_no_joint_also_beside_an_abutment():
