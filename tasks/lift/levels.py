@@ -40,10 +40,11 @@ def along(heights: Heights, wanted: Numbers) -> tuple[Floats, Numbers]:
         z[chosen], numbers[chosen] = row[chosen], number
     for start, end in _stretches(several):
         candidates = [(0, z[start:end].copy())]
+        candidates += [
+            (number, row[start:end]) for number, row in others if np.isfinite(row[start:end]).all()
+        ]
         # The highest first: it is taken where levels are equally smooth.
-        for number, row in reversed(others):
-            if np.isfinite(row[start:end]).all():
-                candidates.insert(len(candidates) - 1, (number, row[start:end]))
+        candidates.sort(key=lambda candidate: -candidate[0])
         around = slice(max(start - 2, 0), end + 2)
         bends = [_bend(z, around, start, end, values) for _, values in candidates]
         alone = start == 0 and end == len(z)

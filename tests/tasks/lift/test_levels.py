@@ -51,6 +51,12 @@ def test_a_line_with_two_levels_from_end_to_end_is_on_the_higher_one():
     assert (numbers == 1).all()
 
 
+def test_a_line_over_a_tube_from_end_to_end_is_on_the_ground():
+    z, numbers = along(Heights((-1, 0), np.stack([GROUND - 6, GROUND])), any_level())
+    np.testing.assert_array_equal(z, GROUND)
+    assert not numbers.any()
+
+
 def test_attributes_decide_where_there_are_any():
     deck = np.where((S > 20) & (S < 32), 106.0, NAN)
     z, numbers = along(heights(deck), np.ones(60, np.int8))
