@@ -108,7 +108,9 @@ def _closed(areas: shapely.Geometry) -> shapely.Geometry:
     # GEOS buffers areas of a fixed precision on their grid, and so fills large holes.
     areas = shapely.set_precision(areas, 0)
     wider = shapely.buffer(areas, GAP_M / 2, join_style="mitre")
-    return shapely.buffer(wider, -GAP_M / 2, join_style="mitre")
+    closed = shapely.buffer(wider, -GAP_M / 2, join_style="mitre")
+    # GEOS rarely returns a mitred outline that crosses itself, which it then refuses to unite.
+    return closed if shapely.is_valid(closed) else shapely.union_all(polygons_of(shapely.make_valid(closed)))
 
 
 def polygons_of(geometries: Any) -> NDArray[np.object_]:
