@@ -51,8 +51,8 @@ from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Floats
 
-VERSION = 5
-"""Of the roads themselves: their division, lines and grids."""
+VERSION = 6
+"""Of the roads themselves: their division, lines, grids and errors."""
 INTERNAL = {"bounds", "lanes_assumed"}
 """Entries of a road's row that the report does not show."""
 REPORT = "roads.csv"

@@ -26,7 +26,7 @@ from flexroad.tasks.types import Floats
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-VERSION = 2
+VERSION = 3
 NAME = ".xodr"
 MEDIA_TYPE = "application/xml"
 

@@ -92,12 +92,14 @@ class Profiles:
 def profiles(grid: HeightGrid, knot_m: float = 5.0) -> Profiles:
     """Return the profiles that fit the heights of the carriageway by least squares.
 
-    Cross-sections with less than two heights do not count; what is between their neighbours is used. The
-    length of a cubic piece is ``knot_m``.
+    Where the surface ends across the road, a cross-section is compared with the nearest complete one: a line
+    through a part of it alone would have the slope of that side of the crown. Cross-sections with less than
+    two heights do not count; what is between their neighbours is used. The length of a cubic piece is
+    ``knot_m``.
     """
-    inside = _carriageway(grid)
-    height, slope = _straight(np.where(inside, grid.heights, 0.0), grid.v, inside)
-    s = grid.line.s
+    inside, s = _carriageway(grid), grid.line.s
+    crown, inside = _crown(grid, inside)
+    height, slope = _straight(np.where(inside, grid.heights - crown, 0.0), grid.v, inside)
     return Profiles(_spline(s, height, knot_m), _spline(s, np.arctan(slope), knot_m))
 
 
@@ -131,8 +133,30 @@ def _missed(grid: HeightGrid, fitted: Floats) -> tuple[float, float]:
 
 
 def _carriageway(grid: HeightGrid) -> Bools:
-    beyond = np.abs(grid.v) - grid.line.width[:, None] / 2
-    return np.asarray((beyond < 1e-6) & np.isfinite(grid.heights))
+    return _between_edges(grid) & np.isfinite(grid.heights)
+
+
+def _between_edges(grid: HeightGrid) -> Bools:
+    return np.asarray(np.abs(grid.v) - grid.line.width[:, None] / 2 < 1e-6)
+
+
+def _crown(grid: HeightGrid, inside: Bools) -> tuple[Floats, Bools]:
+    """Return how far the nearest complete row is from its straight line, for rows that are cut, and where.
+
+    The rows of the second array are those of ``inside``, without places where the nearest row has no height.
+    """
+    crown = np.zeros(grid.heights.shape)
+    cut = (inside != _between_edges(grid)).any(axis=1)
+    complete, (rows,) = np.flatnonzero(~cut), np.nonzero(cut)
+    if not len(complete) or not len(rows):
+        return crown, inside
+    nearest = complete[np.rint(np.interp(rows, complete, np.arange(len(complete)))).astype(int)]
+    heights = np.where(inside[nearest], grid.heights[nearest], 0.0)
+    height, slope = _straight(heights, grid.v, inside[nearest])
+    crown[rows] = np.where(inside[nearest], heights - height[:, None] - slope[:, None] * grid.v, 0.0)
+    common = inside.copy()
+    common[rows] &= inside[nearest]
+    return crown, common
 
 
 def _straight(heights: Floats, v: Floats, inside: Bools) -> tuple[Floats, Floats]:

@@ -70,6 +70,22 @@ def test_profiles_unknown_cross_sections_are_bridged():
     assert result.elevation(51.0) == pytest.approx(hill(51.0, 0.0), abs=0.005)
 
 
+@pytest.mark.parametrize("step", [0.5, -2.0])
+def test_profiles_of_a_crowned_road_do_not_bend_where_its_surface_ends(step):
+    """A tile ends askew: the first and last cross-sections are cut."""
+
+    def crowned(x, y):
+        return 100 + 0.04 * x + 0.01 * y - 0.025 * np.abs(y)
+
+    def ending(x, y):
+        return np.where(np.abs(x - 30 - step * y) < 30.01, crowned(x, y), np.nan)
+
+    s = np.linspace(0, 60, 25)
+    complete, cut = (profiles(grid(heights, 60.0)) for heights in (crowned, ending))
+    np.testing.assert_allclose(cut.elevation(s), complete.elevation(s), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(cut.superelevation(s), np.arctan(0.01), rtol=0, atol=1e-9)
+
+
 def test_profile_error_without_heights_is_nan():
     whole = grid(hill)
     nothing = HeightGrid(whole.line, whole.v, whole.heights * np.nan)
