@@ -6,6 +6,7 @@ import json
 from xml.etree import ElementTree
 
 import numpy as np
+import shapely
 import trimesh
 from PIL import Image
 from pmtiles.reader import MmapSource, Reader, all_tiles
@@ -150,3 +151,18 @@ def vertices(out, crs="EPSG:25832"):
         "cityjson": cityjson(next((out / "cityjson").iterdir())),
         "obj": obj(out / "obj"),
     }
+
+
+def on_mesh(vertices, faces, easting, northing):
+    """Return the heights of a mesh at places."""
+    corners = vertices[faces]
+    tree = shapely.STRtree(shapely.polygons(corners[:, :, :2]))
+    point, face = tree.query(shapely.points(easting, northing), predicate="intersects")
+    height = np.full(len(easting), np.nan)
+    a, b, c = corners[face].transpose(1, 0, 2)
+    u, v, w = b - a, c - a, np.column_stack([easting, northing])[point] - a[:, :2]
+    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    p = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
+    q = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
+    height[point] = a[:, 2] + p * u[:, 2] + q * v[:, 2]
+    return height

@@ -5,7 +5,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import shapely
 import trimesh
 from pyproj import Transformer
 
@@ -16,6 +15,7 @@ from flexroad.pipeline.export.source import Options, select
 from flexroad.pipeline.run.record import Run
 from flexroad.tasks.spline.stepped import without_steps
 from tests.make_city import CRS, TILE_M, make_city, south_west
+from tests.read_exports import on_mesh
 from tests.read_opendrive import plan, polynomial
 
 POINTS = 1000
@@ -82,21 +82,6 @@ def truth(city, places):
         inside = (west <= easting) & (easting <= east) & (south <= northing) & (northing <= north)
         height[inside] = without_steps(tile.surface).height(easting[inside], northing[inside])
     assert np.isfinite(height).all()
-    return height
-
-
-def on_mesh(vertices, faces, easting, northing):
-    """Return the heights of a mesh at places."""
-    corners = vertices[faces]
-    tree = shapely.STRtree(shapely.polygons(corners[:, :, :2]))
-    point, face = tree.query(shapely.points(easting, northing), predicate="intersects")
-    height = np.full(len(easting), np.nan)
-    a, b, c = corners[face].transpose(1, 0, 2)
-    u, v, w = b - a, c - a, np.column_stack([easting, northing])[point] - a[:, :2]
-    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    p = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
-    q = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
-    height[point] = a[:, 2] + p * u[:, 2] + q * v[:, 2]
     return height
 
 

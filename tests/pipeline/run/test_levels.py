@@ -2,7 +2,7 @@
 
 import io
 import json
-import shutil
+import subprocess
 from xml.etree import ElementTree
 
 import geopandas
@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 import rasterio
 import shapely
+import trimesh
 
 import flexroad
 from flexroad.catalog import Catalog
@@ -28,11 +29,16 @@ from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.export import npz
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.spline.levelled import LevelledSurface
-from flexroad.tasks.synthetic.crossings import Crossings
+from flexroad.tasks.synthetic.centrelines import MAIN, SIDE
+from flexroad.tasks.synthetic.crossings import CROSS_M, MAIN_M, Crossings
+from tests import validators
 from tests.command_line import call
 from tests.mesh_union import Union
+from tests.read_exports import on_mesh
 from tests.read_opendrive import numbers, plan, polynomial, quality_issues
+from tests.tasks.export.test_landxml import surfaces as landxml_surfaces
 from tests.tasks.export.test_viewer import content, heights
+from tests.validators.gltf import gltf_issues
 from tests.validators.opendrive import by_sumo, in_crs
 
 SEED, SIZE_M = 0, 60
@@ -334,8 +340,7 @@ def test_opendrive_has_two_heights_at_a_crossing_and_a_bridge(along):
     upper, lower = ElementTree.parse(file).getroot().findall("road")
     heights = []
     for number, road in ((1, upper), (0, lower)):
-        # At the ends of the tiles, cross-sections are cut.
-        s = np.arange(4.0, float(road.attrib["length"]) - 4, 0.5)
+        s = np.arange(0.0, float(road.attrib["length"]), 0.5)
         x, y, heading = np.array([plan(road, at) for at in s]).T[..., None]
         # A profile is straight across a road, and its crown is some centimetres higher.
         v = np.linspace(-3.4, 3.4, 35)
@@ -356,15 +361,95 @@ def test_opendrive_has_two_heights_at_a_crossing_and_a_bridge(along):
     assert lower.find("objects") is None
 
 
-def test_opendrive_with_levels_passes_the_quality_checker_and_netconvert(along, tmp_path):
-    file = shutil.copy(next((along / "xodr").glob("*.xodr")), tmp_path / "roads.xodr")
+@pytest.fixture(scope="module")
+def below(cells):
+    """Places of the street below the deck of the main road, ``(n, 2)``."""
+    x, y, *_ = cells
+    lines = Crossings(SEED).roads((x.min(), y.min(), x.max(), y.max()))
+    on = np.ones(x.shape, bool)
+    for half_m, highway, level in ((CROSS_M, SIDE, 0), (MAIN_M, MAIN, 1)):
+        roads = [line.points for line in lines if (line.highway, line.level) == (highway, level)]
+        on &= shapely.dwithin(shapely.multilinestrings(roads), shapely.points(x, y), half_m)
+    return np.column_stack([x[on], y[on]])
+
+
+def from_glb(run, below, folder):
+    """The Khronos validator and trimesh."""
+    files, meshes = sorted(run.path.glob("tiles/*/*.glb")), []
+    assert gltf_issues(files) == []
+    for file in files:
+        graph = (scene := trimesh.load(file)).graph
+        for node in graph.nodes_geometry:
+            matrix, name = graph[node]
+            x, y, z = trimesh.transform_points(scene.geometry[name].vertices, matrix).T
+            places = np.column_stack([x + run.origin[0], run.origin[1] - z, y])
+            level = int(graph.transforms.parents[node] == "level 1")
+            meshes.append((level, places, scene.geometry[name].faces))
+    return on_meshes(meshes, below)
+
+
+def from_landxml(run, below, folder):
+    """The text alone: none of the programs reads LandXML."""
+    call("export", run.path, "--format", "landxml", "-o", folder).expected(0)
+    (file,) = (folder / "landxml").glob("*.xml")
+    surfaces = landxml_surfaces(file.read_bytes())
+    assert set(surfaces) == {"road", "ground", "road level 1"}
+    return on_meshes([(int(name.endswith("level 1")), *surfaces[name]) for name in surfaces], below)
+
+
+def from_cityjson(run, below, folder):
+    """The program cjio, which joins the tiles."""
+    call("export", run.path, "--format", "cityjson", "-o", folder).expected(0)
+    (file,) = (folder / "cityjson").glob("*.jsonl")
+    command = [validators.program("cjio"), "--suppress_msg", "stdin", "save", folder / "city.json"]
+    subprocess.run(command, input=file.read_bytes(), check=True)
+    city = json.loads((folder / "city.json").read_bytes())
+    vertices = np.array(city["vertices"]) * city["transform"]["scale"] + city["transform"]["translate"]
+    meshes = []
+    for item in city["CityObjects"].values():
+        (geometry,) = item["geometry"]
+        meshes.append((int(item["type"] == "Bridge"), vertices, np.array(geometry["boundaries"])[:, 0]))
+    return on_meshes(meshes, below)
+
+
+def from_opendrive(run, below, folder):
+    """The checker of ASAM, and netconvert, which has heights at places of its own in the middle of lanes."""
+    call("export", run.path, "--format", "crg,xodr", "-o", folder).expected(0)
+    (file,) = (folder / "xodr").glob("*.xodr")
     assert quality_issues(file) == []
-    roads, places = by_sumo(file, tmp_path)
-    x, y = in_crs(file, "EPSG:25832", *places[:, :2].T)
-    upper, lower = ElementTree.parse(file).getroot().findall("road")
-    crossing = truth(1, x, y)[1]
-    means = [places[crossing & (roads == int(road.attrib["id"])), 2].mean() for road in (upper, lower)]
-    assert means[0] - means[1] > 5
+    roads, places = by_sumo(file, folder)
+    places[:, :2] = np.column_stack(in_crs(file, "EPSG:25832", *places[:, :2].T))
+    near = shapely.dwithin(shapely.multipoints(below), shapely.points(places[:, :2]), 0.8)
+    upper, lower = (int(road.attrib["id"]) for road in ElementTree.parse(file).getroot().findall("road"))
+    return {0: places[near & (roads == lower)], 1: places[near & (roads == upper)]}
+
+
+def from_query(run, below, folder):
+    """The command line."""
+    points = folder / "points.csv"
+    pd.DataFrame(below, columns=["easting", "northing"]).to_csv(points, index=False)
+    answer = call("query", run.path, "--points", points, "--level", "all").expected(0).out
+    table = pd.read_csv(io.StringIO(answer)).set_index("level")[["easting", "northing", "height_m"]]
+    return {level: table.loc[level].to_numpy() for level in (0, 1)}
+
+
+def on_meshes(meshes, places):
+    """Return places with the heights of both levels by meshes: level, vertices and faces."""
+    heights = np.full((2, len(places)), np.nan)
+    for level, vertices, faces in meshes:
+        here = on_mesh(vertices, faces, *places.T)
+        heights[level] = np.where(np.isnan(here), heights[level], here)
+    return {level: np.column_stack([places, heights[level]]) for level in (0, 1)}
+
+
+@pytest.mark.parametrize("opened", [from_glb, from_landxml, from_cityjson, from_opendrive, from_query])
+def test_every_export_of_a_crossing_has_both_heights_in_other_programs(opened, run, below, tmp_path):
+    both = opened(run, below, tmp_path)
+    for level, at_most in ((0, 0.06), (1, 0.02)):
+        x, y, z = both[level].T
+        off = np.abs(z - Crossings(SEED).height(level, x, y))
+        assert len(z) >= 5
+        assert off.mean() <= at_most
 
 
 def test_roads_of_a_run_without_levels_have_no_column_of_them(run, tmp_path):
