@@ -325,17 +325,19 @@ def roofs_seen(
         return ()
     x, y = (np.array([getattr(house, axis) for house in houses]) for axis in ("x", "y"))
     height = np.array([house.eaves for house in houses]) - ground_at(x, y).bare
-    phase = generator(seed, "images").uniform(0, IMAGE_M, 2)
-    shift = lean * height * np.stack([_from_middle(x + phase[0]), _from_middle(y + phase[1])])
+    shift = lean * height * from_middle(seed, x, y)
     return tuple(
         Roof(house, (float(east), float(north)), _drawn(house, seed) < facades)
         for house, east, north in zip(houses, *shift, strict=True)
     )
 
 
-def _from_middle(coordinate: Floats) -> Floats:
-    """Return the place in an image, from -1 at its one edge to 1 at the other."""
-    return 2 * (coordinate / IMAGE_M % 1) - 1
+def from_middle(seed: int, x: Floats, y: Floats) -> Floats:
+    """Return the places of points in their images, ``(2, N)``: 0 in the middle, -1 and 1 at the edges."""
+    phase = generator(seed, "images").uniform(0, IMAGE_M, 2)
+    return np.stack(
+        [2 * ((axis + start) / IMAGE_M % 1) - 1 for axis, start in zip((x, y), phase, strict=True)]
+    )
 
 
 def _drawn(house: House, seed: int) -> float:

@@ -66,6 +66,14 @@ class SceneOptions(Options):
         0.0, ge=0, le=1, description="fraction of the cells at walls whose height lies between top and foot"
     )
 
+    voids: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="length of the ground hidden beside a crown, per its height, at the edge of an image; "
+        "above 0, hidden ground and water have no height in the DSM",
+    )
+
     car_parks: float = Field(0.0, ge=0, le=5, description="car parks per street")
     fields: float = Field(
         0.0, ge=0, le=5, description="bare fields per street that the mask may show as road"

@@ -23,6 +23,7 @@ from flexroad.tasks.synthetic.segmentation import segmentation
 from flexroad.tasks.synthetic.spoilers import BARE, Canvas, Kind, surface_model
 from flexroad.tasks.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
 from flexroad.tasks.synthetic.survey_errors import changes, growth, mixed, rise, scars
+from flexroad.tasks.synthetic.voids import hidden, water
 from flexroad.tasks.types import Bools, Floats
 
 __all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
@@ -48,7 +49,7 @@ class Scene:
     grid: Grid
     stratum: str
     dsm: Floats
-    """Surface model with houses, crowns, cars and noise, ``(H, W)``, m."""
+    """Surface model with houses, crowns, cars and noise, ``(H, W)``, m; NaN where it has no height."""
     dtm: Floats
     """Terrain model without bridges, smoothed and noisy, ``(H, W)``, m."""
     road_mask: Bools
@@ -177,6 +178,10 @@ def _survey(
     if options.mixed > 0:
         dsm, chosen = mixed(dsm, truth, options.mixed, rng)
         kind[chosen & np.isin(kind, BARE) & (dsm > truth)] = Kind.MIXED
+    if options.voids > 0:
+        without = water(canvas, canvas.plan.streams(_box(canvas, 0))) & ~here.deck
+        without |= hidden(canvas, dsm, objects.crowns, canvas.plan.seed, options.voids)
+        dsm[without] = np.nan
     return dsm, kind
 
 
