@@ -128,7 +128,8 @@ def squared(data: TileData, clusters: RoadClusters, options: fit.Options) -> Nur
     space = fit.space_of(data, options)
     along_u = basis_matrix(space.knots_u, space.degree[0], space.u)[0]
     along_v = basis_matrix(space.knots_v, space.degree[1], space.v)[0]
-    target = np.where(clusters.mask, data.dsm, data.dtm)
+    # Where the DSM has no height, the DTM: the closed form needs one in each cell.
+    target = np.where(clusters.mask & np.isfinite(data.dsm), data.dsm, data.dtm)
     datum = float(target.mean())
     z = np.linalg.pinv(along_v) @ (target - datum) @ np.linalg.pinv(along_u).T
     return surface_of(data, space, z, np.ones_like(z), datum)

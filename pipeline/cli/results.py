@@ -103,13 +103,21 @@ def tables(
             rich_help_panel=INPUTS,
         ),
     ] = None,
+    dsm: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="The same tiles, run with --config ablation_dsm: road L2 against the DSM.",
+            rich_help_panel=INPUTS,
+        ),
+    ] = None,
     allow: options.Allow = None,
 ) -> None:
     """Write the paper's tables and claims beside the values of a run.
 
     They are Markdown, LaTeX, CSV and HTML.
     """
-    folders = (true, dsc3d, dsc3d_true, literal)
+    folders = (true, dsc3d, dsc3d_true, literal, dsm)
     runs = [Run.open(folder, allow or ()) if folder else None for folder in folders]
     for written in write_comparison(Run.open(path, allow or ()), runs[0], output, *runs[1:]):
         echo(str(written))

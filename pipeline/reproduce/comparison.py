@@ -42,6 +42,8 @@ from flexroad.pipeline.reproduce.sections import (
     literal_numbers,
     literal_sections,
     numbers,
+    road_numbers,
+    road_sections,
     score_sections,
     side_by_side,
     verdicts_table,
@@ -105,6 +107,7 @@ def compare(data: MetricsData) -> Comparison:
         *(section for name, rows in tables.items() for section in side_by_side(name, rows, ours)),
         *(_changes(tables["Table II"], head) if BASE in head.variants and "Table II" in tables else []),
         *(literal_sections(tables.get("Table II", ()), data)),
+        *road_sections(_union(tables), head, data),
         Section("The paper's claims", claims),
         *dsc3d_sections,
         *_other_masks(_union(tables), means),
@@ -115,7 +118,7 @@ def compare(data: MetricsData) -> Comparison:
         for classes, class_means in means.items()
         for name, rows in tables.items()
     ]
-    table_numbers += literal_numbers(tables, data)
+    table_numbers += [*literal_numbers(tables, data), *road_numbers(_union(tables), data)]
     return Comparison(
         data.line,
         (*_notes(data, paper, verdicts[data.classes[0]]), *literal_notes(data), *dsc3d_notes),

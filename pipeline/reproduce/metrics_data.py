@@ -16,7 +16,8 @@ from flexroad.pipeline.report.content import FIGURES
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.tables import frame_of, read_metrics
 
-FILE, DSC3D_FILE, LITERAL_FILE = "metrics.parquet", "metrics_dsc3d.parquet", "metrics_literal.parquet"
+FILE, DSC3D_FILE = "metrics.parquet", "metrics_dsc3d.parquet"
+LITERAL_FILE, DSM_FILE = "metrics_literal.parquet", "metrics_dsm.parquet"
 KEYS = ["dataset", "classes", "tile_id", "stratum", "variant"]
 FIGURE_DTYPE: Final = "float32"
 """Type of the stored figures. Pages are made from these values: the stored files reproduce them exactly."""
@@ -35,6 +36,8 @@ class MetricsData:
     """Runs for the DSC3D rows, one per reference; the reference that the paper describes comes first."""
     literal: MetricsData | None = None
     """A run with the paper read literally over all or some of the tiles, None if there is none."""
+    dsm: MetricsData | None = None
+    """The same tiles measured against the DSM, None if there is no such run."""
 
     @property
     def dataset(self) -> str:
@@ -83,6 +86,7 @@ def collect(
     dsc3d: Run | None = None,
     dsc3d_true: Run | None = None,
     literal: Run | None = None,
+    dsm: Run | None = None,
 ) -> MetricsData:
     """Return the figures of a run and of the runs it is compared with.
 
@@ -98,6 +102,8 @@ def collect(
         The same scenes, measured against the true surface.
     literal : Run, optional
         A run with configs/literal.yaml over the same tiles or some of them.
+    dsm : Run, optional
+        The same tiles and variants with configs/ablation_dsm.yaml: measured against the DSM.
 
     Raises
     ------
@@ -111,8 +117,9 @@ def collect(
         _check_twins(dsc3d, dsc3d_true, *(data.rows for data in scenes))
     first = _rows(run)
     column = _checked_literal(literal, first) if literal else None
+    other = _checked_dsm(dsm, run, first) if dsm else None
     if true is None:
-        return _checked(first, run.path, scenes, column)
+        return _checked(first, run.path, scenes, column, other)
     second = _rows(true)
     if not any(tile.layer("reference_road") for tile in true.catalog.tiles):
         raise ConfigError(f"{true.path} has no true road mask in its catalog; leave out --true")
@@ -125,7 +132,7 @@ def collect(
         raise ConfigError(
             f"{true.path} has other data, tiles or variants than {run.path}; run both over the same catalog"
         )
-    return _checked(pd.concat([first, second], ignore_index=True), run.path, scenes, column)
+    return _checked(pd.concat([first, second], ignore_index=True), run.path, scenes, column, other)
 
 
 def _checked_literal(literal: Run, first: pd.DataFrame) -> MetricsData:
@@ -135,6 +142,17 @@ def _checked_literal(literal: Run, first: pd.DataFrame) -> MetricsData:
             f"{literal.path} has other data or tiles than the main run; --literal needs its catalog"
         )
     return _checked(rows, literal.path)
+
+
+def _checked_dsm(dsm: Run, run: Run, first: pd.DataFrame) -> MetricsData:
+    if any(chain["evaluate"].truth != "dsm" for chain in dsm.config.chains.values()):
+        raise ConfigError(f"{dsm.path} is not measured against the DSM; --dsm needs --config ablation_dsm")
+    rows = _rows(dsm)
+    if _tile_variants(first) != _tile_variants(rows) or {*first.dataset} != {*rows.dataset}:
+        raise ConfigError(
+            f"{dsm.path} has other data, tiles or variants than {run.path}; run both over the same catalog"
+        )
+    return _checked(rows, dsm.path)
 
 
 def _check_twins(run: Run, true: Run, first: pd.DataFrame, second: pd.DataFrame) -> None:
@@ -166,16 +184,22 @@ def write_metrics_data(data: MetricsData, folder: Path) -> None:
         write(folder / LITERAL_FILE, _parquet(data.literal.rows))
     else:
         (folder / LITERAL_FILE).unlink(missing_ok=True)
+    if data.dsm:
+        write(folder / DSM_FILE, _parquet(data.dsm.rows))
+    else:
+        (folder / DSM_FILE).unlink(missing_ok=True)
 
 
 def read_metrics_data(folder: Path) -> MetricsData:
     """Read the files of `write_metrics_data`."""
     dsc3d = _read(folder / DSC3D_FILE) if (folder / DSC3D_FILE).exists() else pd.DataFrame({"dataset": []})
     parts = [rows for _, rows in dsc3d.groupby("dataset", sort=False)]
-    literal = MetricsData(_read(folder / LITERAL_FILE)) if (folder / LITERAL_FILE).exists() else None
-    return MetricsData(
-        _read(folder / FILE), tuple(MetricsData(rows.reset_index(drop=True)) for rows in parts), literal
+    literal, dsm = (
+        MetricsData(_read(folder / name)) if (folder / name).exists() else None
+        for name in (LITERAL_FILE, DSM_FILE)
     )
+    scenes = tuple(MetricsData(rows.reset_index(drop=True)) for rows in parts)
+    return MetricsData(_read(folder / FILE), scenes, literal, dsm)
 
 
 def _parquet(rows: pd.DataFrame) -> bytes:
@@ -220,8 +244,9 @@ def _checked(
     run: Location,
     dsc3d: tuple[MetricsData, ...] = (),
     literal: MetricsData | None = None,
+    dsm: MetricsData | None = None,
 ) -> MetricsData:
-    data = MetricsData(rows, dsc3d, literal)
+    data = MetricsData(rows, dsc3d, literal, dsm)
     if not data.tiles.complete.any():
         raise ConfigError(f"{run} has no tile with figures for every variant; see `flexroad status {run}`")
     return data

@@ -31,6 +31,7 @@ from flexroad.pipeline.reproduce.published import BASE, Row
 
 GROUPS = (("l2_road_m", "l2_terrain_m"), ("mad_road_deg", "mad_terrain_deg"), ("triangles",))
 """Figures that share a table; all five in one table would be wider than a page."""
+ROAD_L2 = "l2_road_m"
 FIGURES_SCORED = ("l2_road_m", "l2_terrain_m", "mad_road_deg", "mad_terrain_deg")
 """Without T, which depends on the mask and the sampling alone."""
 LEAST = 0.05
@@ -276,6 +277,33 @@ def literal_sections(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Secti
         f"{count(len(tiles), 'tile')}: the exponential of the mean absolute logarithm of the ratio, 1 if "
         "equal. Figures: of the row itself. Changes: of the row relative to the full pipeline.",
     )
+
+
+def road_sections(rows: tuple[Row, ...], means: Means, data: MetricsData) -> Iterator[Section]:
+    """Yield L2 on roads against the reference and against the DSM, if there is a run with the DSM."""
+    if not data.dsm:
+        return
+    table = pd.DataFrame({"variant": [row.label for row in rows]})
+    table[f"{FIGURES[ROAD_L2]}, paper"] = [format_figure(row.value(ROAD_L2), ROAD_L2) for row in rows]
+    for name, column in (("reference", means), ("DSM", _means(data.dsm))):
+        table[f"{FIGURES[ROAD_L2]}, ours by the {name}"] = [
+            _with_interval(column, row.variant, ROAD_L2) for row in rows
+        ]
+    yield Section(
+        "L2 on roads by the reference and by the DSM",
+        table,
+        "The same meshes and the same road mask, measured against the reference, and against the DSM where "
+        "it has a height.",
+    )
+
+
+def road_numbers(rows: tuple[Row, ...], data: MetricsData) -> list[pd.DataFrame]:
+    """Return L2 on roads against the DSM as rows of `numbers`, if there is a run with it."""
+    if not data.dsm:
+        return []
+    name = f"{data.dsm.dataset}; against the DSM"
+    table = numbers("L2 on roads by the DSM", rows, data.dsm.classes[0], _means(data.dsm), name)
+    return [table[table.figure == ROAD_L2]]
 
 
 def distances_of(rows: tuple[Row, ...], means: Means, relative: bool) -> np.ndarray:

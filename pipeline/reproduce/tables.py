@@ -37,6 +37,7 @@ def write_comparison(
     dsc3d: Run | None = None,
     dsc3d_true: Run | None = None,
     literal: Run | None = None,
+    dsm: Run | None = None,
 ) -> tuple[Path, ...]:
     """Write the paper's tables with a run's figures beside them; return the paths of the files.
 
@@ -46,7 +47,7 @@ def write_comparison(
         A run with variants named as in configs/ablation.yaml; missing variants are left out.
     folder : Path
         Folder for the files.
-    true, dsc3d, dsc3d_true, literal : Run, optional
+    true, dsc3d, dsc3d_true, literal, dsm : Run, optional
         The runs that `collect` takes.
 
     Raises
@@ -55,7 +56,7 @@ def write_comparison(
         If a run has no figures or mixes datasets, two runs to compare have different tiles, or the folder
         cannot be written.
     """
-    data = collect(run, true, dsc3d, dsc3d_true, literal)
+    data = collect(run, true, dsc3d, dsc3d_true, literal, dsm)
     texts = pages(data)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ has their height.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -31,13 +31,20 @@ VERSION = 3
 
 
 class Options(base.Options):
-    """Optional metrics, and the mask that classes cells as road."""
+    """Optional metrics, the mask that classes cells as road, and the heights that count as true."""
+
+    LATER: ClassVar[tuple[str, ...]] = ("truth",)
 
     nearest: bool = Field(False, description="also measure 3-D distances (slower)")
     classes: Literal["reference", "segmented"] = Field(
         "reference",
         description="mask of the road cells: reference: the true mask, else the raw segmented one; "
         "segmented: the raw segmented one, as in the paper",
+    )
+    truth: Literal["reference", "dsm"] = Field(
+        "reference",
+        description="heights that the mesh is compared with: reference: the catalog's, else the DTM; "
+        "dsm: the DSM",
     )
 
 
@@ -47,14 +54,14 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
     Parameters
     ----------
     data : TileData
-        Reference heights, else the DTM, are the truth.
+        Reference heights, else the DTM, are the truth, or with ``truth: dsm`` the DSM.
     road : RoadMask
         Its raw mask classes the cells with ``classes: segmented``, or if the tile has no reference mask.
         The distance from the surface is always by the raw mask, by which the mesh was sampled.
     surface : Surface
         The surface that the mesh samples.
     options : Options
-        Whether to measure 3-D distances, and which mask classes the cells.
+        Whether to measure 3-D distances, which mask classes the cells, and which heights are true.
 
     Returns
     -------
@@ -70,7 +77,7 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
     for number in mesh.numbers:
         mesh_check.check(mesh.at(number))
     triangles, mesh = len(mesh.faces), mesh.at(0)
-    truth = data.dtm if data.reference is None else data.reference
+    truth = _truth(data, options)
     reference_road = data.reference_road if options.classes == "reference" else None
     is_road = road.mask if reference_road is None else reference_road
     window = data.grid.window(data.core)
@@ -103,6 +110,12 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
         completeness=mean(has_both[has_truth]),
         **mesh_distances(mesh, surface, road),
     )
+
+
+def _truth(data: TileData, options: Options) -> Floats:
+    if options.truth == "dsm":
+        return data.dsm
+    return data.dtm if data.reference is None else data.reference
 
 
 def _below_decks(road: RoadMask) -> Bools:

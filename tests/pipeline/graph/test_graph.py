@@ -74,10 +74,12 @@ def reference_fingerprints(graph, config) -> dict[str, dict[str, str]]:
         for stage, inputs in STAGES.items():
             options = chain[stage]
             module = stage_module(options)
+            # None of the configurations changes an option that was added later.
+            values = {k: v for k, v in options.model_dump(mode="json").items() if k not in options.LATER}
             hashed = [
                 stage,
                 module.VERSION,
-                options.model_dump(mode="json"),
+                values,
                 [by_stage[name] for name in inputs] or asdict(tile.grid),
                 [source for source in graph.sources if source[0] in getattr(module, "READS", ())],
                 [],

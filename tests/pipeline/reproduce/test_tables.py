@@ -345,6 +345,35 @@ def test_compare_names_the_mask_that_classed_the_cells(tmp_path):
         assert any(note.endswith(words) for note in compare(collect(run)).notes), words
 
 
+def test_write_comparison_with_dsm_run_has_road_l2_side_by_side(tmp_path):
+    ours = made_run(tmp_path / "ours")
+    by_dsm = made_run(tmp_path / "dsm", "ablation_dsm", factor=2)
+    write_comparison(ours, None, tmp_path / "out", dsm=by_dsm)
+    page = (tmp_path / "out" / "tables.md").read_text()
+    section = page.partition("## L2 on roads by the reference and by the DSM\n")[2].partition("\n## ")[0]
+    assert "| Full Pipeline | 0.483 | 0.483 [0.483, 0.483] | 0.966 [0.966, 0.966] |" in section
+    stored = read_metrics_data(tmp_path / "out")
+    assert pages(stored)["tables.md"] == page
+    table = compare(stored).numbers
+    rows = table[table.table == "L2 on roads by the DSM"]
+    assert {*rows.figure} == {"l2_road_m"}
+    assert {*rows.data} == {"made; against the DSM"}
+    assert len(rows) == len(VARIANTS)
+    write_comparison(ours, None, tmp_path / "out")
+    assert read_metrics_data(tmp_path / "out").dsm is None
+
+
+def test_collect_dsm_run_must_be_one_over_the_same_tiles(tmp_path):
+    ours = made_run(tmp_path / "ours")
+    with pytest.raises(
+        ConfigError, match="is not measured against the DSM; --dsm needs --config ablation_dsm"
+    ):
+        collect(ours, dsm=ours)
+    other = made_run(tmp_path / "other", "ablation_dsm", dataset=("GeRoD",))
+    with pytest.raises(ConfigError, match="has other data, tiles or variants than"):
+        collect(ours, dsm=other)
+
+
 def test_collect_literal_run_over_other_tiles_raises(tmp_path):
     ours = made_run(tmp_path / "ours")
     literal = made_run(tmp_path / "literal", "literal")

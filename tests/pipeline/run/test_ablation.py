@@ -42,9 +42,10 @@ def test_main_variants_equal_those_of_paper_configuration(survey):
         assert ours[variant] == paper[variant]
 
 
-def test_true_mask_changes_only_evaluation(survey):
+@pytest.mark.parametrize("name", ["ablation_true", "ablation_dsm"])
+def test_other_truth_changes_only_evaluation(survey, name):
     tile = Catalog.read(survey).tiles[0]
-    ours, true = (tile_graph(tile, load_config(name)).variants for name in ("ablation", "ablation_true"))
+    ours, true = (tile_graph(tile, load_config(config)).variants for config in ("ablation", name))
     assert ours.keys() == true.keys()
     for variant, nodes in ours.items():
         assert {stage for stage in nodes if nodes[stage] != true[variant][stage]} == {"evaluate"}

@@ -374,3 +374,15 @@ def test_fault_of_a_deck_is_an_error():
     data = TileData("t", tile.road.core, tile.road.core, truth, truth)
     with pytest.raises(MeshFault, match="inverted faces"):
         evaluate(replace(mesh, faces=last), data, tile.road, tile.surface, Options())
+
+
+def test_evaluate_truth_dsm_measures_distance_from_the_dsm_where_it_has_a_height():
+    grid = ground(40, 30)
+    mesh, truth = on_lattice(grid, tilt(0)), np.full(grid.shape, 160.0)
+    data = TileData("t", grid, grid, truth + 0.5, truth, reference=truth - 1)
+    data.dsm[:, :10] = np.nan
+    road = RoadMask(grid, grid, western_half(grid), np.zeros(grid.shape, bool))
+    by_dsm = evaluate(mesh, data, road, Level(), Options(truth="dsm"))
+    assert by_dsm.l2_road_m == pytest.approx(0.5)
+    assert by_dsm.road_fraction == pytest.approx(10 / 30)
+    assert evaluate(mesh, data, road, Level(), Options()).l2_road_m == pytest.approx(1.0)
