@@ -37,6 +37,8 @@ REPRODUCED := runs/synthetic-$(TILES)-$(SEED)
 TRUE := $(REPRODUCED)/true
 endif
 LITERAL := $(REPRODUCED)/literal
+# The same meshes against the DSM in place of the reference.
+BY_DSM := $(REPRODUCED)/dsm
 # The column of the paper read literally has fewer tiles: tiles of a smaller number are the first of a larger one.
 LITERAL_TILES ?= $(shell [ $(TILES) -lt 6 ] && echo $(TILES) || echo 6)
 SURVEY := $(REPRODUCED)/survey/catalog.parquet
@@ -44,20 +46,21 @@ SURVEY := $(REPRODUCED)/survey/catalog.parquet
 TRUE_SURVEY := $(REPRODUCED)/survey/catalog_true.parquet
 LITERAL_SURVEY := $(if $(GEROD_ROOT),$(SURVEY),runs/synthetic-$(LITERAL_TILES)-$(SEED)/survey/catalog.parquet)
 RESULTS ?= $(REPRODUCED)/results
-# The published dataset lies elsewhere than its catalog.
-ABLATE = $(BIN)/flexroad run $(if $(GEROD_ROOT),--allow $(GEROD_ROOT)) --store $(REPRODUCED)/store
+# The published dataset lies elsewhere than its catalog; an archive is unpacked beside itself.
+ABLATE = $(BIN)/flexroad run $(if $(GEROD_ROOT),--allow $(GEROD_ROOT:.zip=)) --store $(REPRODUCED)/store
 # DSC3D cannot be had as rasters: five synthetic scenes stand in for it, by the paper's reference and by the truth.
 STANDIN := runs/standin-$(SEED)
 SCENES := $(STANDIN)/scenes/catalog.parquet
 STAND_IN = $(BIN)/flexroad run --config dsc3d --store $(STANDIN)/store
 
-reproduce: $(SURVEY) $(SCENES) $(LITERAL_SURVEY) ## The paper's tables and figures beside ours, on synthetic tiles (TILES=24 SEED=1) or GEROD_ROOT=...
+reproduce: $(SURVEY) $(SCENES) $(LITERAL_SURVEY) ## The paper's tables and figures beside ours, on synthetic tiles (TILES=24 SEED=1) or GEROD_ROOT=FOLDER|ZIP
 	$(ABLATE) --catalog $(SURVEY) --config ablation --out $(REPRODUCED)/segmented
 	$(if $(TRUE),$(ABLATE) --catalog $(TRUE_SURVEY) --config ablation_true --out $(TRUE))
+	$(ABLATE) --catalog $(SURVEY) --config ablation_dsm --out $(BY_DSM)
 	$(ABLATE) --catalog $(LITERAL_SURVEY) --config literal --out $(LITERAL)
 	$(STAND_IN) --catalog $(SCENES) --out $(STANDIN)/circular
 	$(STAND_IN) --catalog $(STANDIN)/scenes/catalog_true.parquet --out $(STANDIN)/true
-	$(BIN)/flexroad tables $(REPRODUCED)/segmented $(if $(TRUE),--true $(TRUE)) --literal $(LITERAL) --dsc3d $(STANDIN)/circular --dsc3d-true $(STANDIN)/true -o $(RESULTS)
+	$(BIN)/flexroad tables $(REPRODUCED)/segmented $(if $(TRUE),--true $(TRUE)) --dsm $(BY_DSM) --literal $(LITERAL) --dsc3d $(STANDIN)/circular --dsc3d-true $(STANDIN)/true -o $(RESULTS)
 	$(BIN)/flexroad figures $(REPRODUCED)/segmented -o $(RESULTS)
 
 # Made once: rasters written anew have new times, and all that hangs on them would be computed again.

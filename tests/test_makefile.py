@@ -36,26 +36,32 @@ def commands(tmp_path, *words: str, program: str = "flexroad", target: str = "re
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_reproduce_synthetic_tiles_run_with_both_masks(tmp_path):
-    catalog, _, first, second, literal, _, _, tables, figures = commands(tmp_path, "TILES=3", "SEED=5")
+    catalog, _, first, second, dsm, literal, _, _, tables, figures = commands(tmp_path, "TILES=3", "SEED=5")
     assert catalog[:2] == ["catalog", "synthetic"]
     assert {"--preset", "gerod", "--tiles", "3", "--seed", "5"} <= set(catalog)
-    stores = [line[line.index("--store") + 1] for line in (first, second, literal)]
-    assert stores[0] == stores[1] == stores[2]
-    assert ("ablation" in first, "ablation_true" in second, "literal" in literal) == (True, True, True)
-    catalogs = [Path(line[line.index("--catalog") + 1]) for line in (first, second)]
+    stores = {line[line.index("--store") + 1] for line in (first, second, dsm, literal)}
+    assert len(stores) == 1
+    runs = (first, second, dsm, literal)
+    configs = [line[line.index("--config") + 1] for line in runs]
+    assert configs == ["ablation", "ablation_true", "ablation_dsm", "literal"]
+    catalogs = [Path(line[line.index("--catalog") + 1]) for line in (first, second, dsm)]
     assert catalogs[1] == catalogs[0].with_name("catalog_true.parquet")
-    outs = [line[line.index("--out") + 1] for line in (first, second, literal)]
-    assert tables[:6] == ["tables", outs[0], "--true", outs[1], "--literal", outs[2]]
+    assert catalogs[2] == catalogs[0]
+    outs = [line[line.index("--out") + 1] for line in runs]
+    assert tables[:8] == ["tables", outs[0], "--true", outs[1], "--dsm", outs[2], "--literal", outs[3]]
     assert figures[:2] == ["figures", outs[0]]
     assert tables[-2:] == figures[-2:]
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_reproduce_with_gerod_root_uses_real_tiles(tmp_path):
-    catalog, _, run, _, _, _, tables, _ = commands(tmp_path, "GEROD_ROOT=/data/gerod")
-    assert catalog[:3] == ["catalog", "gerod", "/data/gerod"]
+@pytest.mark.parametrize(("root", "folder"), [("/data/gerod", "/data/gerod"), ("GeRoD.zip", "GeRoD")])
+def test_reproduce_with_gerod_root_uses_real_tiles(tmp_path, root, folder):
+    catalog, _, run, dsm, literal, _, _, tables, _ = commands(tmp_path, f"GEROD_ROOT={root}")
+    assert catalog == ["catalog", "gerod", root, "-o", "runs/gerod/survey/catalog.parquet"]
     assert "ablation" in run
-    assert run[run.index("--allow") + 1] == "/data/gerod"
+    assert {line[line.index("--allow") + 1] for line in (run, dsm, literal)} == {folder}
+    assert {line[line.index("--catalog") + 1] for line in (run, dsm, literal)} == {catalog[-1]}
+    assert tables[tables.index("--dsm") + 1] == dsm[dsm.index("--out") + 1]
     assert "--true" not in tables
 
 

@@ -16,11 +16,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from affine import Affine
-from numpy.typing import NDArray
 
 from flexroad.catalog.crs import short
+from flexroad.catalog.derived import write_heights
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.editions import newest_first
@@ -31,12 +30,9 @@ from flexroad.catalog.headers.point_clouds import chunks
 from flexroad.catalog.headers.rasters import RasterFile, glob, opened, scan, skip, there, unlisted_lines
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.limits import MIN_COVER
-from flexroad.catalog.storage.outputs import atomic_path
 from flexroad.catalog.text import some
 from flexroad.catalog.tile import HEIGHTS, Tile
 from flexroad.catalog.tiling import Conversion, TilingResult, cut
-
-Floats = NDArray[np.float64]
 
 CRS = "EPSG:25832"
 """CRS of all downloads; XYZ files do not declare it."""
@@ -258,7 +254,7 @@ def _deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
         count += np.bincount(cell, minlength=count.size)
     with np.errstate(invalid="ignore"):
         heights = (total / count).reshape(height, width)
-    _write(target, heights, Affine(DECK_CELL_M, 0, west, 0, -DECK_CELL_M, north), crs)
+    write_heights(target, heights, Affine(DECK_CELL_M, 0, west, 0, -DECK_CELL_M, north), crs)
     return bool(count.any())
 
 
@@ -271,19 +267,6 @@ def _kept(cloud: Path, target: Path) -> bool | None:
             return bool(np.isfinite(raster.read(1)).any())
     except ERRORS:
         return None
-
-
-def _write(target: Path, heights: Floats, transform: Affine, crs: str) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    rows, cols = heights.shape
-    profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "compress": "deflate", "nodata": np.nan}
-    with (
-        atomic_path(target) as temporary,
-        rasterio.open(
-            temporary, "w", width=cols, height=rows, transform=transform, crs=crs, **profile
-        ) as raster,
-    ):
-        raster.write(heights.astype(np.float32), 1)
 
 
 def _without_terrain(tiles: Sequence[Tile]) -> list[str]:

@@ -5,8 +5,8 @@ A template is a path relative to the folder. ``{tile}`` is the tile's id, ``{str
 
 The paper's datasets are read so: GeRoD, 240 tiles of 250 x 250 m of North Rhine-Westphalia, and DSC3D, the
 DeepScenario Open 3D Dataset, as rasters made from the meshes of its scenes with separate true heights. The
-names of their files are not fixed: the templates in ``configs/gerod.yaml`` and ``configs/dsc3d.yaml`` are a
-guess, to be adapted to the folder.
+names of their files are not fixed: without templates the files of GeRoD are found by the words in their paths
+(`catalog.layouts`), and the templates in ``configs/dsc3d.yaml`` are a guess, to be adapted to the folder.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from flexroad.catalog import layouts
+from flexroad.catalog.derived import is_current, rasters_of_points, write_heights
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.rasters import RasterFile, glob, opened, require_metric, there, unlisted_lines
@@ -27,7 +29,7 @@ from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.tiling import MASKS, TilingResult, assumed, taken
 
 GEROD, DSC3D = "GeRoD", "DSC3D"
-GEROD_TILES = 240
+GEROD_CRS = "EPSG:25832"
 CORNER = re.compile(r"(\d+)_(\d+)")
 """Ids of GeRoD are the south-west corner in whole metres: the paper's ``295500_5629250``."""
 NEEDED = ("dsm", "dtm")
@@ -96,7 +98,12 @@ class _MatchedFile(NamedTuple):
 
 
 def index(
-    root: Path, layout: Mapping[str, Any], dataset: str, *, date: datetime | None = None
+    root: Path,
+    layout: Mapping[str, Any],
+    dataset: str,
+    *,
+    date: datetime | None = None,
+    derived: Path | None = None,
 ) -> TilingResult:
     """Return the tiles of a dataset's folder, with notes on what differs from the paper's.
 
@@ -105,28 +112,39 @@ def index(
     root : Path
         The folder.
     layout : Mapping[str, Any]
-        ``layers`` (templates), ``road_values`` and ``crs``, as in a configuration's ``dataset``.
+        ``layers`` (templates), ``road_values`` and ``crs``, as in a configuration's ``dataset``; see
+        `by_name`.
     dataset : str
         `GEROD` or `DSC3D`.
     date : datetime, optional
         Date of the survey; overrides the files' dates.
+    derived : Path, optional
+        Folder for rasters of points (``.npz``), which are left out without it.
 
     Raises
     ------
     CatalogError
         If the layout is invalid, or the folder does not match it.
     """
-    result = read(root, Layout.of(layout), dataset=dataset, date=date)
+    if dataset == GEROD and by_name(layout):
+        result = _named(root, Layout.of({"layers": dict.fromkeys(NEEDED, "{tile}"), **layout}), date, derived)
+    else:
+        result = read(root, Layout.of(layout), dataset=dataset, date=date)
     notes = {GEROD: _gerod_notes, DSC3D: _dsc3d_notes}[dataset](result.tiles)
     return replace(result, notes=(*result.notes, *notes))
+
+
+def by_name(layout: Mapping[str, Any]) -> bool:
+    """Return whether the files of GeRoD are found by their names: the layout has no templates."""
+    return bool(layout) and "layers" not in layout
 
 
 def _gerod_notes(tiles: Sequence[Tile]) -> list[str]:
     """Return notes on tiles that are not at the corner in their id (a wrong template or CRS) or missing."""
     off = [tile.id for tile in tiles if not _is_at_id(tile)]
     notes = [f"not at the corner given by the tile's name: {some(off)}; check layout and CRS"] if off else []
-    if len(tiles) != GEROD_TILES:
-        notes.append(f"{len(tiles)} of the dataset's {GEROD_TILES} tiles are here")
+    if len(tiles) != layouts.TILES:
+        notes.append(f"{len(tiles)} of the dataset's {layouts.TILES} tiles are here")
     return notes
 
 
@@ -177,7 +195,78 @@ def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = No
         why = left_out[0] if left_out else there(root, "; describe them with --layout")
         raise CatalogError(f"no usable file matches {layout.layers['dsm']!r} (dsm) below {root}; {why}")
     left_out += _without_metres(by_layer["dsm"])
-    tiles = tuple(
+    tiles = _tiles(root, by_layer, layout, dataset, date)
+    return TilingResult(tiles, (*_lacking(tiles, layout), *assumed(tiles)), tuple(left_out))
+
+
+def _named(root: Path, layout: Layout, date: datetime | None, derived: Path | None) -> TilingResult:
+    """Return the tiles of GeRoD, whose files are found by their names."""
+    if not root.is_dir():
+        raise CatalogError(f"folder {root} does not exist")
+    root = root.resolve()
+    found, notes = layouts.find(root)
+    paths, left_out = _rasters(root, found, derived, layout.crs or GEROD_CRS)
+    by_layer = {}
+    for name in (name for name in LAYERS if any(file.layer == name for file in paths.values())):
+        parts = {path: (file.tile, file.stratum) for path, file in paths.items() if file.layer == name}
+        by_layer[name], skipped = _opened(root, name, parts, layout.crs, "leave one of them")
+        left_out += skipped
+    if not by_layer.get("dsm"):
+        why = left_out[0] if left_out else there(root, "; describe them with --layout")
+        raise CatalogError(
+            f"no usable file is the dsm of a tile such as {layouts.NAMED[0]} below {root}; {why}"
+        )
+    left_out += _without_metres(by_layer["dsm"])
+    tiles = _tiles(root, by_layer, layout, GEROD, date)
+    return TilingResult(tiles, (*notes, *assumed(tiles)), tuple(left_out))
+
+
+def _rasters(
+    root: Path, found: Sequence[layouts.Found], derived: Path | None, crs: str
+) -> tuple[dict[Path, layouts.Found], list[str]]:
+    """Return the files that are rasters, with those made of points, and lines on points that are left out."""
+    paths, left_out = dict[Path, layouts.Found](), list[str]()
+    for file in found:
+        if not file.name.lower().endswith(layouts.POINTS):
+            paths[root / file.name] = file
+        elif derived is None:
+            left_out.append(f"skipped {file.name} ({file.layer}): points need a folder for their rasters")
+        else:
+            try:
+                paths |= _of_points(root / file.name, file, derived.resolve(), crs)
+            except CatalogError as error:
+                left_out.append(f"skipped {file.name} ({file.layer}): {error}")
+    return paths, left_out
+
+
+def _of_points(source: Path, file: layouts.Found, derived: Path, crs: str) -> dict[Path, layouts.Found]:
+    """Write the arrays of points as rasters; return these. Rasters of the same file are written once."""
+    folder = derived / file.tile
+    made = {path: path.stem.rpartition(".")[2] for path in sorted(folder.glob(f"{source.stem}.*.tif"))}
+    if not made or not all(is_current(source, path) for path in made):
+        rasters, transform = rasters_of_points(source, _corner(file.tile))
+        made = {}
+        for name, heights in rasters.items():
+            layer = file.layer if name == "z" else layouts.layer_of(name, layouts.OWN_NAMES)
+            if layer in LAYERS:
+                made[path := folder / f"{source.stem}.{layer}.tif"] = layer
+                write_heights(path, heights, transform, crs)
+    return {path: replace(file, layer=layer) for path, layer in made.items()}
+
+
+def _corner(tile_id: str) -> tuple[float, float]:
+    east, north = map(float, tile_id.split("_"))
+    return east, north
+
+
+def _tiles(
+    root: Path,
+    by_layer: Mapping[str, Mapping[str, _MatchedFile]],
+    layout: Layout,
+    dataset: str,
+    date: datetime | None,
+) -> tuple[Tile, ...]:
+    return tuple(
         _tile(
             root,
             tile_id,
@@ -188,7 +277,6 @@ def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = No
         )
         for tile_id in sorted(by_layer["dsm"])
     )
-    return TilingResult(tiles, (*_lacking(tiles, layout), *assumed(tiles)), tuple(left_out))
 
 
 def _without_metres(dsm: dict[str, _MatchedFile]) -> list[str]:
@@ -214,19 +302,34 @@ def _files(root: Path, layer: str, layout: Layout) -> tuple[dict[str, _MatchedFi
         paths, unlisted = glob(root, PLACEHOLDER.sub("*", template))
     except (ValueError, NotImplementedError) as error:
         raise CatalogError(f"layout: {layer}: {template!r} is not a path below {root}: {error}") from error
-    path_of = {path.relative_to(root).as_posix(): path for path in paths}
-    parts = {name: match.groupdict() for name in path_of if (match := pattern.fullmatch(name))}
-    files, skipped = opened(root, layer, [path_of[name] for name in parts], layout.crs)
+    parts = {
+        path: (match["tile"], match.groupdict().get("stratum") or "")
+        for path in paths
+        if (match := pattern.fullmatch(path.relative_to(root).as_posix()))
+    }
+    remedy = f"change the template {template!r} so that it matches only one of them"
+    by_tile, skipped = _opened(root, layer, parts, layout.crs, remedy)
+    return by_tile, [*skipped, *unlisted_lines(root, layer, unlisted)]
+
+
+def _opened(
+    root: Path, layer: str, parts: Mapping[Path, tuple[str, str]], crs: str | None, remedy: str
+) -> tuple[dict[str, _MatchedFile], list[str]]:
+    """Return the files of a layer by tile id, and lines on skipped files.
+
+    ``parts`` gives id and stratum of each path, ``remedy`` what to do with two files of a tile.
+    """
+    files, skipped = opened(root, layer, parts, crs)
     by_tile: dict[str, _MatchedFile] = {}
     for file in files:
-        tile_id = parts[file.name]["tile"]
+        tile_id, stratum = parts[root / file.name]
         if tile_id in by_tile:
             raise CatalogError(
                 f"{by_tile[tile_id].file.name} and {file.name} are both the {layer} of tile {tile_id}; "
-                f"change the template {template!r} so that it matches only one of them"
+                f"{remedy}"
             )
-        by_tile[tile_id] = _MatchedFile(file, parts[file.name].get("stratum") or "")
-    return by_tile, [*skipped, *unlisted_lines(root, layer, unlisted)]
+        by_tile[tile_id] = _MatchedFile(file, stratum)
+    return by_tile, skipped
 
 
 def _pattern(template: str) -> re.Pattern[str]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from flexroad.catalog import layouts
 from flexroad.catalog.crs import in_plan, plan_unit, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
@@ -27,6 +28,8 @@ from flexroad.catalog.text import count
 
 MAX_FILES = 5000
 """Largest number of files that are looked at."""
+GEROD_ZIP = r"gerod.*\.zip"
+"""Name of the archive of the paper's dataset."""
 MAX_DEPTH = 8
 """Largest depth of folders below the given one."""
 PREVIEW = 256
@@ -45,15 +48,6 @@ SUFFIXES = {
     "archive": (".zip", ".7z", ".tar", ".tgz", ".rar"),
 }
 """Kind -> endings of its files; a raster's layer is then told by its name."""
-NAMES = (
-    ("above_ground", r"n(dom|dsm)|cdsm|chm|dhm|mnh|ndhm"),
-    ("road_height", r"road.?heights?"),
-    ("dsm", r"dsm|dom|mns|mds|surface"),
-    ("dtm", r"dtm|dgm|dem|mnt|mdt|terrain|ground|bare"),
-    ("dop", r"dop|ortho|orthophoto|rgbi?|cir"),
-    ("road_mask", r"mask|landcover|land.?use|roads?"),
-)
-"""Layer and the words in names of files or folders that mean it, the first match first."""
 ROADS = r"road|street|stra(ss|ß)e|highway|carriage|route|centre.?line|center.?line|osm"
 """Words in names of vector files and their layers that mean roads."""
 QUESTIONS = {
@@ -122,6 +116,24 @@ def look(folder: Path) -> tuple[list[Download], bool]:
     return found, False
 
 
+def gerod(folder: Path) -> list[str]:
+    """Return what a folder has of the paper's dataset, what it lacks, and the command that makes its catalog.
+
+    Empty if the folder has none of the tiles that the paper names, and no archive of the dataset.
+    """
+    archives = [path for path in sorted(folder.glob("*")) if re.fullmatch(GEROD_ZIP, path.name.lower())]
+    found, _ = layouts.find(folder)
+    if not {file.tile for file in found} & {*layouts.NAMED}:
+        commands = [_gerod_command(path) for path in archives if path.is_file()]
+        return ["the paper's dataset GeRoD, packed", "", commands[0]] if commands else []
+    asked = [f"question: {line}" for line in layouts.questions(found)]
+    return ["the paper's dataset GeRoD", *layouts.table(found), *asked, "", _gerod_command(folder)]
+
+
+def _gerod_command(where: Path) -> str:
+    return shlex.join(["flexroad", "catalog", "gerod", str(where), "-o", "gerod.parquet"])
+
+
 def _files(folder: Path) -> Iterator[Path]:
     for parent, folders, names in os.walk(folder):
         if RUN_FILE in names:
@@ -144,16 +156,6 @@ def _looked(path: Path, folder: Path, kind: str) -> Download | None:
     return Download(path, kind, question=QUESTIONS.get(kind, ""))
 
 
-def _named(path: Path, folder: Path) -> str:
-    """Return the layer that the name of a file means, else that of the folder it lies in, else ``raster``."""
-    relative = path.relative_to(folder)
-    for name in (relative.stem, *reversed(relative.parts[:-1])):
-        for kind, words in NAMES:
-            if re.search(rf"(?<![a-z])({words})(?![a-z])", name.lower()):
-                return kind
-    return "raster"
-
-
 def _raster(path: Path, folder: Path) -> Download | None:
     try:
         with quiet(), open_raster(path) as raster:
@@ -165,7 +167,7 @@ def _raster(path: Path, folder: Path) -> Download | None:
             # A text to read.
             return None
         return Download(path, "raster", question=f"it cannot be read as a raster: {error}")
-    kind = _named(path, folder)
+    kind = layouts.layer_of(path.relative_to(folder).as_posix()) or "raster"
     about = f"{count(bands, 'band')} {dtype}, {size}, {values[0]}, {short(crs) if crs else 'no CRS'}"
     question = QUESTIONS.get(kind, "")
     if bands >= 3 and kind in ("dsm", "dtm", "raster"):

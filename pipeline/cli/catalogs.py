@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from rich.console import Console
 
-from flexroad.catalog import Catalog, CatalogError
+from flexroad.catalog import Catalog, CatalogError, layouts
 from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.sources import nrw, rasters, templates
+from flexroad.catalog.storage.unpack import unpack
 from flexroad.catalog.text import count
 from flexroad.catalog.tiling import Conversion, TilingResult
 from flexroad.pipeline.check.catalog import check
@@ -22,6 +24,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES
 from flexroad.pipeline.graph.layers import fitting_config
 from flexroad.pipeline.prepare.options import MIN_COVER_HELP
+from flexroad.pipeline.run.progress import StepProgress
 
 app = group("catalog", "Make, show and check catalogs of tiles.")
 
@@ -192,15 +195,35 @@ def catalog_nrw(
 
 @app.command("gerod", cls=Command)
 def catalog_gerod(
-    root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder of the paper's GeRoD dataset.")],
+    root: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER|ZIP", help="The paper's GeRoD dataset, unpacked or as published."),
+    ],
     output: Output,
     layout: Layout = "gerod",
     date: Date = None,
     strict: Strict = False,
 ) -> None:
-    """List the tiles of the GeRoD dataset."""
-    result = templates.index(root, load_config(layout).dataset, templates.GEROD, date=date)
+    """List the tiles of the GeRoD dataset.
+
+    Its files are found by the words in their paths. A zip file is unpacked beside itself.
+    """
+    dataset = load_config(layout).dataset
+    if root.suffix.lower() == ".zip" and not root.is_dir():
+        root = unpack(root, layouts.SHA256, StepProgress(Console(stderr=True)), _note)
+    if templates.by_name(dataset) and root.is_dir():
+        found, _ = layouts.find(root)
+        for line in layouts.table(found) if found else ():
+            echo(line)
+        for question in layouts.questions(found):
+            echo(f"question: {question}")
+    derived = output.parent / f"{output.stem}_points"
+    result = templates.index(root, dataset, templates.GEROD, date=date, derived=derived)
     _write_catalog(result, output, strict, layout)
+
+
+def _note(line: str) -> None:
+    echo(f"note: {line}", err=True)
 
 
 @app.command("dsc3d", cls=Command)

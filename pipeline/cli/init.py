@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from flexroad.pipeline.check.downloads import MAX_FILES, Download, Proposal, look, proposals
+from flexroad.pipeline.check.downloads import MAX_FILES, Download, Proposal, gerod, look, proposals
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
@@ -49,6 +49,10 @@ def init(
 
     Asks what is unclear. The commands make a catalog of the files and run it.
     """
+    if published := gerod(folder):
+        for line in published:
+            echo(line)
+        return
     found, more = look(folder)
     if more:
         echo(f"note: only the first {MAX_FILES} files of {folder} were looked at; name a smaller folder")

@@ -1,5 +1,7 @@
 """Catalogs of published datasets, made on the command line and run."""
 
+import hashlib
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 import yaml
 
 import flexroad as library
-from flexroad.catalog import Catalog
+from flexroad.catalog import Catalog, layouts
 from tests.command_line import call
 from tests.make_rasters import write
 
@@ -92,3 +94,59 @@ def test_production_fits_roads_to_layer_road_height(tmp_path):
         assert row.dsm_excess_m == pytest.approx(excess, abs=1e-4)
         # Without a reference the DTM is the truth.
         assert row.l2_road_m == pytest.approx(0.1 - excess, abs=0.02)
+
+
+TILE = "295500_5629250"
+
+
+def gerod_tile(folder: Path) -> None:
+    west, south = map(int, TILE.split("_"))
+    for name in ("DSM", "DTM"):
+        write(folder / f"{TILE}_{name}.tif", ground(south + 60, west), west, south + 60)
+    write(folder / f"{TILE}_mask.tif", np.eye(60, dtype=np.uint8), west, south + 60)
+
+
+def test_catalog_gerod_of_an_archive_unpacks_it_and_says_what_it_found(tmp_path, monkeypatch):
+    gerod_tile(tmp_path / "packed")
+    archive = Path(shutil.make_archive(str(tmp_path / "GeRoD"), "zip", tmp_path / "packed"))
+    out = tmp_path / "gerod.json"
+    _, error = flexroad("catalog", "gerod", archive, "-o", out, expect=2)
+    *_, line = error.splitlines()
+    assert line.startswith(f"error: {archive} has the SHA-256 ")
+    assert not (tmp_path / "GeRoD").exists()
+    monkeypatch.setattr(layouts, "SHA256", hashlib.sha256(archive.read_bytes()).hexdigest())
+    said, error = flexroad("catalog", "gerod", archive, "-o", out)
+    assert said.splitlines()[:4] == [
+        "layer      tiles  files",
+        "dsm            1  {tile}_DSM.tif",
+        "dtm            1  {tile}_DTM.tif",
+        "road_mask      1  {tile}_mask.tif",
+    ]
+    assert [line.split(":")[1] for line in said.splitlines() if line.startswith("question")] == [
+        f" no reference for 1 of 1 tiles ({TILE})",
+        f" no stratum for 1 of 1 tiles ({TILE})",
+    ]
+    assert f"next: flexroad run --config gerod --catalog {out} --out runs/gerod" in said
+    assert f"unpacks to 0.00 GB in {tmp_path / 'GeRoD'}" in error
+    (tile,) = Catalog.read(out).tiles
+    assert (tile.id, tile.dataset, Path(tile.root)) == (TILE, "GeRoD", tmp_path)
+    assert [layer.files for layer in tile.layers] == [
+        (f"GeRoD/{TILE}_{n}.tif",) for n in ("DSM", "DTM", "mask")
+    ]
+
+
+def test_init_proposes_the_catalog_of_gerod(tmp_path):
+    gerod_tile(tmp_path / "data")
+    said, _ = flexroad("init", tmp_path / "data")
+    assert said.splitlines()[:2] == ["the paper's dataset GeRoD", "layer      tiles  files"]
+    assert said.splitlines()[-1] == f"flexroad catalog gerod {tmp_path / 'data'} -o gerod.parquet"
+    assert f"question: no stratum for 1 of 1 tiles ({TILE})" in said
+    (tmp_path / "packed").mkdir()
+    (tmp_path / "packed" / "GeRoD.zip").touch()
+    said, _ = flexroad("init", tmp_path / "packed")
+    archive = tmp_path / "packed" / "GeRoD.zip"
+    assert said.splitlines()[-1] == f"flexroad catalog gerod {archive} -o gerod.parquet"
+    # Other tiles with such ids are not the dataset.
+    for path in (tmp_path / "data").iterdir():
+        path.rename(path.with_name(path.name.replace(TILE, "295501_5629250")))
+    assert "GeRoD" not in flexroad("init", tmp_path / "data")[0]

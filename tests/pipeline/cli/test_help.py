@@ -28,17 +28,18 @@ COMMANDS = dict(commands(typer.main.get_command(app)))
 PATHS = {"FILE", "FOLDER", "RUN", "CATALOG", "MODEL"}
 METAVARS = {
     int: {"N", "METRES"},
-    float: {"METRES", "SHARE", "NUMBER", "PERCENT"},
+    float: {"METRES", "SHARE", "NUMBER"},
     Path: PATHS,
     str: {
         "NAME", "NAME|FILE", "ID", "KEY=VALUE", "PATTERN", "CRS", "SQL", "ADDRESS", "CMD|URL",
         "FOLDER|URL", "FILE", "FILE|'X Y, X Y'", "RUN", "N|all",
     },
     datetime: {"YYYY-MM-DD"},
-    tuple: {"W S E N", "E N H", "E N"},
+    tuple: {"W S E N", "E N H"},
 }  # fmt: skip
 """The words for values of options, by the type of the option."""
-ARGUMENTS = {"RUN", "CATALOG", "FOLDER", "ROOT", "FILE", "IMAGE", "MESH", "PROJECT", "NAME|FILE"}
+PACKED = "FOLDER|ZIP"
+ARGUMENTS = {"RUN", "CATALOG", "FOLDER", PACKED, "ROOT", "FILE", "IMAGE", "MESH", "PROJECT", "NAME|FILE"}
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
