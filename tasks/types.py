@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -103,6 +104,11 @@ class Level:
     passing: shapely.MultiPolygon = field(default_factory=shapely.MultiPolygon)
     """The streets of level 0 near the joints that pass below the deck, or above the tube."""
 
+    @cached_property
+    def rasters(self) -> dict[tuple[str, Grid], tuple[tuple[slice, ...], Bools]]:
+        """Cells of grids by name, as windows and the cells in them; kept by `tasks.levels.seen`."""
+        return {}
+
     def covers(self, easting: Floats, northing: Floats) -> Bools:
         """Return which points lie on the decks or tubes, in the points' broadcast shape."""
         shapely.prepare(self.areas)
@@ -118,8 +124,11 @@ class Level:
         result = np.zeros(easting.shape)
         if self.approach.is_empty:
             return result
-        west, south, east, north = shapely.buffer(shapely.box(*self.approach.bounds), BLEND_M).bounds
-        near = np.array((easting > west) & (easting < east) & (northing > south) & (northing < north))
+        near = np.zeros(easting.shape, np.bool_)
+        for west, south, east, north in shapely.bounds(shapely.get_parts(self.approach)):
+            near |= (np.abs(2 * easting - west - east) < east - west + 2 * BLEND_M) & (
+                np.abs(2 * northing - south - north) < north - south + 2 * BLEND_M
+            )
         places = shapely.points(easting[near], northing[near])
         shapely.prepare(self.approach)
         reached = shapely.dwithin(self.approach, places, BLEND_M)

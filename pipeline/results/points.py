@@ -21,7 +21,9 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, open_variant
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, peek_statuses
+from flexroad.tasks.lift.types import Heights
 from flexroad.tasks.spline.levelled import LevelledSurface
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 
@@ -127,6 +129,40 @@ class Ground:
             of_level if level is None else np.full(easting.shape, level, np.int8),
             tuple(sorted(numbers)),
         )
+
+    def heights(
+        self, easting: Floats, northing: Floats, steps: bool = True
+    ) -> tuple[Heights, tuple[str, ...]]:
+        """Return the heights of n points on all levels, and the ids of the tiles with `earlier` values.
+
+        Heights are NaN off the finished tiles and beyond the survey.
+
+        Parameters
+        ----------
+        steps : bool
+            Whether level 0 has its steps beside roads; without them it is the spline.
+        """
+        easting, northing = np.asarray(easting, np.float64), np.asarray(northing, np.float64)
+        rows, earlier = {0: np.full(easting.shape, np.nan)}, list[str]()
+        for status, selected in self._owners(easting, northing):
+            found = self._current(status) if status.done else self._last(status.graph.tile.id)
+            if found is None:
+                continue
+            earlier += [] if status.done else [status.graph.tile.id]
+            surface, road = found
+            here = selected[~road.outside[road.grid.cells(easting[selected], northing[selected])]]
+            east, north = easting[here], northing[here]
+            if isinstance(surface, SteppedSurface) and not steps:
+                rows[0][here] = surface.smooth(east, north)
+            else:
+                rows[0][here] = surface.height(east, north)
+            if isinstance(surface, LevelledSurface):
+                for own in surface.levels:
+                    row = rows.setdefault(own.level.number, np.full(easting.shape, np.nan))
+                    on = own.level.covers(east, north)
+                    row[here[on]] = surface.at(own.level.number).height(east[on], north[on])
+        numbers = tuple(sorted(rows))
+        return Heights(numbers, np.stack([rows[number] for number in numbers])), tuple(earlier)
 
     def on_every_level(self, easting: Floats, northing: Floats) -> tuple[NDArray[np.intp], Answer]:
         """Return what `at` returns for all levels of each point, and the number of the point of each row.

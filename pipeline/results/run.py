@@ -20,6 +20,7 @@ from flexroad.catalog.storage.paths import exists, read
 from flexroad.catalog.text import access_reason, count, with_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import has_borders
+from flexroad.pipeline.results.lift import LiftedFile, lift
 from flexroad.pipeline.results.mosaic import mosaic
 from flexroad.pipeline.results.points import Answer, Ground
 from flexroad.pipeline.results.surface import Surface, placed
@@ -30,6 +31,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import sample
+from flexroad.tasks.lift.types import Options
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface, uniform_knots
@@ -205,6 +207,49 @@ class RunView:
         """
         shape, answer = self._at(x, y)
         return answer.normal.reshape(*shape, 3)
+
+    def lift(
+        self,
+        path: str | Path,
+        out: str | Path,
+        options: Options | None = None,
+        crs: str | None = None,
+        report: str | Path | None = None,
+    ) -> LiftedFile:
+        """Write a road network or features of other programs with the heights of the run.
+
+        Parameters
+        ----------
+        path, out : str or Path
+            The file, and where its copy is written, in the same format (``flexroad lift --help`` names
+            them). All but the heights stays as it is.
+        options : flexroad.tasks.lift.types.Options, optional
+            Tolerance, what roads have across, what is listed.
+        crs : str, optional
+            CRS of the file, if it does not say it.
+        report : str or Path, optional
+            A CSV with a row per road or feature.
+
+        Returns
+        -------
+        LiftedFile
+            ``rows``, one per road or feature, with its distances from the surface, and ``summary``.
+
+        Raises
+        ------
+        ConfigError
+            If the file cannot be read, is of an unknown format, has no CRS, or does not lie on the tiles.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> run = flexroad.open_run("runs/city")
+        >>> run.lift("streets.osm", "streets_3d.osm").summary        # doctest: +SKIP
+        '30 features, 2.41 km'
+        """
+        ground = Ground(self.run, self.variant)
+        table = None if report is None else Path(report)
+        return lift(ground, Path(path), Path(out), options or Options(), crs, report=table)
 
     def to_xarray(self, bounds: Bounds | None = None) -> xr.Dataset:
         """Return height and road mask of the finished tiles as one lazy raster.

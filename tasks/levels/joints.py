@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.text import count
 from flexroad.tasks.io.vectors import has_place
+from flexroad.tasks.levels.overlaps import crossing_notes, place
 from flexroad.tasks.meshing.road_outline import polygons_of
 from flexroad.tasks.roads.flat_patches import flat_patches
 from flexroad.tasks.roads.rasterise import cells
@@ -60,26 +61,27 @@ Lines = NDArray[np.object_]
 
 
 def levels_of(
-    areas: NDArray[np.object_], numbers: NDArray[np.int64], data: TileData
+    areas: NDArray[np.object_], shapes: NDArray[np.object_], numbers: NDArray[np.int64], data: TileData
 ) -> tuple[tuple[Level, ...], tuple[str, ...]]:
     """Return the levels that the surface of a tile depends on, by ascending number, and notes.
 
     Parameters
     ----------
-    areas, numbers : ndarray, (n,)
-        The roads on and around the tile's grid as polygons, and their levels.
+    areas, shapes, numbers : ndarray, (n,)
+        The roads on and around the tile's grid as polygons, what these were made of (`rasterise.Roads`), and
+        their levels.
     data : TileData
         Its heights refuse joints between roads that differ in height.
     """
     if not numbers.any():
         return (), ()
     known = ~shapely.is_empty(areas) & has_place(areas)
-    areas, numbers = areas[known], numbers[known]
+    areas, shapes, numbers = areas[known], shapes[known], numbers[known]
     invalid = ~shapely.is_valid(areas)
     areas[invalid] = shapely.make_valid(areas[invalid])
     streets = areas[numbers == 0]
     window, near = _grown(data.grid, 0.0), _grown(data.core, REACH_M)
-    levels, notes = [], list[str]()
+    levels, notes = [], list(crossing_notes(areas, shapes, numbers, data.core))
     for number in np.unique(numbers[numbers != 0]).tolist():
         level = _level(number, _polygons(shapely.union_all(areas[numbers == number])), streets, data)
         if number < 0:
@@ -88,7 +90,7 @@ def levels_of(
         if not shapely.intersects(shapely.union(level.areas, level.approach), near):
             continue
         if number > 0:
-            notes += _without_joint(level, data.core)
+            notes += _without_joint(level, data)
         cut = _polygons(shapely.intersection(level.areas, window))
         levels.append(replace(level, areas=cut))
     return tuple(levels), tuple(notes)
@@ -227,7 +229,7 @@ def _with_portals(level: Level, core: Grid) -> tuple[Level, list[str]]:
         elif shapely.intersects(part, _grown(core, 0.0)):
             why = f"is longer than {TUBE_M:g} m" if length > TUBE_M else "has no two portals"
             notes.append(
-                f"segment: the tube at {_place(part)} (level {level.number}) {why}, so it is left out"
+                f"segment: the tube at {place(part)} (level {level.number}) {why}, so it is left out"
             )
     areas = shapely.MultiPolygon(kept)
     joints = joints[shapely.dwithin(joints, areas, APART_M)] if kept else joints[:0]
@@ -236,20 +238,19 @@ def _with_portals(level: Level, core: Grid) -> tuple[Level, list[str]]:
     return replace(level, areas=areas, joints=lines, approach=approach), notes
 
 
-def _without_joint(level: Level, core: Grid) -> list[str]:
+def lack_joint(parts: Lines, joints: shapely.MultiLineString, grid: Grid, core: Grid) -> Bools:
+    """Return which decks on a tile have no joint, ``(n,)``; one that leaves its grid may have some beyond."""
+    known = shapely.contains_properly(_grown(grid, 0.0), parts) & shapely.intersects(parts, _grown(core, 0.0))
+    return np.asarray(known & ~shapely.dwithin(parts, joints, APART_M))
+
+
+def _without_joint(level: Level, data: TileData) -> list[str]:
     """Return a note about the decks on a tile at which no road of level 0 begins."""
     parts = shapely.get_parts(level.areas)
-    alone = parts[
-        ~shapely.dwithin(parts, level.joints, APART_M) & shapely.intersects(parts, _grown(core, 0.0))
-    ]
+    alone = parts[lack_joint(parts, level.joints, data.grid, data.core)]
     if not len(alone):
         return []
     return [
         f"segment: {count(len(alone), 'deck')} of level {level.number} without a joint to a road of level 0, "
-        f"such as at {_place(alone[0])}; check the level of the roads at its ends, and gaps above {GAP_M:g} m"
+        f"such as at {place(alone[0])}; check the level of the roads at its ends, and gaps above {GAP_M:g} m"
     ]
-
-
-def _place(area: shapely.Polygon) -> str:
-    x, y = shapely.get_coordinates(shapely.centroid(area))[0]
-    return f"E {x:.0f} N {y:.0f}"

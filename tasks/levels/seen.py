@@ -102,7 +102,7 @@ def top_mask(clusters: RoadClusters) -> Bools:
     result = with_approaches(clusters).mask
     for own in clusters.levels:
         if own.level and own.level.number > 0:
-            result = np.where(_cells(own.level.areas, clusters.grid), own.mask, result)
+            result = np.where(_own(own.level, clusters.grid), own.mask, result)
     return result
 
 
@@ -111,13 +111,13 @@ def level_road(road: RoadMask, number: int) -> RoadMask:
     if number == 0:
         return road
     level = next(level for level in road.levels if level.number == number)
-    mask = _cells(level.areas, road.grid)
+    mask = _own(level, road.grid)
     return RoadMask(road.grid, road.core, mask, ~mask, areas=encoded(np.array([level.areas]), road.core))
 
 
 def _of_level(data: TileData, road: RoadMask, level: Level, ecsrc: Filter) -> RoadClusters:
     grid = data.grid
-    own, approach = _cells(level.areas, grid), _taken(level, grid)
+    own, approach = _own(level, grid), _taken(level, grid)
     apart = _cells(shapely.buffer(level.areas, APART_M), grid) & ~own & ~approach
     mask = road.mask & ~apart | own | approach
     clusters = ecsrc(_masked(data, road.levels, level.number), replace(road, mask=mask, levels=()), True)
@@ -141,12 +141,11 @@ def _masked(data: TileData, levels: tuple[Level, ...], number: int) -> TileData:
         dtm = np.where(hidden & (np.abs(data.dtm - data.dsm) <= AGREE_M), np.nan, data.dtm)
         return _replaced(data, dsm, dtm)
     level = next(level for level in levels if level.number == number)
-    own = _cells(level.areas, grid)
+    own = _own(level, grid)
     gone = hidden & ~own
     for other in levels:
         if other.number > max(number, 0):
-            over = _cells(shapely.buffer(other.areas, HIDDEN_M), grid)
-            gone |= over & ~(_cells(other.approach, grid) & own)
+            gone |= _over(other, grid) & ~(_approach(other, grid) & own)
     if number < 0:
         gone |= own
     known = np.nan if data.decks is None or number < 0 else data.decks
@@ -162,7 +161,7 @@ def _replaced(data: TileData, dsm: Floats, dtm: Floats) -> TileData:
 
 def _inferred(data: TileData, level: Level, visible: Bools) -> Floats:
     """Return the DSM with the heights of a tube: a thin plate through its approaches."""
-    grid, own = data.grid, _cells(level.areas, data.grid)
+    grid, own = data.grid, _own(level, data.grid)
     # Other roads near the portals may lie above the tube.
     row, col = np.nonzero(visible & _taken(level, grid))
     if len(row) < LEAST or not own.any():
@@ -188,24 +187,57 @@ def _without(clusters: RoadClusters, cells: Bools) -> RoadClusters:
 def _hidden(levels: tuple[Level, ...], grid: Grid) -> Bools:
     """Return the cells on decks and beside them, but for approaches."""
     approach = _any(grid, [_taken(level, grid) for level in levels])
-    decks = [_cells(shapely.buffer(deck.areas, HIDDEN_M), grid) for deck in _decks(levels)]
-    return _any(grid, decks) & ~approach
+    return _any(grid, [_over(deck, grid) for deck in _decks(levels)]) & ~approach
 
 
 def _decks(levels: tuple[Level, ...]) -> list[Level]:
     return [level for level in levels if level.number > 0]
 
 
-def _taken(level: Level, grid: Grid) -> Bools:
-    """Return the cells of the approach, on which level 0 has the surface of another level."""
-    result = _cells(level.approach, grid)
-    row, col = np.nonzero(result)
-    result[row, col] = level.weight(grid.eastings[col], grid.northings[row]) >= 1
-    return result
-
-
 def _any(grid: Grid, masks: list[Bools]) -> Bools:
     return np.asarray(np.logical_or.reduce([np.zeros(grid.shape, np.bool_), *masks]))
+
+
+def _own(level: Level, grid: Grid) -> Bools:
+    """Return the cells of the decks or tubes."""
+    return _once(level, grid, "own", lambda: _cells(level.areas, grid))
+
+
+def _over(deck: Level, grid: Grid) -> Bools:
+    """Return the cells on decks and beside them."""
+    return _once(deck, grid, "over", lambda: _cells(shapely.buffer(deck.areas, HIDDEN_M), grid))
+
+
+def _approach(level: Level, grid: Grid) -> Bools:
+    return _once(level, grid, "approach", lambda: _cells(level.approach, grid))
+
+
+def _taken(level: Level, grid: Grid) -> Bools:
+    """Return the cells of the approach, on which level 0 has the surface of another level."""
+
+    def make() -> Bools:
+        result = _approach(level, grid)
+        row, col = np.nonzero(result)
+        result[row, col] = level.weight(grid.eastings[col], grid.northings[row]) >= 1
+        return result
+
+    return _once(level, grid, "taken", make)
+
+
+def _once(level: Level, grid: Grid, name: str, make: Callable[[], Bools]) -> Bools:
+    """Return a raster of a level, ``(H, W)``; it is made once and kept with the level.
+
+    It is kept without the rows and columns around it that are empty: a tile has many cells, a deck few.
+    """
+    key, result = (name, grid), np.zeros(grid.shape, np.bool_)
+    if key not in level.rasters:
+        cells = make()
+        rows, cols = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
+        window = tuple(slice(side[0], side[-1] + 1) if side.size else slice(0) for side in (rows, cols))
+        level.rasters[key] = window, cells[window].copy()
+    window, part = level.rasters[key]
+    result[window] = part
+    return result
 
 
 def _cells(area: shapely.Geometry, grid: Grid) -> Bools:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from flexroad.tasks.levels.joints import APART_M
+from flexroad.tasks.levels.joints import lack_joint
 from flexroad.tasks.levels.seen import level_road
 from flexroad.tasks.spline.levelled import LevelledSurface
-from flexroad.tasks.types import Level, RoadMask, Structures
+from flexroad.tasks.types import RoadMask, Structures
 
 BELOW, NO_RISE, NO_JOINT = "below", "no-rise", "no-joint"
 STRUCTURE_FLAGS = (BELOW, NO_RISE, NO_JOINT)
@@ -47,14 +47,6 @@ def structures(
         float(np.median(rise)) if rise.size else float("nan"),
         float(np.mean(inner < 0)) if inner.size else 0.0,
     )
-    raised = (found.crossed > MOST_CROSSED, found.clearance_m < LEAST_RISE_M, _lacks_joint(level, road))
+    alone = lack_joint(shapely.get_parts(level.areas), level.joints, road.grid, road.core).any()
+    raised = (found.crossed > MOST_CROSSED, found.clearance_m < LEAST_RISE_M, alone)
     return found, tuple(flag for flag, is_raised in zip(STRUCTURE_FLAGS, raised, strict=True) if is_raised)
-
-
-def _lacks_joint(level: Level, road: RoadMask) -> bool:
-    """Return whether a deck on the core has no joint; one that goes on beyond what is known may have some."""
-    parts, window = shapely.get_parts(level.areas), shapely.box(*road.grid.bounds)
-    known = shapely.contains_properly(window, parts) & shapely.intersects(
-        parts, shapely.box(*road.core.bounds)
-    )
-    return bool((known & ~shapely.dwithin(parts, level.joints, APART_M)).any())

@@ -78,6 +78,8 @@ class Roads:
 
     areas: NDArray[np.object_]
     """Polygons in the tile's CRS, ``(n,)``."""
+    shapes: NDArray[np.object_]
+    """The polygons or lines that they were made of, ``(n,)``; None for discs between lines."""
     bridge: Bools
     """Which of them are on bridges, ``(n,)``."""
     level: NDArray[np.int64]
@@ -143,6 +145,7 @@ def roads(source: Source | None, grid: Grid, options: Options, levels: LevelColu
         parts.append(_from_table(table, options, levels))
     return Roads(
         np.concatenate([part.areas for part in parts]),
+        np.concatenate([part.shapes for part in parts]),
         np.concatenate([part.bridge for part in parts]),
         np.concatenate([part.level for part in parts]),
         (*notes, *(note for part in parts for note in part.notes)),
@@ -175,6 +178,7 @@ def _from_table(table: Any, options: Options, columns: LevelColumns | None) -> R
     strips = shapely.buffer(lines, half, quad_segs=8, cap_style="flat", join_style="round")
     return Roads(
         np.concatenate([parts[is_area], strips, joints]),
+        np.concatenate([parts[is_area], lines, np.full(len(joints), None)]),
         np.concatenate([bridge[is_area], bridge[is_line], joint_bridge]),
         np.concatenate([level[is_area], level[is_line], joint_level]),
         (*unread, *notes),

@@ -73,7 +73,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
         nowhere = np.zeros(data.grid.shape, np.bool_)
         return RoadMask(data.grid, data.core, nowhere, beyond_extent(data), bridge=nowhere, notes=(note,))
     roads = rasterise.roads(data.roads, data.grid, options, options.read_levels)
-    levels, left_out = levels_of(roads.areas, roads.level, data)
+    levels, left_out = levels_of(roads.areas, roads.shapes, roads.level, data)
     areas, bridge = roads.areas[roads.level == 0], roads.bridge[roads.level == 0]
     mask = clean(rasterise.cells(areas, data.grid), data, options.cleanup)
     notes = (*roads.notes, *left_out)

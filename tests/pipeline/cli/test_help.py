@@ -28,14 +28,14 @@ COMMANDS = dict(commands(typer.main.get_command(app)))
 PATHS = {"FILE", "FOLDER", "RUN", "CATALOG", "MODEL"}
 METAVARS = {
     int: {"N", "METRES"},
-    float: {"METRES", "SHARE", "NUMBER"},
+    float: {"METRES", "SHARE", "NUMBER", "PERCENT"},
     Path: PATHS,
     str: {
         "NAME", "NAME|FILE", "ID", "KEY=VALUE", "PATTERN", "CRS", "SQL", "ADDRESS", "CMD|URL",
         "FOLDER|URL", "FILE", "FILE|'X Y, X Y'", "RUN", "N|all",
     },
     datetime: {"YYYY-MM-DD"},
-    tuple: {"W S E N", "E N H"},
+    tuple: {"W S E N", "E N H", "E N"},
 }  # fmt: skip
 """The words for values of options, by the type of the option."""
 PACKED = "FOLDER|ZIP"

@@ -29,7 +29,8 @@ def found(*roads, dsm=FLAT, dtm=FLAT, grid=GRID):
     """Return the levels of roads, given as (level, area), and notes."""
     numbers, areas = zip(*roads, strict=True)
     data = TileData("a", grid, grid, dsm, dtm)
-    return levels_of(np.array(areas, object), np.array(numbers), data)
+    areas = np.array(areas, object)
+    return levels_of(areas, areas, np.array(numbers), data)
 
 
 def joint_ends(level):
@@ -66,6 +67,13 @@ def test_gap_that_is_too_wide_gives_no_joint():
     assert level.joints.is_empty
     assert "1 deck of level 1 without a joint" in notes[0]
     assert "gaps above 1.5 m" in notes[0]
+
+
+@pytest.mark.parametrize(("west", "east", "noted"), [(-60, 160, False), (-60, 99, False), (1, 99, True)])
+def test_deck_without_joint_is_noted_if_its_ends_are_known(west, east, noted):
+    """The middle tile of a long deck sees none of its joints."""
+    levels, notes = found((1, strip(west, east)), BELOW)
+    assert (len(levels), len(notes)) == (1, noted)
 
 
 def test_street_below_is_no_joint_also_beside_an_abutment():
@@ -131,6 +139,37 @@ def test_decks_of_two_levels_have_their_own_joints():
     )
     assert [level.number for level in levels] == [1, 2]
     assert [len(level.joints.geoms) for level in levels] == [2, 2]
+
+
+@pytest.mark.parametrize("numbers", [(2,), (4,), (1, 3)])
+def test_levels_with_nothing_below_them_are_levels(numbers):
+    levels, _ = found(
+        *((number, strip(40, 60, y=20 * number)) for number in numbers), (0, strip(0, 40, y=40))
+    )
+    assert tuple(level.number for level in levels) == numbers
+    assert joint_ends(levels[0]) == ([40] if numbers == (2,) else [])
+
+
+@pytest.mark.parametrize("rise", [8.0, 0.0])
+def test_lower_street_beside_a_deck_has_no_joint_and_no_approach(rise):
+    """It lies 1 m beside the deck, and its approaches."""
+    row = GRID.south + 50 - GRID.northings[:, None]
+    dsm = np.where(np.abs(row) < 4, rise, 0.0) + FLAT
+    (level,), _ = found(DECK, *WAYS, BELOW, (0, strip(0, 100, width=6, y=58)), dsm=dsm)
+    places = GRID.west + np.array([35, 35, 50]), GRID.south + np.array([50, 58, 58])
+    if rise:
+        assert joint_ends(level) == [40, 60]
+        np.testing.assert_array_equal(level.weight(*places), [1, 0, 0])
+    else:
+        # Streets of one height are a place on the deck.
+        assert joint_ends(level) == [40, 40, 60]
+
+
+def test_hole_in_a_deck_is_an_outline():
+    deck = shapely.difference(strip(20, 80, width=40), strip(45, 55, width=10))
+    (level,), _ = found((1, deck), (0, strip(0, 20)), (0, strip(45, 55)))
+    assert joint_ends(level) == [20, 45, 45, 45, 55]
+    assert not level.covers(GRID.west + 50, GRID.south + 50)
 
 
 def test_damaged_polygons_are_mended():

@@ -1,5 +1,6 @@
 """Surfaces of several levels on synthetic crossings with known heights, and what each level sees of them."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,13 @@ import shapely
 
 from flexroad.catalog import Grid
 from flexroad.pipeline.store import codec
+from flexroad.tasks.filter import planar
+from flexroad.tasks.fit import smoothing_spline
+from flexroad.tasks.levels import seen
 from flexroad.tasks.levels.seen import level_data, level_road, top_mask
+from flexroad.tasks.quality.assess import Options as AssessOptions
+from flexroad.tasks.quality.assess import assess
+from flexroad.tasks.roads.rasterise import cells
 from tests.make_crossings import CRS, Survey, block
 
 DECK_M, UNDER_M, BESIDE_M = 0.02, 0.06, 0.08
@@ -142,3 +149,26 @@ def test_levels_see_their_own_heights(tmp_path):
     # The approach is the deck's, not the ground's.
     taken = level.weight(x, y) >= 1
     assert not result.clusters.mask[taken].any()
+
+
+def test_raster_of_a_level_is_made_once_and_kept_without_empty_cells(tmp_path, monkeypatch):
+    core = block(80)
+    result = Survey.of(tmp_path, 0, core, tubes=0).tile(core)
+    (level,) = result.road.levels
+    made = Counter()
+    monkeypatch.setattr(
+        seen, "_cells", lambda area, grid: made.update([area.wkb]) or cells(np.array([area]), grid)
+    )
+    level = replace(level)
+    road, data = replace(result.road, levels=(level,)), result.data
+    clusters = planar.ecsrc(data, road, planar.Options(verge_m=5))
+    surface = smoothing_spline.fit(data, clusters, smoothing_spline.Options())
+    assess(data, road, clusters, surface, AssessOptions())
+    assert len(made) > 3
+    assert set(made.values()) == {1}
+    first = level_road(road, 1).mask
+    np.testing.assert_array_equal(first, cells(np.array([level.areas]), data.grid))
+    first[:] = False
+    assert level_road(road, 1).mask.any()
+    kept = sum(part.size for _, part in level.rasters.values())
+    assert kept < 0.2 * len(level.rasters) * data.grid.width * data.grid.height

@@ -1,0 +1,280 @@
+"""Files of other programs with heights of a run: road networks, lines, polygons and points."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+
+from flexroad.catalog.crs import in_plan, short
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.headers.refused import Refused, head
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.storage.outputs import made_folder, output_file
+from flexroad.catalog.storage.paths import write
+from flexroad.catalog.storage.scratch import ScratchFolder
+from flexroad.catalog.text import count, no_formula
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.results.points import Ground
+from flexroad.pipeline.results.query import required_crs
+from flexroad.pipeline.results.query_files import to_crs
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.lift import osm, xml_text
+from flexroad.tasks.lift.types import Frame, Heights, Lifted, Options
+from flexroad.tasks.types import Floats
+
+if TYPE_CHECKING:
+    import geopandas
+else:
+    geopandas = lazy("geopandas")
+
+XML_FORMATS: dict[str, ModuleType] = {"osm": osm}
+"""Formats by the name of the outermost element."""
+KINDS = "an OSM file (.osm)"
+PLACES = ".gpkg"
+"""Places above limits are in a file beside the report, of the same name with this suffix."""
+
+
+@dataclass(frozen=True)
+class LiftedFile:
+    """What became of a file."""
+
+    rows: tuple[Lifted, ...]
+    files: tuple[Path, ...]
+    """The files written."""
+    earlier: int
+    """Number of tiles whose heights are of earlier sources or options."""
+
+    @property
+    def summary(self) -> str:
+        """One line: what was lifted, and how near to the surface."""
+        length = sum(row.length_m for row in self.rows if np.isfinite(row.length_m))
+        return f"{count(len(self.rows), 'feature')}, {length / 1000:.2f} km"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines for the user: what has no heights of the run, and why."""
+        without = [row for row in self.rows if row.without_ground_m > 0]
+        unknown = [row for row in self.rows if row.unknown_deck_m > 0]
+        notes = []
+        if without:
+            length = sum(row.without_ground_m for row in without)
+            notes.append(
+                f"{length:.1f} m of {count(len(without), 'feature')} lie beyond the finished tiles and keep "
+                f"their heights ({without[0].id}{' and others' if len(without) > 1 else ''})"
+            )
+        if unknown:
+            length = sum(row.unknown_deck_m for row in unknown)
+            notes.append(
+                f"{length:.1f} m of {count(len(unknown), 'feature')} are on a deck of unknown height "
+                f"({unknown[0].id}{' and others' if len(unknown) > 1 else ''}); "
+                "a run with segment.levels=true has its level"
+            )
+        return tuple(notes)
+
+
+def lift(
+    ground: Ground,
+    source: Path,
+    out: Path,
+    options: Options,
+    crs: str | None = None,
+    offset: tuple[float, float] | None = None,
+    report: Path | None = None,
+) -> LiftedFile:
+    """Write a file with the heights of a run.
+
+    Parameters
+    ----------
+    ground : Ground
+        The run.
+    source, out : Path
+        The file, and where its copy is written: both are complete files of the same format.
+    options : Options
+    crs, offset
+        CRS of the file, and what is added to its coordinates (m), if the file does not say them.
+    report : Path, optional
+        A CSV with a row per road or feature; places above limits are in a GeoPackage beside it.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is of an unknown format, has no CRS, or does not lie on the run's tiles.
+    OSError
+        If an output cannot be written.
+    """
+    _require_outputs(source, out, report)
+    with _explained(source):
+        module = _format(source)
+        named = module.frame(source)
+        place = Frame(crs or named.crs, *(offset or (named.x, named.y)))
+        if place.crs is None:
+            raise TaskError("carries no CRS; give it with --crs, such as --crs EPSG:25832")
+        in_run = _InRun(ground, _plan(place.crs), place, required_crs(ground), module.STEPS)
+        with made_folder(out.absolute().parent), ScratchFolder(out.absolute().parent) as scratch:
+            rows = tuple(module.lift(source, Path(scratch, out.name), in_run.heights, options))
+            in_run.require_heights()
+            files = _move(Path(scratch), out)
+    if report is not None:
+        files += _write_report(rows, report, in_run)
+    return LiftedFile(rows, files, len(in_run.earlier))
+
+
+@dataclass(eq=False)
+class _InRun:
+    """Heights of a run at coordinates of a file."""
+
+    ground: Ground
+    crs: str
+    place: Frame
+    run_crs: str
+    steps: bool
+
+    def __post_init__(self) -> None:
+        self.known = 0
+        self.bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
+        self.earlier: set[str] = set()
+
+    def to_run(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Return easting and northing (m) in the CRS of the run."""
+        return to_crs(np.asarray(x) + self.place.x, np.asarray(y) + self.place.y, self.crs, self.run_crs)
+
+    def heights(self, x: Floats, y: Floats) -> Heights:
+        """Return heights of all levels; NaN without a surface."""
+        easting, northing = self.to_run(x, y)
+        found, earlier = self.ground.heights(easting, northing, self.steps)
+        self.earlier.update(earlier)
+        self.known += int(np.isfinite(found.z).any(axis=0).sum())
+        inside = np.isfinite(easting) & np.isfinite(northing)
+        if inside.any():
+            part = np.array([[values.min(), values.max()] for values in (easting[inside], northing[inside])])
+            self.bounds[:2] = np.minimum(self.bounds[:2], part[:, 0])
+            self.bounds[2:] = np.maximum(self.bounds[2:], part[:, 1])
+        return found
+
+    def require_heights(self) -> None:
+        """Raise an error if no point has had a height."""
+        if self.known:
+            return
+        if not np.isfinite(self.bounds).all():
+            raise TaskError("has no road or feature with coordinates")
+        tiles = np.array([tile.grid.bounds for tile in self.ground.run.catalog.usable])
+        of_tiles = [*tiles[:, :2].min(axis=0), *tiles[:, 2:].max(axis=0)]
+        raise TaskError(
+            f"does not lie on the finished tiles: it lies in {_box(self.bounds)}, they in "
+            f"{_box(of_tiles)} ({short(self.run_crs)}); correct its CRS with --crs and --offset"
+        )
+
+
+def _box(bounds: Sequence[float] | Floats) -> str:
+    west, south, east, north = bounds
+    return f"W {west:.0f} S {south:.0f} E {east:.0f} N {north:.0f}"
+
+
+def _format(source: Path) -> ModuleType:
+    """Return the module of a file's format, told by its first bytes."""
+    first = head(source).removeprefix(b"\xef\xbb\xbf").lstrip()
+    if first[:1] == b"<" or first[:2] == b"\x1f\x8b":
+        name = xml_text.root_name(source)
+        if name in XML_FORMATS:
+            return XML_FORMATS[name]
+        raise TaskError(f"has the root element {name or 'none'}; give {KINDS}")
+    raise TaskError(f"is of no known format; give {KINDS}")
+
+
+def _plan(crs: str) -> str:
+    try:
+        return in_plan(crs)
+    except CatalogError as error:
+        raise TaskError(f"has a CRS that PROJ does not read: {error}; give another one with --crs") from error
+
+
+def _require_outputs(source: Path, out: Path, report: Path | None) -> None:
+    """Raise an error if an output would replace the input, or another output."""
+    files = [
+        (out, "-o"),
+        *([(report, "--report"), (report.with_suffix(PLACES), "--report")] if report else []),
+    ]
+    taken = {source.resolve(): str(source)}
+    for path, option in files:
+        if path.resolve() in taken:
+            raise ConfigError(f"{option} {path}: is also {taken[path.resolve()]}; give another name")
+        taken[path.resolve()] = f"{option} {path}"
+        output_file(path)
+
+
+@contextmanager
+def _explained(source: Path) -> Iterator[None]:
+    """Name the file in errors of reading it."""
+    try:
+        yield
+    except (TaskError, Refused) as error:
+        raise ConfigError(f"{source} {error}") from error
+
+
+def _move(scratch: Path, out: Path) -> tuple[Path, ...]:
+    """Move the files that a format has written into their places; the one that was asked for is the last."""
+    made = sorted(path for path in scratch.rglob("*") if path.is_file() and not path.name.startswith("."))
+    made.sort(key=lambda path: path.name == out.name)
+    files = list[Path]()
+    for path in made:
+        target = out.parent / path.relative_to(scratch)
+        target.parent.mkdir(exist_ok=True)
+        path.replace(output_file(target))
+        files.append(target)
+    return tuple(files)
+
+
+def _write_report(rows: Sequence[Lifted], report: Path, in_run: _InRun) -> tuple[Path, ...]:
+    """Write the table, and the places above limits if there are any; return the files."""
+    text = io.StringIO(newline="")
+    table = csv.DictWriter(text, list(_row(Lifted(""))), lineterminator="\n")
+    table.writeheader()
+    table.writerows({name: no_formula(value) for name, value in _row(row).items()} for row in rows)
+    write(report, text.getvalue().encode())
+    steep = [(row.id, place) for row in rows for place in row.steep]
+    if not steep:
+        return (report,)
+    east, north = in_run.to_run(
+        np.array([place.x for _, place in steep]), np.array([place.y for _, place in steep])
+    )
+    found, _ = in_run.ground.heights(east, north)
+    columns = {
+        "id": [name for name, _ in steep],
+        "kind": [place.kind for _, place in steep],
+        "percent": [round(100 * place.value, 3) for _, place in steep],
+    }
+    height = np.nan_to_num(found.ground)
+    frame = geopandas.GeoDataFrame(columns, geometry=shapely.points(east, north, height), crs=in_run.run_crs)
+    places = report.with_suffix(PLACES)
+    with ScratchFolder() as folder:
+        frame.to_file(Path(folder, "places.gpkg"), layer="places", driver="GPKG", engine="pyogrio")
+        write(places, Path(folder, "places.gpkg").read_bytes())
+    return report, places
+
+
+def _row(row: Lifted) -> dict[str, str | int | float]:
+    """Return a row of the report; lengths in m, heights in mm, slopes in percent, empty where not known."""
+    figures = {
+        "length_m": (row.length_m, 1, 3),
+        "without_ground_m": (row.without_ground_m, 1, 3),
+        "unknown_deck_m": (row.unknown_deck_m, 1, 3),
+        "before_max_mm": (row.before_m, 1000, 1),
+        "elevation_max_mm": (row.elevation_m, 1000, 1),
+        "superelevation_max_mm": (row.superelevation_m, 1000, 1),
+        "shape_max_mm": (row.shape_m, 1000, 1),
+        "grade_max_percent": (row.grade, 100, 3),
+        "crossfall_max_percent": (row.crossfall, 100, 3),
+    }
+    values: dict[str, str | int | float] = {"id": row.id, "levels": " ".join(map(str, row.levels))}
+    for name, (value, factor, digits) in figures.items():
+        values[name] = round(value * factor, digits) if np.isfinite(value) else ""
+    return {**values, "note": row.note}

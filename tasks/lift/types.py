@@ -1,0 +1,112 @@
+"""What the formats have in common: heights of all levels at points, options, and the rows of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.tasks.types import Bools, Floats
+
+Places = slice | Bools | NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """Heights of n points on each level."""
+
+    numbers: tuple[int, ...]
+    """The k levels, ascending; 0, the ground, is one of them."""
+    z: Floats
+    """``(k, n)``, m; NaN where a level is not, and beyond the surface."""
+
+    def __getitem__(self, places: Places) -> Heights:
+        return replace(self, z=self.z[:, places])
+
+    @property
+    def ground(self) -> Floats:
+        """Heights of level 0, ``(n,)``, m."""
+        return np.asarray(self.z[self.numbers.index(0)])
+
+
+HeightsAt = Callable[[Floats, Floats], Heights]
+"""Heights at x and y, ``(n,)`` each, in the coordinates of the file."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where the coordinates of a file are: added to ``x`` and ``y``, they are those of a CRS."""
+
+    crs: str | None
+    """Any text that PROJ reads; None if the file names none."""
+    x: float = 0.0
+    y: float = 0.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """How files get their heights."""
+
+    tolerance_m: float = 0.005
+    """Largest distance of a profile, or of a line between its vertices, from the surface (m)."""
+    lateral: Literal["superelevation", "shape", "none"] = "superelevation"
+    """What OpenDRIVE's roads have across."""
+    crg: bool = False
+    """Whether OpenDRIVE's roads get OpenCRG files with the surface itself."""
+    flat_ends: bool = False
+    """Whether a road without ground beneath goes on level; else it keeps the heights that it had."""
+    add_vertices: bool | None = None
+    """Whether lines get vertices where they leave the surface by more than the tolerance; None: as the format
+    does by default."""
+    columns: bool = False
+    """Whether features get the columns ``grade_max``, ``crossfall_max`` and ``error_estimate_m``."""
+    grade_limit: float | None = None
+    """Places with a steeper grade are listed (m/m)."""
+    crossfall_limit: float | None = None
+    """Places with a steeper crossfall are listed (m/m)."""
+
+
+@dataclass(frozen=True)
+class Steep:
+    """A place above a limit."""
+
+    kind: Literal["grade", "crossfall"]
+    value: float
+    """Its grade or crossfall (m/m)."""
+    x: float
+    """In the coordinates of the file."""
+    y: float
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """One road or feature of a file: a row of the report. Lengths and heights in m, grades in m/m.
+
+    NaN where a figure is not known, or the format does not have it.
+    """
+
+    id: str
+    length_m: float = np.nan
+    without_ground_m: float = 0.0
+    """Length where the run has no surface."""
+    levels: tuple[int, ...] = (0,)
+    """Numbers of the levels whose heights it has."""
+    unknown_deck_m: float = 0.0
+    """Length on bridges and in tunnels of which the run does not have the level."""
+    before_m: float = np.nan
+    """Largest distance of the heights that it had from the surface."""
+    elevation_m: float = np.nan
+    """Largest distance of its carriageway from the surface, by its elevation alone."""
+    superelevation_m: float = np.nan
+    """The same with the superelevation."""
+    shape_m: float = np.nan
+    """The same with the shape of its cross-sections."""
+    grade: float = np.nan
+    """Largest grade."""
+    crossfall: float = np.nan
+    """Largest crossfall."""
+    steep: tuple[Steep, ...] = ()
+    note: str = ""

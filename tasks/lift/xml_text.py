@@ -1,0 +1,268 @@
+"""XML files copied byte by byte, with some elements changed: what is not changed stays as it was written.
+
+A file is read once, in pieces, so that memory does not grow with it. Some of its elements are handed over as
+trees, with the places of their parts in the text; all other text is handed over as it is.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+from xml.etree import ElementTree as ET
+from xml.parsers import expat
+
+from flexroad.catalog.text import reason, shown
+from flexroad.tasks.errors import TaskError
+
+CHUNK_BYTES = 2**18
+LARGEST_BYTES = 2**26
+"""Largest text of one element that is handed over."""
+DEEPEST = 200
+"""Largest number of elements within each other."""
+ENCODINGS = ("utf-8", "us-ascii", "iso-8859-1", "windows-1252")
+"""In these, the characters of ASCII are one byte each."""
+START_TAG = re.compile(rb"""<[^>"']*(?:"[^"]*"[^>"']*|'[^']*'[^>"']*)*>""")
+ATTRIBUTE = re.compile(rb"""\s(([^\s=<>"']+)\s*=\s*(?:"[^"]*"|'[^']*'))""")
+LATER = "; save it again with a program that writes plain XML in UTF-8"
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """An element with its text as the file has it."""
+
+    element: ET.Element
+    text: bytes
+    spans: Mapping[ET.Element, tuple[int, int]] = field(repr=False)
+    """Start and end in ``text`` of the element and of those in it."""
+    path: tuple[str, ...] = ()
+    """The names of the elements around it, from the root."""
+
+    def start_tag(self, element: ET.Element) -> tuple[int, int]:
+        """Return start and end of the start tag of an element."""
+        start, _ = self.spans[element]
+        found = START_TAG.match(self.text, start)
+        assert found is not None
+        return start, found.end()
+
+    def inside(self, element: ET.Element) -> tuple[int, int] | None:
+        """Return start and end of the text in an element; None if it is written as an empty tag."""
+        _, first = self.start_tag(element)
+        if self.text[first - 2 : first] == b"/>":
+            return None
+        return first, self.text.rindex(b"</", first, self.spans[element][1])
+
+    def with_child(self, text: str, element: ET.Element | None = None) -> tuple[int, int, bytes]:
+        """Return the edit that adds a text before the end of an element, by default of the whole one."""
+        element = self.element if element is None else element
+        place = self.inside(element)
+        if place is not None:
+            return place[1], place[1], text.encode("ascii")
+        start, end = self.start_tag(element)
+        head = self.text[start:end].removesuffix(b"/>").rstrip()
+        return start, end, head + b">" + text.encode("ascii") + b"</" + str(element.tag).encode() + b">"
+
+    def replaced(self, edits: Iterable[tuple[int, int, bytes]]) -> bytes:
+        """Return the text with some stretches replaced: start, end and new text of each.
+
+        They must not overlap; those of length 0 insert text.
+        """
+        parts, at = list[bytes](), 0
+        for start, end, new in sorted(edits, key=lambda edit: edit[:2]):
+            assert at <= start <= end
+            parts += [self.text[at:start], new]
+            at = end
+        return b"".join([*parts, self.text[at:]])
+
+    def with_attributes(self, element: ET.Element, values: Mapping[str, str]) -> tuple[int, int, bytes]:
+        """Return the edit that gives an element attributes; those that it has are replaced in their place."""
+        start, end = self.start_tag(element)
+        tag = self.text[start:end]
+        for name, value in values.items():
+            text = value.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+            new = f'{name}="{text}"'.encode("ascii")
+            own = [found for found in ATTRIBUTE.finditer(tag) if found[2] == name.encode()]
+            if own:
+                tag = tag[: own[0].start(1)] + new + tag[own[0].end(1) :]
+            else:
+                head = tag[: -2 if tag.endswith(b"/>") else -1].rstrip()
+                tag = head + b" " + new + tag[len(head) :]
+        return start, end, tag
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a file to read; one whose name ends in ``.gz`` is unpacked as it is read."""
+    with path.open("rb") as file:
+        if path.suffix.lower() != ".gz":
+            yield file
+            return
+        with gzip.GzipFile(fileobj=file) as unpacked:
+            yield cast("BinaryIO", unpacked)
+
+
+@contextmanager
+def written(path: Path) -> Iterator[BinaryIO]:
+    """Open a file to write; one whose name ends in ``.gz`` is compressed, without a time in it."""
+    with path.open("wb") as file:
+        if path.suffix.lower() != ".gz":
+            yield file
+            return
+        with gzip.GzipFile(filename="", fileobj=file, mode="wb", mtime=0) as packed:
+            yield cast("BinaryIO", packed)
+
+
+def root_name(path: Path) -> str:
+    """Return the name of the outermost element of a file.
+
+    Raises
+    ------
+    TaskError
+        As of `parts`.
+    """
+    with opened(path) as file:
+        names = list[str]()
+
+        def start(name: str, attributes: dict[str, str]) -> None:
+            names.append(name)
+
+        parser = expat.ParserCreate()
+        parser.StartElementHandler = start
+        try:
+            while not names and (data := file.read(CHUNK_BYTES)):
+                parser.Parse(data)
+        except expat.ExpatError as error:
+            if not names:
+                raise _broken(error) from error
+        except (OSError, EOFError, zlib.error) as error:
+            raise TaskError(f"cannot be read: {reason(error)}") from error
+    return names[0] if names else ""
+
+
+def parts(file: BinaryIO, names: Collection[str]) -> Iterator[bytes | Part]:
+    """Yield a file as pieces of text and the elements of some names; joined, these are the file.
+
+    Of elements within each other, the outer one is handed over.
+
+    Parameters
+    ----------
+    file : binary file
+    names : collection of str
+        Names of elements, as they are written.
+
+    Raises
+    ------
+    TaskError
+        If the file is no well-formed XML, declares entities, is in UTF-16, or has elements that are too deep
+        or too large. The message continues a sentence that begins with the name of the file.
+    """
+    reader = _Reader(names)
+    try:
+        while data := file.read(CHUNK_BYTES):
+            yield from reader.feed(data)
+        yield from reader.feed(b"")
+    except expat.ExpatError as error:
+        raise _broken(error) from error
+    except (OSError, EOFError, zlib.error) as error:
+        raise TaskError(f"cannot be read: {reason(error)}") from error
+
+
+def _broken(error: expat.ExpatError) -> TaskError:
+    where = f"line {error.lineno}, column {error.offset + 1}"
+    return TaskError(f"is not whole XML: {expat.ErrorString(error.code)}, {where}; save it again")
+
+
+class _Reader:
+    """The state of reading a file: what is not handed over yet, and the element that is being read."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        self.names = frozenset(names)
+        self.parser = expat.ParserCreate()
+        self.parser.buffer_text = True
+        self.parser.XmlDeclHandler = self.declaration
+        self.parser.EntityDeclHandler = self.entity
+        self.parser.StartElementHandler = self.start
+        self.parser.EndElementHandler = self.end
+        self.parser.CharacterDataHandler = self.characters
+        self.ready: list[bytes | Part] = []
+        self.text, self.offset = bytearray(), 0
+        """Text from a place of the file on."""
+        self.path: list[str] = []
+        self.open: list[tuple[ET.Element, int]] = []
+        self.spans: dict[ET.Element, tuple[int, int]] = {}
+        self.outer = 0
+        """Number of elements around the one that is being read."""
+
+    def feed(self, data: bytes) -> Iterator[bytes | Part]:
+        if self.offset == 0 and not self.text and data.startswith((b"\xff\xfe", b"\xfe\xff", b"\0", b"<\0")):
+            raise TaskError(f"is in UTF-16{LATER}")
+        self.text += data
+        self.parser.Parse(data, not data)
+        if not self.open:
+            # What the parser has not passed may be the start of an element.
+            self.pass_to(self.parser.CurrentByteIndex if data else self.offset + len(self.text))
+        elif len(self.text) > LARGEST_BYTES:
+            name = self.open[0][0].tag
+            raise TaskError(f"has an element {name} of more than {LARGEST_BYTES >> 20} MiB{LATER}")
+        yield from self.ready
+        self.ready.clear()
+
+    def pass_to(self, index: int) -> None:
+        length = index - self.offset
+        if length > 0:
+            self.ready.append(bytes(self.text[:length]))
+            del self.text[:length]
+            self.offset = index
+
+    def declaration(self, version: str, encoding: str | None, standalone: int) -> None:
+        if (encoding or "utf-8").lower() not in ENCODINGS:
+            raise TaskError(f"is in {shown(encoding)}{LATER}")
+
+    def entity(self, name: str, *_: Any) -> None:
+        raise TaskError(f"declares the entity {shown(name)}{LATER}")
+
+    def start(self, name: str, attributes: dict[str, str]) -> None:
+        self.path.append(name)
+        if len(self.path) > DEEPEST:
+            raise TaskError(f"has more than {DEEPEST} elements within each other{LATER}")
+        index = self.parser.CurrentByteIndex
+        if not self.open:
+            if name not in self.names:
+                return
+            self.pass_to(index)
+            self.outer = len(self.path) - 1
+        element = ET.Element(name, attributes)
+        if self.open:
+            self.open[-1][0].append(element)
+        self.open.append((element, index - self.offset))
+
+    def characters(self, text: str) -> None:
+        if self.open:
+            element = self.open[-1][0]
+            if len(element):
+                element[-1].tail = (element[-1].tail or "") + text
+            else:
+                element.text = (element.text or "") + text
+
+    def end(self, name: str) -> None:
+        path = tuple(self.path[: self.outer])
+        self.path.pop()
+        if not self.open:
+            return
+        element, start = self.open.pop()
+        tag = START_TAG.match(self.text, start)
+        assert tag is not None
+        end = tag.end()
+        if self.text[end - 2 : end] != b"/>":
+            end = self.text.index(b">", self.parser.CurrentByteIndex - self.offset) + 1
+        self.spans[element] = start, end
+        if not self.open:
+            self.ready.append(Part(element, bytes(self.text[:end]), self.spans, path))
+            self.spans = {}
+            del self.text[:end]
+            self.offset += end
