@@ -106,13 +106,28 @@ def top_mask(clusters: RoadClusters) -> Bools:
     return result
 
 
+def hidden(levels: tuple[Level, ...], number: int, grid: Grid) -> Bools:
+    """Return the cells of a level that decks above it hide, and those beside the decks, ``(H, W)``."""
+    if number == 0:
+        return _hidden(levels, grid)
+    level = next(level for level in levels if level.number == number)
+    above = [other for other in levels if other.number > max(number, 0)]
+    return _any(grid, [_over(deck, grid) & ~(_approach(deck, grid) & _own(level, grid)) for deck in above])
+
+
+def off_ground(levels: tuple[Level, ...], grid: Grid) -> Bools:
+    """Return the cells of level 0 below and beside decks, and above tubes, ``(H, W)``: roads go on there."""
+    return _any(grid, [_hidden(levels, grid), *(_own(level, grid) for level in levels if level.number < 0)])
+
+
 def level_road(road: RoadMask, number: int) -> RoadMask:
     """Return the road mask of a level: for others than 0 its areas, beyond which it has no mesh."""
     if number == 0:
         return road
     level = next(level for level in road.levels if level.number == number)
     mask = _own(level, road.grid)
-    return RoadMask(road.grid, road.core, mask, ~mask, areas=encoded(np.array([level.areas]), road.core))
+    areas = encoded(np.array([level.areas]), road.core)
+    return RoadMask(road.grid, road.core, mask, ~mask, areas=areas, levels=road.levels)
 
 
 def _of_level(data: TileData, road: RoadMask, level: Level, ecsrc: Filter) -> RoadClusters:
@@ -134,18 +149,15 @@ def _of_level(data: TileData, road: RoadMask, level: Level, ecsrc: Filter) -> Ro
 def _masked(data: TileData, levels: tuple[Level, ...], number: int) -> TileData:
     """Return the data without the heights that a level does not see."""
     grid = data.grid
-    hidden = _hidden(levels, grid)
+    below = _hidden(levels, grid)
     if number == 0:
-        dsm = np.where(hidden, np.nan, data.dsm)
+        dsm = np.where(below, np.nan, data.dsm)
         # A terrain model that has the deck tells nothing of the ground below it.
-        dtm = np.where(hidden & (np.abs(data.dtm - data.dsm) <= AGREE_M), np.nan, data.dtm)
+        dtm = np.where(below & (np.abs(data.dtm - data.dsm) <= AGREE_M), np.nan, data.dtm)
         return _replaced(data, dsm, dtm)
     level = next(level for level in levels if level.number == number)
     own = _own(level, grid)
-    gone = hidden & ~own
-    for other in levels:
-        if other.number > max(number, 0):
-            gone |= _over(other, grid) & ~(_approach(other, grid) & own)
+    gone = below & ~own | hidden(levels, number, grid)
     if number < 0:
         gone |= own
     known = np.nan if data.decks is None or number < 0 else data.decks

@@ -155,7 +155,7 @@ def _assess(
         "residual_nmad_m": nmad(residuals),
         "residual_p95_m": _quantile(np.abs(residuals), 95),
         "curvature_per_m": _largest(_second_differences(height, on_road) / cell**2),
-        "edge_step_m": _quantile(_edge_steps(cells.smooth, on_road), 95),
+        "edge_step_m": _quantile(_edge_steps(cells.smooth, on_road, cells.goes_on), 95),
         "measured_road": mean(classes[on_road] == Support.MEASURED),
         "dtm_road": mean(classes[on_road] == Support.DTM),
         "inferred_road": mean(classes[on_road] == Support.INFERRED),
@@ -168,7 +168,8 @@ def _assess(
         **asdict(holdout(data, road, clusters, refit, options.agree_m, options.holdout)),
         "suspect_m2": _largest_patch(on_road & (cells.deviation > options.agree_m)) * cell**2,
     }
-    flags = [flag for flag, name in FLAGS.items() if figures[name] > getattr(options, name)]
+    judged = figures | {"inferred_road": mean(cells.lacking[on_road])}
+    flags = [flag for flag, name in FLAGS.items() if judged[name] > getattr(options, name)]
     if not on_road.any():
         figures["suspect_m2"] = float("nan")
         flags = []
@@ -229,13 +230,16 @@ def _second_differences(height: Floats, on_road: Bools) -> Floats:
     return _finite(np.concatenate(parts))
 
 
-def _edge_steps(height: Floats, on_road: Bools) -> Floats:
-    """Return the distance of each first cell beside the road to the line of the last two on it, ``(n,)``."""
-    parts = []
-    for z, road in ((height, on_road), (height.T, on_road.T)):
-        for profile, road_profile in ((z, road), (z[::-1], road[::-1])):
+def _edge_steps(height: Floats, on_road: Bools, goes_on: Bools) -> Floats:
+    """Return the distance of each first cell beside the road to the line of the last two on it, ``(n,)``.
+
+    At a joint there is none: the road goes on as a deck or in a tube.
+    """
+    parts, beside = [], ~(on_road | goes_on)
+    for z, road, edge in ((height, on_road, beside), (height.T, on_road.T, beside.T)):
+        for profile, on, out in ((z, road, edge), (z[::-1], road[::-1], edge[::-1])):
             step = profile[2:] - 2 * profile[1:-1] + profile[:-2]
-            parts.append(np.abs(step[~road_profile[2:] & road_profile[1:-1] & road_profile[:-2]]))
+            parts.append(np.abs(step[out[2:] & on[1:-1] & on[:-2]]))
     return _finite(np.concatenate(parts))
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from flexroad.tasks.levels.seen import level_data, with_approaches
+from flexroad.tasks.levels.joints import TUBE_M
+from flexroad.tasks.levels.seen import hidden, level_data, off_ground, with_approaches
 from flexroad.tasks.quality.support import Support, support
 from flexroad.tasks.roads.distances import distances, filled
 from flexroad.tasks.roads.dtm_validity import AGREE_M, rise, without_invalid_dtm
@@ -158,6 +159,11 @@ class Compared:
     inferred cells."""
     estimate: Floats
     """Estimated error of the surface (m), by `quality.estimate.error_estimate`."""
+    goes_on: Bools
+    """Cells of level 0 below decks or above tubes: a road that ends there at a joint goes on."""
+    lacking: Bools
+    """Inferred road cells, but for those below decks within half the length of a tube (`TUBE_M`) of road with
+    a height: that a deck hides the street below it is no fault of the data."""
 
 
 def compare(
@@ -182,7 +188,8 @@ def compare(
     data, clusters = level_data(data, clusters), with_approaches(clusters)
     window = data.grid.window(data.core)
     fitted = with_road_heights(data, clusters)
-    classes = support(data, road, _with_ground(clusters, surface, data), agree_m)[window]
+    every = support(data, road, _with_ground(clusters, surface, data), agree_m)
+    classes, below = every[window], hidden(road.levels, clusters.number, data.grid)
     on_road = road.mask[window] & (classes != Support.NONE)
     kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
     height = surface.lattice(data.core.eastings, data.core.northings)
@@ -195,7 +202,21 @@ def compare(
     inferred = classes == Support.INFERRED
     distance = np.where(inferred, estimate, deviation(off_dsm, off_dtm, spread, kept, inferred))
     excess = (data.dsm - fitted.dsm)[window]
-    return Compared(on_road, kept, classes, height, smooth, off_dsm, excess, off_dtm, distance, estimate)
+    return Compared(
+        on_road, kept, classes, height, smooth, off_dsm, excess, off_dtm, distance, estimate,
+        goes_on=off_ground(road.levels if clusters.level is None else (), data.grid)[window],
+        lacking=on_road & _lacking(road.mask, every, below, data.grid.cell)[window],
+    )  # fmt: skip
+
+
+def _lacking(road: Bools, classes: NDArray[np.uint8], below: Bools, cell: float) -> Bools:
+    """Return the inferred road cells that no deck explains, ``(H, W)``; see `Compared.lacking`."""
+    lacking = road & (classes == Support.INFERRED)
+    by_deck = lacking & below
+    if by_deck.any():
+        known = road & ((classes == Support.MEASURED) | (classes == Support.DTM))
+        lacking[by_deck] = distances(by_deck, known) * cell > TUBE_M / 2
+    return np.asarray(lacking)
 
 
 def _with_ground(clusters: RoadClusters, surface: Surface, data: TileData) -> RoadClusters:

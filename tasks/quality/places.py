@@ -8,7 +8,6 @@ import scipy
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.quality.assess import Options
 from flexroad.tasks.quality.estimate import Compared
-from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Bools, Floats
 
 AROUND_M = 10.0
@@ -37,10 +36,10 @@ def places(cells: Compared, grid: Grid, options: Options) -> dict[str, Place]:
         "error-estimate": _around(np.where(road, cells.estimate, 0.0), grid.cell),
         "patch": _depth(_largest_patch(road & (cells.deviation > agree_m))),
         "spike": _bend(cells.height, road),
-        "edge-step": _edge_step(cells.smooth, road),
+        "edge-step": _edge_step(cells.smooth, road, cells.goes_on),
         "loose": np.where(cells.kept, np.abs(cells.off_dsm), 0.0),
         "off-dtm": _around(np.where(road & (np.abs(cells.off_dtm) > agree_m), 1.0, 0.0), grid.cell),
-        "inferred": _depth(_largest_patch(road & (cells.classes == Support.INFERRED))),
+        "inferred": _depth(_largest_patch(cells.lacking)),
         "dropped": _depth(_largest_patch(road & ~cells.kept)),
     }
     return {flag: place for flag, score in scores.items() if (place := _highest(score, grid)) is not None}
@@ -79,12 +78,12 @@ def _bend(height: Floats, road: Bools) -> Floats:
     return bend
 
 
-def _edge_step(height: Floats, road: Bools) -> Floats:
+def _edge_step(height: Floats, road: Bools, goes_on: Bools) -> Floats:
     """Return how far the cell beside the road lies off the line of the last two on it, at the last one."""
-    steps = np.zeros(height.shape)
-    for z, on, out in ((height, road, steps), (height.T, road.T, steps.T)):
-        for profile, inside, into in ((z, on, out), (z[::-1], on[::-1], out[::-1])):
+    steps, beside = np.zeros(height.shape), ~(road | goes_on)
+    for z, on, off, out in ((height, road, beside, steps), (height.T, road.T, beside.T, steps.T)):
+        for profile, inside, outside, into in ((z, on, off, out), (z[::-1], on[::-1], off[::-1], out[::-1])):
             step = np.abs(profile[2:] - 2 * profile[1:-1] + profile[:-2])
-            at_edge = ~inside[2:] & inside[1:-1] & inside[:-2]
+            at_edge = outside[2:] & inside[1:-1] & inside[:-2]
             into[1:-1] = np.fmax(into[1:-1], np.where(at_edge, step, 0.0))
     return steps

@@ -15,6 +15,8 @@ from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean
 from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 2
+LEVELS_VERSION = 2
+"""Raised instead if the results of any stage change with `Options.levels` alone."""
 READS = ("roads",)
 NEEDS = ("roads",)
 

@@ -358,3 +358,10 @@ def test_options_of_levels_do_not_change_fingerprints():
     assert "levels" not in head
     assert hashlib.sha256(head.encode()).hexdigest()[:16] == "a1bf6d02b744da5e"
     assert stage_head("segment", vector.Options(levels=True))[-1]["levels"] is True
+
+
+def test_version_of_levels_enters_fingerprints_only_with_levels(monkeypatch):
+    before = stage_head("segment", vector.Options()), stage_head("segment", vector.Options(levels=True))
+    monkeypatch.setattr(vector, "LEVELS_VERSION", vector.LEVELS_VERSION + 1)
+    assert stage_head("segment", vector.Options()) == before[0]
+    assert stage_head("segment", vector.Options(levels=True)) != before[1]

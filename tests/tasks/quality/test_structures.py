@@ -1,13 +1,16 @@
 """Figures and flags of decks: of level planes they are exact."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import shapely
 
+from flexroad.catalog.grid import Grid
 from flexroad.pipeline.store import codec
 from flexroad.tasks.quality.assess import Options, assess, cell_errors
+from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.structures import BELOW, NO_JOINT, NO_RISE, structures
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Level, RoadClusters, RoadMask, Structures, TileData
@@ -92,3 +95,44 @@ def test_heights_in_tubes_are_inferred_and_those_of_decks_measured(number, suppo
     assert (classes[~covered] == Support.NONE).all()
     assert np.isfinite(error[covered]).all()
     np.testing.assert_array_equal(assess(*inputs).levels[0][1].support, classes)
+
+
+@pytest.mark.parametrize(("width", "doubtful"), [(8, False), (44, False), (60, True)])
+def test_street_below_a_deck_is_inferred_but_in_doubt_only_if_it_is_long(width, doubtful):
+    grid = Grid(GRID.crs, WEST, SOUTH + 40, 1.0, 140, 40)
+    street, nowhere = np.zeros(grid.shape, np.bool_), np.zeros(grid.shape, np.bool_)
+    street[16:24] = True
+    deck = shapely.box(WEST + 70 - width / 2, SOUTH, WEST + 70 + width / 2, SOUTH + 40)
+    level = Level(1, shapely.MultiPolygon([deck]), shapely.MultiLineString(), shapely.MultiPolygon())
+    ground = np.full(grid.shape, 100.0)
+    dsm = np.where(level.covers(*np.meshgrid(grid.eastings, grid.northings)), 107.0, ground)
+    labels = street.astype(np.int32)
+    own = RoadClusters(grid, labels, levels=(RoadClusters(grid, nowhere.astype(np.int32), level=level),))
+    mask = RoadMask(grid, grid, street, nowhere, levels=(level,))
+    surface = SimpleNamespace(lattice=lambda eastings, northings: ground)
+    inputs = TileData("a", grid, grid, dsm, ground), mask, own, surface
+    quality, cells = assess(*inputs, Options()), compare(*inputs, 0.3)
+    assert quality.inferred_road == pytest.approx((width + 2) / 140)
+    assert ("inferred" in quality.flags) == doubtful
+    # In the middle, more than 25 m from either side.
+    assert cells.lacking.sum() == (8 * (width + 2 - 50) if doubtful else 0)
+
+
+@pytest.mark.parametrize("number", [1, -1])
+def test_road_that_goes_on_as_deck_or_tube_has_no_step_at_its_end(number):
+    """The ground below the deck lies 7 m lower, and that above the tube 7 m higher."""
+    level = replace(LEVEL, number=number)
+    on_deck = level.covers(*np.meshgrid(GRID.eastings, GRID.northings))
+    approach = np.zeros(GRID.shape, np.bool_)
+    rows = on_deck.any(axis=1)
+    approach[rows, : int(np.argmax(on_deck.any(axis=0)))] = True
+    heights = np.where(on_deck, 100.0 - 7 * number, 100.0)
+    own = RoadClusters(GRID, approach.astype(np.int32))
+    surface = SimpleNamespace(lattice=lambda eastings, northings: heights)
+    steps = {}
+    for name, levels in (("with", (level,)), ("without", ())):
+        mask = RoadMask(GRID, GRID, approach, NOWHERE, levels=levels)
+        data = TileData("a", GRID, GRID, heights, heights)
+        steps[name] = assess(data, mask, own, surface, Options())
+    assert steps["with"].edge_step_m == 0
+    assert "edge-step" in steps["without"].flags
