@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -27,7 +28,7 @@ from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.results.query import required_crs
 from flexroad.pipeline.results.query_files import to_crs
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.lift import osm, xml_text
+from flexroad.tasks.lift import opendrive, osm, xml_text
 from flexroad.tasks.lift.types import Frame, Heights, Lifted, Options
 from flexroad.tasks.types import Floats
 
@@ -36,9 +37,9 @@ if TYPE_CHECKING:
 else:
     geopandas = lazy("geopandas")
 
-XML_FORMATS: dict[str, ModuleType] = {"osm": osm}
+XML_FORMATS: dict[str, ModuleType] = {"OpenDRIVE": opendrive, "osm": osm}
 """Formats by the name of the outermost element."""
-KINDS = "an OSM file (.osm)"
+KINDS = "OpenDRIVE (.xodr) or an OSM file (.osm)"
 PLACES = ".gpkg"
 """Places above limits are in a file beside the report, of the same name with this suffix."""
 
@@ -115,7 +116,9 @@ def lift(
     with _explained(source):
         module = _format(source)
         named = module.frame(source)
-        place = Frame(crs or named.crs, *(offset or (named.x, named.y)))
+        place = replace(named, crs=crs or named.crs)
+        if offset is not None:
+            place = Frame(place.crs, *offset)
         if place.crs is None:
             raise TaskError("carries no CRS; give it with --crs, such as --crs EPSG:25832")
         in_run = _InRun(ground, _plan(place.crs), place, required_crs(ground), module.STEPS)
@@ -145,12 +148,17 @@ class _InRun:
 
     def to_run(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Return easting and northing (m) in the CRS of the run."""
-        return to_crs(np.asarray(x) + self.place.x, np.asarray(y) + self.place.y, self.crs, self.run_crs)
+        place, x, y = self.place, np.asarray(x), np.asarray(y)
+        ahead, left = math.cos(place.turn), math.sin(place.turn)
+        with np.errstate(invalid="ignore"):
+            east, north = x * ahead - y * left + place.x, x * left + y * ahead + place.y
+        return to_crs(east, north, self.crs, self.run_crs)
 
     def heights(self, x: Floats, y: Floats) -> Heights:
         """Return heights of all levels; NaN without a surface."""
         easting, northing = self.to_run(x, y)
         found, earlier = self.ground.heights(easting, northing, self.steps)
+        found = replace(found, z=found.z - self.place.z)
         self.earlier.update(earlier)
         self.known += int(np.isfinite(found.z).any(axis=0).sum())
         inside = np.isfinite(easting) & np.isfinite(northing)

@@ -38,12 +38,15 @@ HeightsAt = Callable[[Floats, Floats], Heights]
 
 @dataclass(frozen=True)
 class Frame:
-    """Where the coordinates of a file are: added to ``x`` and ``y``, they are those of a CRS."""
+    """Where the coordinates of a file are: turned, then added to ``x``, ``y`` and ``z``, those of a CRS."""
 
     crs: str | None
     """Any text that PROJ reads; None if the file names none."""
     x: float = 0.0
     y: float = 0.0
+    z: float = 0.0
+    turn: float = 0.0
+    """Radians, counter-clockwise."""
 
 
 @dataclass(frozen=True)

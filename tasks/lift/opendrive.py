@@ -1,0 +1,318 @@
+"""OpenDRIVE 1.4 to 1.8 (``.xodr``): elevation and lateral profile of each road from the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Literal
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from flexroad.catalog.text import shown
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.lift import lanes, levels, opendrive_text, plan_view, road_profiles, xml_text
+from flexroad.tasks.lift.batches import with_heights
+from flexroad.tasks.lift.levels import ANY, Numbers
+from flexroad.tasks.lift.plan_view import numbers
+from flexroad.tasks.lift.profile import AHEAD_M, value_at
+from flexroad.tasks.lift.road_profiles import NONE, CrossSections
+from flexroad.tasks.lift.types import Frame, Heights, HeightsAt, Lifted, Options, Steep
+from flexroad.tasks.lift.xml_text import Part
+from flexroad.tasks.types import Bools, Floats
+
+STEPS = False
+"""Whether heights have the steps beside roads: OpenDRIVE has kerbs in its lanes."""
+ALONG_M, LEAST_ALONG = 1.0, 4
+"""Distance of the cross-sections of a road (m), and their least number, less one."""
+ACROSS_M, SHAPE_ACROSS_M = 1.0, 0.5
+"""Distance of the points of a cross-section, and where shapes are written (m)."""
+LEAST_ACROSS, MOST_ACROSS = 4, 80
+"""Number of the points of a cross-section, less one."""
+MOST_FINER = 8
+"""Cross-sections for each of the usual ones, at most, where a road bends."""
+LONGEST_M = 50_000.0
+"""Longest road (m)."""
+Structure = tuple[Literal["bridge", "tunnel"], float, float]
+"""Kind, start and end of a bridge or tunnel, by distances along its road (m)."""
+ALL_LEVEL = 'all lanes have level="true", as netconvert writes it: they stay flat across; write "false"'
+
+
+@dataclass(frozen=True, eq=False)
+class Road:
+    """A road with the places of its cross-sections."""
+
+    part: Part
+    id: str
+    s: Floats
+    """``(n,)``: distances of the cross-sections, m."""
+    t: Floats
+    """``(m,)``: their points, m from the reference line."""
+    x: Floats
+    """``(n,)``: the reference line."""
+    y: Floats
+    heading: Floats
+    extent: lanes.Extent
+    elevation: Floats
+    """The profile that it had, ``(k, 5)``."""
+    superelevation: Floats
+    structures: tuple[Structure, ...]
+
+    @property
+    def inside(self) -> Bools:
+        """The points of cross-sections on the lanes, ``(n, m)``, or next to them."""
+        half = (self.t[1] - self.t[0]) / 2
+        right, left = self.extent.right[:, None], self.extent.left[:, None]
+        return np.asarray((self.t >= right - half) & (self.t <= left + half))
+
+    def places(self) -> tuple[Floats, Floats]:
+        """Return x and y of the points: cross-sections, then the line, then before and after its points."""
+        ahead, left = np.cos(self.heading), np.sin(self.heading)
+        x = [(self.x[:, None] - self.t * left[:, None]).ravel()]
+        y = [(self.y[:, None] + self.t * ahead[:, None]).ravel()]
+        for away in (0.0, -AHEAD_M, AHEAD_M):
+            x.append(self.x + away * ahead)
+            y.append(self.y + away * left)
+        return np.concatenate(x), np.concatenate(y)
+
+
+@dataclass(frozen=True)
+class Left:
+    """A road that stays as it is, and why."""
+
+    part: Part
+    id: str
+    note: str
+
+
+def frame(source: Path) -> Frame:
+    """Return where the coordinates of a file are: its ``geoReference`` and ``offset``.
+
+    Raises
+    ------
+    TaskError
+        If the file cannot be read; continues a sentence that begins with its name.
+    """
+    with xml_text.opened(source) as file:
+        for part in xml_text.parts(file, {"header", "road"}):
+            if isinstance(part, bytes):
+                continue
+            if part.element.tag == "road":
+                break
+            text = " ".join((part.element.findtext("geoReference") or "").split())
+            offset = part.element.find("offset")
+            try:
+                moved = [0.0] * 4 if offset is None else numbers(offset, *"xyz", "hdg", missing=0.0)
+            except TaskError as error:
+                raise TaskError(f"{error}; correct its header") from error
+            return Frame(text or None, moved[0], moved[1], z=moved[2], turn=moved[3])
+    return Frame(None)
+
+
+def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Iterator[Lifted]:
+    """Copy a file with heights; yield the rows of the report.
+
+    Raises
+    ------
+    TaskError
+        If the file cannot be read; continues a sentence that begins with its name.
+    """
+    with xml_text.opened(source) as file, xml_text.written(out) as copy:
+        parts = (_read(part, options) for part in xml_text.parts(file, {"road"}))
+        for part, found in with_heights(parts, _places, heights):
+            if isinstance(part, bytes):
+                copy.write(part)
+            elif isinstance(part, Left) or found is None:
+                assert isinstance(part, Left)
+                copy.write(part.part.text)
+                yield Lifted(part.id, note=part.note)
+            else:
+                text, row = _lifted(part, found, options)
+                copy.write(text)
+                yield row
+
+
+def _places(part: bytes | Left | Road) -> tuple[Floats, Floats] | None:
+    return part.places() if isinstance(part, Road) else None
+
+
+def _read(part: bytes | Part, options: Options) -> bytes | Left | Road:
+    """Return a road, or why it stays as it is."""
+    if isinstance(part, bytes):
+        return part
+    name = part.element.get("id", "")
+    if part.path != ("OpenDRIVE",):
+        return part.text
+    try:
+        with np.errstate(all="ignore"):
+            return _road(part, name, options)
+    except TaskError as error:
+        return Left(part, name, f"road {shown(name)} {error}; it stays as it was")
+
+
+def _road(part: Part, name: str, options: Options) -> Road:
+    element = part.element
+    (length,) = numbers(element, "length")
+    if not 0 < length <= LONGEST_M:
+        raise TaskError(f"has a length of {length:g} m")
+    plan = plan_view.read(element)
+    count = max(int(np.ceil(length / ALONG_M)), LEAST_ALONG)
+    s = np.linspace(0.0, length, count + 1)
+    extent = lanes.extent(element, s)
+    reach = max(float(np.abs(extent.right).max()), float(np.abs(extent.left).max()))
+    # In narrow bends the outer lanes are long; kinks between geometries are not bends.
+    kept = np.diff(np.searchsorted(plan.start[:, 0], s, side="right")) == 0
+    turned = float(np.abs(np.diff(plan.at(s)[2]))[kept].max(initial=0.0)) * reach
+    if np.isfinite(turned) and turned > ALONG_M:
+        s = np.linspace(0.0, length, count * int(min(np.ceil(turned / ALONG_M), MOST_FINER)) + 1)
+        extent = lanes.extent(element, s)
+    x, y, heading = plan.at(s)
+    right, left = float(extent.right.min()), float(extent.left.max())
+    step = SHAPE_ACROSS_M if options.lateral == "shape" else ACROSS_M
+    if left - right < ACROSS_M / 2:
+        right, left = right - ACROSS_M / 2, left + ACROSS_M / 2
+    across = int(np.clip(np.ceil((left - right) / step), LEAST_ACROSS, MOST_ACROSS))
+    return Road(
+        part=part,
+        id=name,
+        s=s,
+        t=np.linspace(right, left, across + 1),
+        x=x,
+        y=y,
+        heading=heading,
+        extent=extent,
+        elevation=_old(element, "elevationProfile/elevation"),
+        superelevation=_old(element, "lateralProfile/superelevation"),
+        structures=tuple(_structures(element)),
+    )
+
+
+def _structures(road: ET.Element) -> Iterator[Structure]:
+    kinds: tuple[Literal["bridge", "tunnel"], ...] = ("bridge", "tunnel")
+    for kind in kinds:
+        for each in road.iterfind(f"objects/{kind}"):
+            start, length = numbers(each, "s", "length")
+            yield kind, start, start + length
+
+
+def _old(road: ET.Element, path: str) -> Floats:
+    """Return the pieces of a profile that a road has; readers take 0 before the first one."""
+    pieces = lanes.records(road.findall(path))
+    if not len(pieces):
+        return NONE
+    pieces = pieces[np.argsort(pieces[:, 0], kind="stable")]
+    return pieces if pieces[0, 0] <= 0 else np.vstack([NONE, pieces])
+
+
+def _lifted(road: Road, heights: Heights, options: Options) -> tuple[bytes, Lifted]:
+    """Return the text of a road with heights, and its row."""
+    sections, used, unknown_m = _sections(road, heights)
+    beyond: road_profiles.Beyond = "flat" if options.flat_ends else "keep"
+    tolerance = options.tolerance_m
+    elevation = road_profiles.elevation(sections, road.elevation, beyond, tolerance)
+    across = road_profiles.superelevation(sections, road.superelevation, beyond, tolerance)
+    if elevation is None or across is None:
+        length = float(road.s[-1])
+        return road.part.text, Lifted(road.id, length, length, (), unknown_m)
+    lateral, shapes = None, list[tuple[float, Floats]]()
+    if options.lateral != "none":
+        lateral = opendrive_text.records("superelevation", across)
+    if options.lateral == "shape":
+        shapes = road_profiles.shape(sections, elevation, across, tolerance)
+        lateral = [*(lateral or ()), *opendrive_text.shapes(shapes)]
+    text = opendrive_text.with_profiles(road.part, opendrive_text.records("elevation", elevation), lateral)
+    row = _row(road, sections, used, unknown_m, elevation, across, shapes, options)
+    return text, row
+
+
+def _sections(road: Road, heights: Heights) -> tuple[CrossSections, Numbers, float]:
+    """Return the cross-sections on the road's level, their levels, and the length of unknown ones (m)."""
+    n, m = len(road.s), len(road.t)
+    middle = (road.extent.right + road.extent.left) / 2
+    column = np.abs(road.t - middle[:, None]).argmin(axis=1)
+    line = heights[np.arange(n) * m + column]
+    wanted, joined, unknown_m = np.full(n, ANY), np.zeros(n, np.bool_), 0.0
+    for kind, start, end in road.structures:
+        here = (road.s >= start) & (road.s <= end)
+        side = 1 if kind == "bridge" else -1
+        own = [
+            number
+            for number, z in zip(line.numbers, line.z, strict=True)
+            if number * side > 0 and np.isfinite(z[here]).any()
+        ]
+        if len(own) == 1:
+            wanted[here] = own[0]
+        elif not own:
+            wanted[here] = 0
+            joined |= here & (kind == "tunnel")
+            unknown_m += max(0.0, min(end, float(road.s[-1])) - max(start, 0.0))
+    _, chosen = levels.along(line, wanted)
+    rows = np.searchsorted(np.array(heights.numbers), chosen)
+    of_point = np.concatenate([np.repeat(rows, m), *[rows] * 3])
+    z = heights.z[of_point, np.arange(len(of_point))]
+    on, before, after = z[n * m :].reshape(3, n)
+    grid = z[: n * m].reshape(n, m)
+    sections = road_profiles.cross_sections(road.s, road.t, grid, (on, before, after), road.inside, joined)
+    return sections, chosen[np.isfinite(sections.line)], unknown_m
+
+
+def _row(
+    road: Road,
+    sections: CrossSections,
+    used: Numbers,
+    unknown_m: float,
+    elevation: Floats,
+    across: Floats,
+    shapes: list[tuple[float, Floats]],
+    options: Options,
+) -> Lifted:
+    s, t = road.s, road.t
+    known = np.isfinite(sections.line)
+    seen = sections.inside & known[:, None] & np.isfinite(sections.z)
+    # Lanes that are level have the height of the middle.
+    t_read = np.broadcast_to(road.extent.middle[:, None] if road.extent.level else t, seen.shape)
+
+    def missed(profile: Floats, lateral: Floats, rest: Floats | float = 0.0) -> float:
+        z = value_at(profile, s)[:, None] + t_read * np.tan(value_at(lateral, s))[:, None] + rest
+        return float(np.abs(z - sections.z)[seen].max(initial=0.0))
+
+    lateral = road.superelevation if options.lateral == "none" else across
+    crossfall = np.where(known, np.tan(value_at(across, s)), 0.0)
+    grade = np.where(known, sections.grade, 0.0)
+    gone = ~(known[:-1] & known[1:]) & ~(sections.joined[:-1] | sections.joined[1:])
+    shaped = 0.0 if road.extent.level or not shapes else road_profiles.shape_at(shapes, s, t)
+    return Lifted(
+        id=road.id,
+        length_m=float(s[-1]),
+        without_ground_m=float(np.diff(s)[gone].sum()),
+        levels=tuple(sorted({int(number) for number in used})),
+        unknown_deck_m=unknown_m,
+        before_m=missed(road.elevation, road.superelevation),
+        elevation_m=missed(elevation, NONE),
+        superelevation_m=np.nan if lateral is NONE else missed(elevation, lateral),
+        shape_m=missed(elevation, across, shaped) if shapes else np.nan,
+        grade=float(np.abs(grade).max()),
+        crossfall=float(np.abs(crossfall).max()),
+        steep=(
+            *_steep(road, "grade", grade, options.grade_limit),
+            *_steep(road, "crossfall", crossfall, options.crossfall_limit),
+        ),
+        note=ALL_LEVEL if road.extent.level and options.lateral != "none" else "",
+    )
+
+
+def _steep(
+    road: Road, kind: Literal["grade", "crossfall"], values: Floats, limit: float | None
+) -> Iterator[Steep]:
+    """Yield the steepest place of each stretch that is steeper than a limit."""
+    if limit is None:
+        return
+    start = 0
+    for above, group in groupby((np.abs(values) > limit).tolist()):
+        end = start + len(list(group))
+        if above:
+            at = start + int(np.abs(values[start:end]).argmax())
+            yield Steep(kind, float(abs(values[at])), float(road.x[at]), float(road.y[at]))
+        start = end

@@ -1,0 +1,181 @@
+"""Plan geometry of OpenDRIVE: places and headings on lines, arcs, spirals, cubics and parametric cubics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Floats
+
+CURVED, SPIRAL, CUBIC = range(3)
+"""Kinds of geometry; a line is curved with curvature 0, poly3 and paramPoly3 are cubics."""
+SAME_TURN = 1e-9
+"""A spiral whose curvature times its length changes by less is an arc (radians)."""
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(12)
+ROUNDS = 12
+"""Largest number of steps of Newton's method for the place on a cubic."""
+
+CLOSE_M = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class PlanView:
+    """The ``k`` geometries of a road, one after the other."""
+
+    start: Floats
+    """``(k, 4)``: s, x, y and heading at the start of each."""
+    length: Floats
+    """``(k,)``, m."""
+    kind: NDArray[np.int8]
+    values: Floats
+    """``(k, 9)``: curvature and its change per metre; of cubics the coefficients of u and v by rising power,
+    and the length of the curve for a metre of s."""
+
+    @property
+    def end(self) -> float:
+        """Distance along the road at its end (m)."""
+        return float(self.start[-1, 0] + self.length[-1])
+
+    def at(self, s: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return x, y and heading at distances along the road, ``(n,)`` each.
+
+        Before the start and beyond the end the first and last geometry go on.
+        """
+        number = np.maximum(np.searchsorted(self.start[:, 0], s, side="right") - 1, 0)
+        along = np.asarray(s) - self.start[number, 0]
+        u, v, turn = (np.zeros(len(along)) for _ in range(3))
+        for kind, place in enumerate((_curved, _spiral, _cubic)):
+            here = self.kind[number] == kind
+            if here.any():
+                u[here], v[here], turn[here] = place(along[here], self.values[number[here]])
+        _, x, y, heading = self.start[number].T
+        ahead, left = np.cos(heading), np.sin(heading)
+        return x + u * ahead - v * left, y + u * left + v * ahead, heading + turn
+
+
+def read(road: ET.Element) -> PlanView:
+    """Return the plan of a road.
+
+    Raises
+    ------
+    TaskError
+        If it has none, or an attribute is missing or no number; continues a sentence that begins with the
+        name of the road.
+    """
+    geometries = road.findall("planView/geometry")
+    if not geometries:
+        raise TaskError("has no planView with a geometry")
+    rows = [numbers(each, "s", "x", "y", "hdg", "length") for each in geometries]
+    kinds, values = zip(*map(_kind, geometries), strict=True)
+    table = np.array(rows)
+    plan = PlanView(table[:, :4], table[:, 4], np.array(kinds, np.int8), np.array(values))
+    if (plan.length < 0).any() or (np.diff(plan.start[:, 0]) < 0).any():
+        raise TaskError("has geometries with s that does not ascend")
+    return plan
+
+
+def numbers(element: ET.Element, *names: str, missing: float | None = None) -> list[float]:
+    """Return attributes as numbers.
+
+    Raises
+    ------
+    TaskError
+        If one is missing (without ``missing``), or is no finite number.
+    """
+    found = []
+    for name in names:
+        text = element.get(name)
+        try:
+            value = missing if text is None else float(text)
+        except ValueError:
+            value = math.nan
+        if value is None:
+            raise TaskError(f"has {element.tag} without {name}")
+        if not math.isfinite(value):
+            raise TaskError(f"has {element.tag} with {name} {str(text)[:40]!r}, which is no number")
+        found.append(value)
+    return found
+
+
+def _kind(geometry: ET.Element) -> tuple[int, list[float]]:
+    """Return the kind of a geometry and its values."""
+    for shape in geometry:
+        if shape.tag == "line":
+            return CURVED, [0.0] * 9
+        if shape.tag == "arc":
+            return CURVED, [*numbers(shape, "curvature"), *[0.0] * 8]
+        if shape.tag == "spiral":
+            first, last = numbers(shape, "curvStart", "curvEnd")
+            (length,) = numbers(geometry, "length")
+            if abs(last - first) * length < SAME_TURN:
+                return CURVED, [(first + last) / 2, *[0.0] * 8]
+            return SPIRAL, [first, (last - first) / length, *[0.0] * 7]
+        if shape.tag == "poly3":
+            return CUBIC, [0.0, 1.0, 0.0, 0.0, *numbers(shape, "a", "b", "c", "d"), 1.0]
+        if shape.tag == "paramPoly3":
+            values = np.array(numbers(shape, "aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV"))
+            (length,) = numbers(geometry, "length")
+            if shape.get("pRange", "normalized") != "arcLength":
+                # The parameter is 1 at the end.
+                values = values / np.tile(float(length or 1.0) ** np.arange(4.0), 2)
+            # The curve ends where its parameter does, also if its length is not quite the one in the file.
+            curve = float(_length(np.array([length]), values[None])[0])
+            return CUBIC, [*values.tolist(), curve / length if length > 0 and curve > 0 else 1.0]
+    raise TaskError("has a geometry that is no line, arc, spiral, poly3 or paramPoly3")
+
+
+def _curved(along: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return u, v and heading on arcs; the chord has the mean of the headings at its ends."""
+    turn = values[:, 0] * along
+    chord = along * np.sinc(turn / (2 * np.pi))
+    return chord * np.cos(turn / 2), chord * np.sin(turn / 2), turn
+
+
+def _spiral(along: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return u, v and heading on clothoids, as a part of that which begins with curvature 0."""
+    curvature, change = values[:, 0], values[:, 1]
+    scale = np.sqrt(np.pi / np.abs(change))
+    # The other clothoid has curvature 0 at its own start, and turns to the left.
+    before = curvature / change
+    sine, cosine = scipy.special.fresnel(np.stack([before, before + along]) / scale)
+    side = np.sign(change)
+    across, ahead = scale * side * np.diff(sine, axis=0)[0], scale * np.diff(cosine, axis=0)[0]
+    first = -change * before**2 / 2
+    u = ahead * np.cos(first) - across * np.sin(first)
+    v = ahead * np.sin(first) + across * np.cos(first)
+    return u, v, along * (curvature + change * along / 2)
+
+
+def _cubic(along: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return u, v and heading on parametric cubics, where they have a length from their start."""
+    target = along * values[:, 8]
+    p = along.copy()
+    for _ in range(ROUNDS):
+        by_u, by_v = _derivatives(p, values)
+        step = (_length(p, values) - target) / np.hypot(by_u, by_v)
+        p = p - step
+        if not (np.abs(step) > CLOSE_M).any():
+            break
+    powers = p[:, None] ** np.arange(4)
+    u, v = ((powers * part).sum(axis=1) for part in (values[:, :4], values[:, 4:8]))
+    by_u, by_v = _derivatives(p, values)
+    return u, v, np.arctan2(by_v, by_u)
+
+
+def _length(p: Floats, values: Floats) -> Floats:
+    """Return the length of cubics from parameter 0 to p."""
+    nodes = p[:, None] * (NODES + 1) / 2
+    by_u, by_v = _derivatives(nodes, values[:, None])
+    return np.asarray((np.hypot(by_u, by_v) * WEIGHTS).sum(axis=1) * p / 2)
+
+
+def _derivatives(p: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Return the derivatives of u and v by p."""
+    by_u, by_v = (values[..., k] + p * (2 * values[..., k + 1] + p * 3 * values[..., k + 2]) for k in (1, 5))
+    return by_u, by_v

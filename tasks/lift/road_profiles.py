@@ -1,0 +1,216 @@
+"""Profiles of a road of OpenDRIVE from heights beside its reference line: elevation, superelevation, shape.
+
+The elevation is the surface at the reference line. At both ends of a road it has the height and the grade of
+the surface there, so that roads that meet in plan meet in height. The superelevation is the slope of the
+straight line through it that fits the cross-section best. The shape is what the surface has beside that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Literal
+
+import numpy as np
+
+from flexroad.tasks.lift.profile import AHEAD_M, cubic_pieces, value_at
+from flexroad.tasks.types import Bools, Floats
+
+NONE = np.zeros((1, 5))
+"""A profile without records: it is 0."""
+STEEPEST = 0.5
+"""Largest slope across a road (m/m): where the surface is steeper, a step or the end of a deck is beneath."""
+LEAST_ACROSS_M = 0.25
+"""Points nearer to the reference line do not say how the cross-section falls (m)."""
+BREAK_M = 1e-3
+"""Distance behind the ground at which a profile goes on as it was (m)."""
+
+Beyond = Literal["keep", "flat"]
+
+
+@dataclass(frozen=True, eq=False)
+class CrossSections:
+    """Heights of the surface at n distances along a road."""
+
+    s: Floats
+    """``(n,)``, m, ascending."""
+    t: Floats
+    """``(m,)``: distances from the reference line, ascending, positive to the left (m)."""
+    z: Floats
+    """``(n, m)``, m; NaN where the surface is not."""
+    inside: Bools
+    """``(n, m)``: the points on the lanes."""
+    line: Floats
+    """``(n,)``: heights on the reference line; NaN without a surface."""
+    grade: Floats
+    """``(n,)``: slope of the surface along the reference line."""
+    joined: Bools
+    """``(n,)``: places without ground between which a profile goes on smoothly, as in a tunnel."""
+
+
+def cross_sections(
+    s: Floats, t: Floats, z: Floats, beside: tuple[Floats, Floats, Floats], inside: Bools, joined: Bools
+) -> CrossSections:
+    """Return cross-sections.
+
+    Parameters
+    ----------
+    s, t, z, inside, joined
+        As of `CrossSections`.
+    beside : tuple of ndarray, (n,)
+        Heights on the reference line, and `AHEAD_M` before and after it.
+    """
+    on, before, after = beside
+    used = np.where(inside, z, np.nan)
+    known = np.isfinite(used)
+    # Where the line is beside a deck, the cross-section goes on to it.
+    lost = ~np.isfinite(on) & (known.sum(axis=1) > 1)
+    line = on.copy()
+    for row in np.flatnonzero(lost):
+        slope, at_line = np.polyfit(t[known[row]], used[row, known[row]], 1)
+        line[row] = at_line if abs(slope) < STEEPEST else np.nan
+    line[joined] = np.nan
+    grade = (after - before) / (2 * AHEAD_M)
+    for one_sided in ((after - on) / AHEAD_M, (on - before) / AHEAD_M):
+        grade = np.where(np.isfinite(grade), grade, one_sided)
+    missing = np.isfinite(line) & ~np.isfinite(grade)
+    if missing.any():
+        grade[missing] = np.nan_to_num(np.gradient(line, s))[missing]
+    return CrossSections(s, t, z, inside, line, grade, joined)
+
+
+def elevation(sections: CrossSections, old: Floats, beyond: Beyond, tolerance: float) -> Floats | None:
+    """Return the pieces of the elevation, ``(k, 5)``; None if the road has no ground."""
+    return _profile(sections, sections.line, sections.grade, old, beyond, tolerance)
+
+
+def superelevation(sections: CrossSections, old: Floats, beyond: Beyond, tolerance: float) -> Floats | None:
+    """Return the pieces of the superelevation, ``(k, 5)``, radians; None if the road has no ground."""
+    away = np.where(sections.inside & np.isfinite(sections.z), sections.t, 0.0)
+    weight = (away**2).sum(axis=1)
+    rise = np.where(away != 0, sections.z - sections.line[:, None], 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = (away * rise).sum(axis=1) / weight
+    known = np.isfinite(sections.line)
+    good = known & np.isfinite(slope) & (np.abs(slope) < STEEPEST)
+    good &= np.abs(away).max(axis=1, initial=0.0) >= LEAST_ACROSS_M
+    s = sections.s
+    angle = np.full(len(s), np.nan)
+    if good.any():
+        angle[known] = np.interp(s[known], s[good], np.arctan(slope[good]))
+    elif known.any():
+        angle[known] = 0.0
+    reach = float(np.abs(sections.t).max(initial=1.0))
+    return _profile(sections, angle, _slopes(s, angle), old, beyond, tolerance / max(reach, 1.0))
+
+
+def shape(
+    sections: CrossSections, elevation: Floats, superelevation: Floats, tolerance: float
+) -> list[tuple[float, Floats]]:
+    """Return the shapes of cross-sections: s and the pieces of each, ``(k, 5)``: t, a, b, c, d.
+
+    Between two of them, readers interpolate linearly along the road.
+    """
+    s, t = sections.s, sections.t
+    plane = value_at(elevation, s)[:, None] + t * np.tan(value_at(superelevation, s))[:, None]
+    rest = sections.z - plane
+    for row, known in zip(rest, np.isfinite(rest), strict=True):
+        row[:] = np.interp(t, t[known], row[known]) if known.any() else 0.0
+    rest[~np.isfinite(sections.line)] = 0.0
+    if len(t) < 2:
+        return []
+    rows = _needed_rows(s, rest, tolerance / 2)
+    slopes = np.gradient(rest[rows], t, axis=1)
+    return [
+        (float(s[row]), cubic_pieces(t, rest[row], slope, tolerance / 2))
+        for row, slope in zip(rows, slopes, strict=True)
+    ]
+
+
+def shape_at(shapes: list[tuple[float, Floats]], s: Floats, t: Floats) -> Floats:
+    """Return the heights of shapes at distances s and t, ``(n, m)``, as readers have them."""
+    if not shapes:
+        return np.zeros((len(s), len(t)))
+    table = np.array([value_at(pieces, t) for _, pieces in shapes])
+    starts = np.array([start for start, _ in shapes])
+    at = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, max(len(starts) - 2, 0))
+    after = np.minimum(at + 1, len(starts) - 1)
+    span = starts[after] - starts[at]
+    share = np.clip((s - starts[at]) / np.where(span > 0, span, 1.0), 0.0, 1.0)[:, None]
+    return np.asarray(table[at] * (1 - share) + table[after] * share)
+
+
+def _profile(
+    sections: CrossSections, values: Floats, slopes: Floats, old: Floats, beyond: Beyond, tolerance: float
+) -> Floats | None:
+    """Return pieces along the whole road: of the surface where it is, else by what `beyond` says."""
+    s, known = sections.s, np.isfinite(values)
+    both = known[:-1] & known[1:]
+    if not both.any():
+        return None
+    parts, start = list[Floats](), 0
+    for has, group in groupby(both.tolist()):
+        end = start + len(list(group))
+        if has:
+            here = slice(start, end + 1)
+            parts.append(cubic_pieces(s[here], values[here], slopes[here], tolerance))
+        else:
+            outer = start == 0 or end == len(both)
+            bridged = not outer and (beyond == "flat" or bool(sections.joined[start + 1 : end].all()))
+            if bridged:
+                ends = [start, end]
+                parts.append(cubic_pieces(s[ends], values[ends], slopes[ends], np.inf))
+            elif beyond == "flat":
+                level = values[end if start == 0 else start]
+                parts.append(np.array([[s[start], level, 0.0, 0.0, 0.0]]))
+            else:
+                # The last place with ground still has its height.
+                first = float(s[start]) + (BREAK_M if start else 0.0)
+                parts.append(_part(old, first, float(s[end])))
+        start = end
+    return np.vstack(parts)
+
+
+def _part(pieces: Floats, start: float, end: float) -> Floats:
+    """Return the pieces from one distance to another; the first one begins there."""
+    inner = pieces[(pieces[:, 0] > start) & (pieces[:, 0] < end)]
+    first = pieces[max(int(np.searchsorted(pieces[:, 0], start, side="right")) - 1, 0)]
+    s, a, b, c, d = first
+    x = start - s
+    moved = [start, a + x * (b + x * (c + x * d)), b + x * (2 * c + 3 * d * x), c + 3 * d * x, d]
+    return np.vstack([moved, inner])
+
+
+def _slopes(s: Floats, values: Floats) -> Floats:
+    """Return the derivative of values along each stretch without NaN."""
+    slopes, start = np.zeros(len(s)), 0
+    for known, group in groupby(np.isfinite(values).tolist()):
+        end = start + len(list(group))
+        if known and end - start > 1:
+            slopes[start:end] = np.gradient(values[start:end], s[start:end])
+        start = end
+    return slopes
+
+
+def _needed_rows(s: Floats, rows: Floats, tolerance: float) -> list[int]:
+    """Return the rows between which the others are linear within a tolerance: as few as possible, about."""
+
+    def straight(a: int, b: int) -> bool:
+        share = ((s[a : b + 1] - s[a]) / (s[b] - s[a]))[:, None]
+        missed = rows[a : b + 1] - rows[a] * (1 - share) - rows[b] * share
+        return bool(np.abs(missed).max() <= tolerance)
+
+    chosen, last = [0], len(s) - 1
+    while chosen[-1] < last:
+        start = chosen[-1]
+        fits, beyond, step = start + 1, last + 1, 2
+        while start + step <= last:
+            if not straight(start, start + step):
+                beyond = start + step
+                break
+            fits, step = start + step, 2 * step
+        while beyond - fits > 1:
+            middle = (fits + beyond) // 2
+            fits, beyond = (middle, beyond) if straight(start, middle) else (fits, middle)
+        chosen.append(fits)
+    return chosen
