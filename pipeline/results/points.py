@@ -26,6 +26,9 @@ from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
+AT_ONCE = 50_000
+"""Number of points of which the tiles are looked up together: geometries take much memory."""
+
 
 @dataclass(frozen=True, eq=False)
 class Answer:
@@ -190,7 +193,12 @@ class Ground:
         """Yield the state of each finished tile that has points, with the indices of the points."""
         tiles = self.run.catalog.usable
         tree = STRtree([box(*tile.grid.bounds) for tile in tiles])
-        point, number = tree.query(points(easting, northing), predicate="intersects")
+        found = [np.zeros((2, 0), np.intp)]
+        for at in range(0, len(easting), AT_ONCE):
+            here = slice(at, at + AT_ONCE)
+            pairs = tree.query(points(easting[here], northing[here]), predicate="intersects")
+            found.append(pairs + np.array([[at], [0]]))
+        point, number = np.hstack(found)
         if not point.size:
             return
         order = np.argsort(number, kind="stable")

@@ -128,7 +128,9 @@ def _road(road: Road, left_hand: bool) -> ET.Element:
     if road.structures:
         element.append(_objects(road))
     if road.crg is not None:
-        ET.SubElement(ET.SubElement(element, "surface"), "CRG", _crg(road.line, road.crg, lengths[-1]))
+        ET.SubElement(
+            ET.SubElement(element, "surface"), "CRG", crg_reference(road.line, road.crg, lengths[-1])
+        )
     return element
 
 
@@ -198,7 +200,7 @@ def _linear(line: ReferenceLine, factor: float) -> Iterator[tuple[float, float, 
         yield float(line.s[k]), float(value[k]), float(slope[k])
 
 
-def _crg(line: ReferenceLine, file: str, length: float) -> dict[str, str]:
+def crg_reference(line: ReferenceLine, file: str, length: float) -> dict[str, str]:
     """Return the attributes of a reference to OpenCRG.
 
     In the mode genuine, readers move the start of the file's line to the road's start and turn it by the

@@ -10,8 +10,8 @@ import numpy as np
 from flexroad.tasks.lift.types import Heights, HeightsAt
 from flexroad.tasks.types import Floats
 
-POINTS = 1_000_000
-"""Number of points of a batch: some 200 MB with their heights."""
+POINTS = 500_000
+"""Number of points of a batch: some 200 MB with their heights and what they belong to."""
 
 T = TypeVar("T")
 

@@ -10,12 +10,14 @@ from typing import Literal
 from xml.etree import ElementTree as ET
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexroad.catalog.text import shown
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.lift import lanes, levels, opendrive_text, plan_view, road_profiles, xml_text
 from flexroad.tasks.lift.batches import with_heights
 from flexroad.tasks.lift.levels import ANY, Numbers
+from flexroad.tasks.lift.opendrive_crg import CrgFiles, CrgLine, crg_line
 from flexroad.tasks.lift.plan_view import numbers
 from flexroad.tasks.lift.profile import AHEAD_M, value_at
 from flexroad.tasks.lift.road_profiles import NONE, CrossSections
@@ -59,6 +61,8 @@ class Road:
     """The profile that it had, ``(k, 5)``."""
     superelevation: Floats
     structures: tuple[Structure, ...]
+    crg: CrgLine | None
+    """Where its OpenCRG file has heights; None if it gets none."""
 
     @property
     def inside(self) -> Bools:
@@ -68,13 +72,16 @@ class Road:
         return np.asarray((self.t >= right - half) & (self.t <= left + half))
 
     def places(self) -> tuple[Floats, Floats]:
-        """Return x and y of the points: cross-sections, then the line, then before and after its points."""
+        """Return x and y of the points: cross-sections, the line, before and after its points, OpenCRG."""
         ahead, left = np.cos(self.heading), np.sin(self.heading)
         x = [(self.x[:, None] - self.t * left[:, None]).ravel()]
         y = [(self.y[:, None] + self.t * ahead[:, None]).ravel()]
         for away in (0.0, -AHEAD_M, AHEAD_M):
             x.append(self.x + away * ahead)
             y.append(self.y + away * left)
+        if self.crg is not None:
+            x.append(self.crg.x)
+            y.append(self.crg.y)
         return np.concatenate(x), np.concatenate(y)
 
 
@@ -119,6 +126,7 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
     TaskError
         If the file cannot be read; continues a sentence that begins with its name.
     """
+    crg = CrgFiles(out)
     with xml_text.opened(source) as file, xml_text.written(out) as copy:
         parts = (_read(part, options) for part in xml_text.parts(file, {"road"}))
         for part, found in with_heights(parts, _places, heights):
@@ -129,7 +137,7 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
                 copy.write(part.part.text)
                 yield Lifted(part.id, note=part.note)
             else:
-                text, row = _lifted(part, found, options)
+                text, row = _lifted(part, found, options, crg)
                 copy.write(text)
                 yield row
 
@@ -174,6 +182,7 @@ def _road(part: Part, name: str, options: Options) -> Road:
     if left - right < ACROSS_M / 2:
         right, left = right - ACROSS_M / 2, left + ACROSS_M / 2
     across = int(np.clip(np.ceil((left - right) / step), LEAST_ACROSS, MOST_ACROSS))
+    own_crg = element.find("surface/CRG") is not None
     return Road(
         part=part,
         id=name,
@@ -186,6 +195,7 @@ def _road(part: Part, name: str, options: Options) -> Road:
         elevation=_old(element, "elevationProfile/elevation"),
         superelevation=_old(element, "lateralProfile/superelevation"),
         structures=tuple(_structures(element)),
+        crg=crg_line(plan, length, max(reach, 1.0)) if options.crg and not own_crg else None,
     )
 
 
@@ -206,9 +216,9 @@ def _old(road: ET.Element, path: str) -> Floats:
     return pieces if pieces[0, 0] <= 0 else np.vstack([NONE, pieces])
 
 
-def _lifted(road: Road, heights: Heights, options: Options) -> tuple[bytes, Lifted]:
+def _lifted(road: Road, heights: Heights, options: Options, crg: CrgFiles) -> tuple[bytes, Lifted]:
     """Return the text of a road with heights, and its row."""
-    sections, used, unknown_m = _sections(road, heights)
+    sections, used, unknown_m, rows = _sections(road, heights)
     beyond: road_profiles.Beyond = "flat" if options.flat_ends else "keep"
     tolerance = options.tolerance_m
     elevation = road_profiles.elevation(sections, road.elevation, beyond, tolerance)
@@ -222,13 +232,19 @@ def _lifted(road: Road, heights: Heights, options: Options) -> tuple[bytes, Lift
     if options.lateral == "shape":
         shapes = road_profiles.shape(sections, elevation, across, tolerance)
         lateral = [*(lateral or ()), *opendrive_text.shapes(shapes)]
-    text = opendrive_text.with_profiles(road.part, opendrive_text.records("elevation", elevation), lateral)
+    surface = None
+    if road.crg is not None:
+        z = _on_rows(heights[-len(road.crg.x) :], road.crg.of_points(road.s, rows))
+        surface = crg.write(road.id, road.crg, z, float(road.s[-1]))
+    text = opendrive_text.with_profiles(
+        road.part, opendrive_text.records("elevation", elevation), lateral, surface
+    )
     row = _row(road, sections, used, unknown_m, elevation, across, shapes, options)
     return text, row
 
 
-def _sections(road: Road, heights: Heights) -> tuple[CrossSections, Numbers, float]:
-    """Return the cross-sections on the road's level, their levels, and the length of unknown ones (m)."""
+def _sections(road: Road, heights: Heights) -> tuple[CrossSections, Numbers, float, NDArray[np.intp]]:
+    """Return the cross-sections, their levels, the length of unknown ones (m), their rows of `Heights.z`."""
     n, m = len(road.s), len(road.t)
     middle = (road.extent.right + road.extent.left) / 2
     column = np.abs(road.t - middle[:, None]).argmin(axis=1)
@@ -251,11 +267,16 @@ def _sections(road: Road, heights: Heights) -> tuple[CrossSections, Numbers, flo
     _, chosen = levels.along(line, wanted)
     rows = np.searchsorted(np.array(heights.numbers), chosen)
     of_point = np.concatenate([np.repeat(rows, m), *[rows] * 3])
-    z = heights.z[of_point, np.arange(len(of_point))]
+    z = _on_rows(heights[: len(of_point)], of_point)
     on, before, after = z[n * m :].reshape(3, n)
     grid = z[: n * m].reshape(n, m)
     sections = road_profiles.cross_sections(road.s, road.t, grid, (on, before, after), road.inside, joined)
-    return sections, chosen[np.isfinite(sections.line)], unknown_m
+    return sections, chosen[np.isfinite(sections.line)], unknown_m, rows
+
+
+def _on_rows(heights: Heights, rows: NDArray[np.intp]) -> Floats:
+    """Return the height of each point in its row of `Heights.z`."""
+    return np.asarray(heights.z[rows, np.arange(len(rows))])
 
 
 def _row(
@@ -299,8 +320,15 @@ def _row(
             *_steep(road, "grade", grade, options.grade_limit),
             *_steep(road, "crossfall", crossfall, options.crossfall_limit),
         ),
-        note=ALL_LEVEL if road.extent.level and options.lateral != "none" else "",
+        note="; ".join(_notes(road, options)),
     )
+
+
+def _notes(road: Road, options: Options) -> Iterator[str]:
+    if road.extent.level and options.lateral != "none":
+        yield ALL_LEVEL
+    if options.crg and road.crg is None:
+        yield "has no OpenCRG file of the surface: it has one of its own, is too short, or bends too much"
 
 
 def _steep(

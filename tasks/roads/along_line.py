@@ -53,13 +53,18 @@ def height_grid(
     margin_m : float
         Width beside the carriageway, on either side (m).
     """
+    v = across(line, v_increment_m, margin_m)
+    return HeightGrid(line, v, without_gaps(v, height(*line.beside(v))))
+
+
+def across(line: ReferenceLine, v_increment_m: float = 0.25, margin_m: float = 1.0) -> Floats:
+    """Return the distances from a line at which `height_grid` has heights."""
     step = v_increment_m
     right, left = line.reach(float(line.width.max()) / 2 + margin_m)
-    v = np.arange(-round(right // step), round(left // step) + 1, dtype=np.float64) * step
-    return HeightGrid(line, v, _without_gaps(v, height(*line.beside(v))))
+    return np.arange(-round(right // step), round(left // step) + 1, dtype=np.float64) * step
 
 
-def _without_gaps(v: Floats, heights: Floats) -> Floats:
+def without_gaps(v: Floats, heights: Floats) -> Floats:
     """Return the heights that reach from the line without a gap: readers of OpenCRG refuse gaps in a row."""
     middle, known = int(np.argmin(np.abs(v))), np.isfinite(heights)
     right = np.logical_and.accumulate(known[:, middle::-1], axis=1)[:, ::-1]

@@ -11,6 +11,7 @@ from flexroad.tasks.lift import opendrive, plan_view
 from flexroad.tasks.lift.lanes import extent
 from flexroad.tasks.lift.types import Frame, Heights, Lifted, Options
 from tests.read_opendrive import place, polynomial
+from tests.tasks.export import test_opencrg as opencrg
 
 LEVEL = 'level="false"'
 LANES = """<lanes>
@@ -394,3 +395,38 @@ def test_places_above_limits_are_the_steepest_of_their_stretch(tmp_path):
     assert grades[0].y == pytest.approx(20)
     # 0.02 + 0.03 cos(x / 20) is 0.046 at most here.
     assert [each.kind for each in row.steep] == ["grade"]
+
+
+@pytest.mark.parametrize(("plan", "surface"), [(LINE, crowned), (ARC, cone)])
+def test_opencrg_has_the_surface_itself(tmp_path, plan, surface):
+    source = write(tmp_path, road(plan), road(plan, name="8", more="<surface/>"))
+    root, (row, again) = lifted(source, surface, crg=True)
+    assert row.note == again.note == ""
+    for element in root.findall("road"):
+        (crg,) = element.findall("surface/CRG")
+        path = tmp_path / crg.get("file")
+        assert path.parent.name == "out_crg"
+        values, _, rows = opencrg.read(path.read_bytes())
+        # The file's line starts at the road's start, with its heading there and hOffset.
+        x, y, heading = (float(value[0]) for value in plan_view.read(element).at(np.zeros(1)))
+        assert values["REFERENCE_LINE_START_X"] == pytest.approx(x)
+        assert values["REFERENCE_LINE_START_Y"] == pytest.approx(y)
+        assert rows[1, 0] == pytest.approx(heading + float(crg.get("hOffset")), abs=1e-6)
+        line = opencrg.positions(values, rows)
+        assert len(line) == 121
+        v = np.linspace(values["LONG_SECTION_V_RIGHT"], values["LONG_SECTION_V_LEFT"], rows.shape[1] - 1)
+        assert v[0] <= -3.5
+        assert v[-1] >= 3.5
+        along = line[2:] - line[:-2]
+        left = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
+        places = line[1:-1, None] + v[None, :, None] * left[:, None]
+        z = values["REFERENCE_LINE_START_Z"] + rows[1:-1, 1:]
+        assert np.abs(z - surface(places[..., 0], places[..., 1])).max() < 1e-3
+
+
+def test_a_road_with_opencrg_of_its_own_keeps_it(tmp_path):
+    own = '<surface><CRG file="a.crg" sStart="0" sEnd="60" orientation="same" mode="attached"/></surface>'
+    root, (row,) = lifted(write(tmp_path, road(more=own)), plane, crg=True)
+    assert [each.get("file") for each in root.iter("CRG")] == ["a.crg"]
+    assert "has one of its own" in row.note
+    assert not (tmp_path / "out_crg").exists()
