@@ -10,9 +10,10 @@ from __future__ import annotations
 import errno
 import math
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,10 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.export import cog
-from flexroad.tasks.levels.seen import top_mask
-from flexroad.tasks.quality.support import top_support
+from flexroad.tasks.levels.seen import top_mask, with_approaches
+from flexroad.tasks.quality.support import Support, top_support
 from flexroad.tasks.spline.levelled import LevelledSurface, top_of
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats, Surface
 
 rasterio = lazy("rasterio")
 
@@ -86,8 +87,8 @@ LAYERS = (
 
 def write_mosaics(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
-) -> None:
-    """Write one raster per quantity over all tiles.
+) -> dict[str, Any] | None:
+    """Write one raster per quantity over all tiles; with a level, return it for the manifest.
 
     Raises
     ------
@@ -97,18 +98,24 @@ def write_mosaics(
         If a file cannot be written.
     """
     grid = whole_grid([tile.grid for tile in source.tiles], options.resolution_m)
+    level, number = options.level, 0
     with _drafts(folder) as drafts:
         limits = {"GDAL_CACHEMAX": CACHE_BYTES, "CPL_TMPDIR": str(drafts)}
         with _gdal(folder, **limits), ExitStack() as opened:
             rasters = [opened.enter_context(_draft(drafts, layer, grid, source)) for layer in LAYERS]
             for tile in tiles:
-                _add(rasters, grid, tile)
+                if shown := _shown(tile, level):
+                    _add(rasters, grid, tile, shown)
+                    number += 1
         for layer in LAYERS:
             target = folder / f"{layer.name}.tif"
             with atomic_file(target) as local, _gdal(target, **limits):
                 _finish(drafts / layer.name, local, layer)
             if style := cog.encode_style(layer.bands[0]) if len(layer.bands) == 1 else b"":
                 write(folder / f"{layer.name}{cog.NAME_STYLE}", style)
+    if level is None:
+        return None
+    return {"level": level} | ({} if number else {"notes": [f"no tile has a road of level {level}"]})
 
 
 @contextmanager
@@ -190,15 +197,48 @@ def _draft(folder: Path, layer: _Layer, grid: Grid, source: Source) -> Any:
     return raster
 
 
-def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile) -> None:
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """What the rasters show of a tile."""
+
+    surface: Surface
+    kept: Bools
+    """Filtered road cells, on the grid of the tile's road mask."""
+    support: NDArray[np.uint8]
+    covers: Callable[[Floats, Floats], Bools] | None = None
+    """Returns which points lie on the decks or tubes of the level; None if it is everywhere."""
+
+
+def _shown(tile: FinishedTile, level: int | None) -> _Shown | None:
+    """Return what is shown of a level, or of the highest one if it is None; None if the tile lacks it."""
+    surface, clusters, quality = tile.surface, tile.clusters, tile.quality
+    if not isinstance(surface, LevelledSurface):
+        return None if level else _Shown(surface, clusters.mask, quality.support)
+    if level is None:
+        core = tile.tile.grid
+        top = surface.top(*np.meshgrid(core.eastings, core.northings))
+        return _Shown(top_of(surface), top_mask(clusters), top_support(quality, top))
+    if level == 0:
+        return _Shown(surface, with_approaches(clusters).mask, quality.support)
+    if level not in surface.numbers:
+        return None
+    (own,) = (own for own in clusters.levels if own.number == level)
+    support = dict(quality.levels)[level].support
+    return _Shown(surface.at(level), own.mask, support, partial(surface.covers, level))
+
+
+def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile, shown: _Shown) -> None:
     """Write the cells of a tile into the drafts."""
-    surface, road, core = top_of(tile.surface), tile.road, tile.tile.grid
-    kept, support = top_mask(tile.clusters), tile.quality.support
-    if isinstance(tile.surface, LevelledSurface):
-        support = top_support(tile.quality, tile.surface.top(*np.meshgrid(core.eastings, core.northings)))
+    surface, road, core = shown.surface, tile.road, tile.tile.grid
     for part, column, line in _parts(grid, core.bounds):
         eastings, northings = part.eastings, part.northings
         outside = road.outside[_cells(road.grid, eastings, northings)]
+        is_road = shown.kept[_cells(road.grid, eastings, northings)].astype(np.uint8)
+        support = shown.support[_cells(core, eastings, northings)]
+        if shown.covers:
+            beyond = ~shown.covers(*np.meshgrid(eastings, northings))
+            outside, is_road = outside | beyond, np.where(beyond, NO_ROAD, is_road)
+            support = np.where(beyond, Support.NONE, support)
         heights = surface.lattice(eastings, northings)
         heights[outside] = np.nan
         normals = encoded_normals(surface.normal(eastings[None, :], northings[:, None]))
@@ -206,8 +246,8 @@ def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile) -> None:
         values: tuple[NDArray[Any], ...] = (
             heights.astype(np.float32)[None],
             normals,
-            kept[_cells(road.grid, eastings, northings)].astype(np.uint8)[None],
-            support[_cells(core, eastings, northings)][None],
+            is_road.astype(np.uint8)[None],
+            support.astype(np.uint8)[None],
         )
         window = rasterio.windows.Window(column, line, part.width, part.height)
         for raster, new in zip(rasters, values, strict=True):

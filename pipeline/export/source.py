@@ -56,6 +56,10 @@ class Options:
         None, OUTPUTS, "Cell size of mosaic and pmtiles; default: that of the run.", "METRES", min=0.01
     )
     """Cell size of rasters over the run (m)."""
+    level: int | None = option(
+        None, OUTPUTS, "Level of mosaic: 0 is the ground, also below decks; default: the highest.", "N"
+    )
+    """Level of roads above roads."""
     drape: bool = option(False, OUTPUTS, "Put the orthophoto on the meshes of 3dtiles and obj.")
     """Also if the meshes of the run have none."""
     roads: str | None = option(

@@ -357,8 +357,8 @@ class RunView:
         Returns
         -------
         xarray.Dataset, (y, x)
-            ``dsm``, ``dtm``, ``surface`` (m), ``road``, ``road_filtered`` and, where the catalog has them,
-            ``reference`` (m) and ``reference_road``.
+            ``dsm``, ``dtm``, ``surface`` (m; with levels, that of level 0), ``road``, ``road_filtered`` and,
+            where the catalog has them, ``reference`` (m) and ``reference_road``.
 
         Raises
         ------

@@ -283,6 +283,30 @@ def test_exports_of_heights_have_the_highest_level(run, cells, tmp_path):
         assert file.read(1)[deck].mean() > 0.5
 
 
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_mosaic_of_a_level_has_its_heights_alone(run, cells, level, tmp_path):
+    x, y, *_ = cells
+    view = flexroad.open_run(run.path)
+    said = call("export", run.path, "--format", "mosaic", "-o", tmp_path, "--level", level).expected(0)
+    assert ("no tile has a road of level 2" in said.err) == (level == 2)
+    entry = json.loads((tmp_path / "export.json").read_bytes())["formats"]["mosaic"]
+    assert entry["level"] == level
+    expected = view.height(x, y, level)
+    known = np.isfinite(expected)
+    assert known.any() == (level < 2)
+    with rasterio.open(tmp_path / "mosaic" / "height.tif") as file:
+        np.testing.assert_allclose(file.read(1), expected, atol=1e-3)
+    with rasterio.open(tmp_path / "mosaic" / "road.tif") as file:
+        road = file.read(1)
+    assert ((road == 255) == ~known).all()
+    with rasterio.open(tmp_path / "mosaic" / "support.tif") as file:
+        assert ((file.read(1) == Support.NONE) == ~known).all()
+    with rasterio.open(tmp_path / "mosaic" / "normal.tif") as file:
+        assert ((file.read(3) == -32768) == ~known).all()
+    if level == 1:
+        assert (road[known] == 1).mean() > 0.5
+
+
 def test_smooth_formats_say_that_they_have_level_0(run, tmp_path):
     call("export", run.path, "--format", "step", "-o", tmp_path).expected(0)
     rows = json.loads((tmp_path / "export.json").read_bytes())
