@@ -73,7 +73,8 @@ def lift(
     columns: Annotated[
         bool,
         typer.Option(
-            "--columns", help="Add the columns grade_max, crossfall_max and error_estimate_m to features."
+            "--columns",
+            help="Add the columns grade_max_percent, crossfall_max_percent and error_estimate_m to features.",
         ),
     ] = False,
     report: Annotated[
@@ -111,7 +112,7 @@ def lift(
     """Write a road network or features with heights of a run.
 
     FILE is OpenDRIVE (.xodr), a network of SUMO (.net.xml), OSM or Lanelet2 (.osm), or a vector file
-    (GeoPackage, GeoJSON, FlatGeobuf, Shapefile, DXF). All else in it stays as it is.
+    (GeoPackage, GeoJSON, FlatGeobuf, Shapefile). All else in it stays as it is.
     """
     if report is None and (grade_limit is not None or crossfall_limit is not None):
         raise ConfigError("places above limits are written beside the report; give --report FILE.csv")

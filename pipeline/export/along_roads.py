@@ -19,7 +19,7 @@ from flexroad.catalog.storage.paths import Location, read, stat, write
 from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export.ground import SMOOTH, Ground, GroundTile, steps_left_out
+from flexroad.pipeline.export.ground import SMOOTH, Ground, steps_left_out
 from flexroad.pipeline.export.network import Network, network
 from flexroad.pipeline.export.pieces import (
     MARKERS,
@@ -30,7 +30,7 @@ from flexroad.pipeline.export.pieces import (
     write_whole,
 )
 from flexroad.pipeline.export.source import Options, Source
-from flexroad.pipeline.run.finished import FinishedTile
+from flexroad.pipeline.run.finished import FinishedTile, GroundTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import opencrg, opendrive
 from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures

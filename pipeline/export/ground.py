@@ -7,23 +7,22 @@ beside roads. `Ground.step` and the texts here say by how much that differs from
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, Grid
-from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.finished import FinishedTile
+from flexroad.pipeline.run.finished import GroundTile, estimate
 from flexroad.tasks.levels.along_route import PlaceLevels
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Surface
 
-SURFACES, ESTIMATES = 128, 32
-"""Numbers of tiles of which a process keeps surface (some 0.4 MB each) and error estimates (0.6 MB)."""
+SURFACES = 128
+"""Number of tiles of which a process keeps the surface (some 0.4 MB each)."""
 SMOOTH = "the surface without kerbs and walls"
 STEPS_SHOWN_M = 0.01
 """Height of steps that are left out from which the user is told (m)."""
@@ -34,30 +33,6 @@ def steps_left_out(steps_m: float | None) -> str:
     if steps_m is None or steps_m < STEPS_SHOWN_M:
         return ""
     return f"; with kerbs and walls it differs by up to {steps_m:.2f} m, where the run has no road"
-
-
-@dataclass(frozen=True)
-class GroundTile:
-    """A finished tile by the name of its assessment, which depends on its surface and on its input."""
-
-    id: str
-    name: str
-    tile: FinishedTile = field(compare=False, repr=False)
-
-    @classmethod
-    def of(cls, tile: FinishedTile) -> GroundTile:
-        """Return that of a tile."""
-        return cls(tile.id, tile.snapshot.nodes["assess"], tile)
-
-    @property
-    def grid(self) -> Grid:
-        """The cells of the tile."""
-        return self.tile.tile.grid
-
-    @property
-    def unread(self) -> FinishedTile:
-        """The tile without the results that were read, which would stay in memory with it."""
-        return replace(self.tile)
 
 
 @dataclass(frozen=True)
@@ -122,10 +97,10 @@ class Ground:
             within = (support == 0) & _within(tile.grid.bounds, easting, northing)
             for number in np.unique(numbers[within]).tolist():
                 here = within & (numbers == number)
-                estimate = _estimate(tile, number)
-                if estimate is not None:
+                estimates = estimate(tile, number)
+                if estimates is not None:
                     cells = tile.grid.cells(easting[here], northing[here])
-                    error[here], support[here] = (values[cells] for values in estimate)
+                    error[here], support[here] = (values[cells] for values in estimates)
         return error, support
 
 
@@ -187,13 +162,3 @@ def _patch(tile: GroundTile) -> _Patch:
     finished = tile.unread
     road = finished.road
     return _Patch(tile.grid, finished.surface, road.outside[road.grid.window(road.core)])
-
-
-@lru_cache(maxsize=ESTIMATES)
-def _estimate(tile: GroundTile, number: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]] | None:
-    """Return the estimates and the support of a level; None if the tile's input cannot be read any more."""
-    try:
-        error, support = tile.unread.level_errors(number)
-    except ConfigError:
-        return None
-    return error.astype(np.float32), support

@@ -5,19 +5,24 @@ from __future__ import annotations
 import csv
 import io
 import math
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
+from flexroad.catalog import Bounds
 from flexroad.catalog.crs import in_plan, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.refused import Refused, head
+from flexroad.catalog.headers.source_files import SHAPEFILE_PARTS, SQLITE_PARTS
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import made_folder, output_file
 from flexroad.catalog.storage.paths import write
@@ -28,7 +33,7 @@ from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.results.query import required_crs
 from flexroad.pipeline.results.query_files import to_crs
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.lift import opendrive, osm, xml_text
+from flexroad.tasks.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, xml_text
 from flexroad.tasks.lift.types import Frame, Heights, Lifted, Options
 from flexroad.tasks.types import Floats
 
@@ -39,7 +44,9 @@ else:
 
 XML_FORMATS: dict[str, ModuleType] = {"OpenDRIVE": opendrive, "osm": osm}
 """Formats by the name of the outermost element."""
-KINDS = "OpenDRIVE (.xodr) or an OSM file (.osm)"
+VECTORS: tuple[ModuleType, ...] = (geopackage, geojson, flatgeobuf, shapefile)
+"""Formats of features; each has its ``SUFFIXES``, and ``begins`` tells it by the first bytes of a file."""
+KINDS = "OpenDRIVE (.xodr), OSM (.osm), a GeoPackage, GeoJSON, FlatGeobuf or Shapefile"
 PLACES = ".gpkg"
 """Places above limits are in a file beside the report, of the same name with this suffix."""
 
@@ -63,15 +70,22 @@ class LiftedFile:
     @property
     def notes(self) -> tuple[str, ...]:
         """Lines for the user: what has no heights of the run, and why."""
-        without = [row for row in self.rows if row.without_ground_m > 0]
+        without = [row for row in self.rows if row.without_ground_m > 0 or row.points_without_ground]
         unknown = [row for row in self.rows if row.unknown_deck_m > 0]
         notes = []
         if without:
             length = sum(row.without_ground_m for row in without)
+            points = sum(row.points_without_ground for row in without)
+            parts = [f"{length:.1f} m"] if length else []
+            parts += [count(points, "point")] if points else []
             notes.append(
-                f"{length:.1f} m of {count(len(without), 'feature')} lie beyond the finished tiles and keep "
-                f"their heights ({without[0].id}{' and others' if len(without) > 1 else ''})"
+                f"{' and '.join(parts)} of {count(len(without), 'feature')} lie beyond the finished tiles "
+                f"and keep their heights ({without[0].id}{' and others' if len(without) > 1 else ''})"
             )
+        notes += [
+            f"{count(len(ids), 'feature')}: {note} ({ids[0]}{' and others' if len(ids) > 1 else ''})"
+            for note, ids in self._by_note.items()
+        ]
         if unknown:
             length = sum(row.unknown_deck_m for row in unknown)
             notes.append(
@@ -80,6 +94,15 @@ class LiftedFile:
                 "a run with segment.levels=true has its level"
             )
         return tuple(notes)
+
+    @property
+    def _by_note(self) -> dict[str, list[str]]:
+        """The features by what is noted of them."""
+        found = dict[str, list[str]]()
+        for row in self.rows:
+            if row.note:
+                found.setdefault(row.note, []).append(row.id)
+        return found
 
 
 def lift(
@@ -115,36 +138,67 @@ def lift(
     _require_outputs(source, out, report)
     with _explained(source):
         module = _format(source)
+        _require_suffix(module, source, out)
         named = module.frame(source)
         place = replace(named, crs=crs or named.crs)
         if offset is not None:
             place = Frame(place.crs, *offset)
         if place.crs is None:
             raise TaskError("carries no CRS; give it with --crs, such as --crs EPSG:25832")
-        in_run = _InRun(ground, _plan(place.crs), place, required_crs(ground), module.STEPS)
+        in_run = _InRun(
+            ground, _plan(place.crs), place, required_crs(ground), module.STEPS, crs is not None, _Seen()
+        )
         with made_folder(out.absolute().parent), ScratchFolder(out.absolute().parent) as scratch:
-            rows = tuple(module.lift(source, Path(scratch, out.name), in_run.heights, options))
+            rows = tuple(module.lift(source, Path(scratch, out.name), in_run, options))
             in_run.require_heights()
             files = _move(Path(scratch), out)
+            _remove_parts(out, files)
     if report is not None:
         files += _write_report(rows, report, in_run)
-    return LiftedFile(rows, files, len(in_run.earlier))
+    return LiftedFile(rows, files, len(in_run.seen.earlier))
 
 
 @dataclass(eq=False)
+class _Seen:
+    """What has been looked up in a run for a file."""
+
+    known: int = 0
+    """Number of points with a height."""
+    bounds: Floats = field(default_factory=lambda: np.array([np.inf, np.inf, -np.inf, -np.inf]))
+    """Of all points, in the CRS of the run."""
+    earlier: set[str] = field(default_factory=set)
+
+
+@dataclass(frozen=True, eq=False)
 class _InRun:
-    """Heights of a run at coordinates of a file."""
+    """The surface of a run at coordinates of a file (`RunSurface`)."""
 
     ground: Ground
     crs: str
     place: Frame
     run_crs: str
     steps: bool
+    given: bool
+    """Whether the user gave the CRS."""
+    seen: _Seen
 
-    def __post_init__(self) -> None:
-        self.known = 0
-        self.bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
-        self.earlier: set[str] = set()
+    def in_crs(self, crs: str | None, layer: str) -> _InRun:
+        """Return the surface for a layer with its own CRS; a CRS that the user gave goes first."""
+        if self.given:
+            return self
+        if crs is None:
+            raise TaskError(
+                f"has the layer {layer} without a CRS; give it with --crs, such as --crs EPSG:25832"
+            )
+        return replace(self, crs=_plan(crs))
+
+    @cached_property
+    def bounds(self) -> Bounds:
+        """West, south, east and north of the tiles of the run (m, in its CRS)."""
+        tiles = np.array([tile.grid.bounds for tile in self.ground.run.catalog.usable])
+        west, south = tiles[:, :2].min(axis=0).tolist()
+        east, north = tiles[:, 2:].max(axis=0).tolist()
+        return west, south, east, north
 
     def to_run(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Return easting and northing (m) in the CRS of the run."""
@@ -154,31 +208,37 @@ class _InRun:
             east, north = x * ahead - y * left + place.x, x * left + y * ahead + place.y
         return to_crs(east, north, self.crs, self.run_crs)
 
-    def heights(self, x: Floats, y: Floats) -> Heights:
-        """Return heights of all levels; NaN without a surface."""
-        easting, northing = self.to_run(x, y)
+    def __call__(self, x: Floats, y: Floats) -> Heights:
+        """Return heights of all levels at coordinates of the file; NaN without a surface."""
+        return self.at(*self.to_run(x, y))
+
+    def at(self, easting: Floats, northing: Floats) -> Heights:
+        """Return heights of all levels at points in the CRS of the run."""
         found, earlier = self.ground.heights(easting, northing, self.steps)
         found = replace(found, z=found.z - self.place.z)
-        self.earlier.update(earlier)
-        self.known += int(np.isfinite(found.z).any(axis=0).sum())
+        seen = self.seen
+        seen.earlier.update(earlier)
+        seen.known += int(np.isfinite(found.z).any(axis=0).sum())
         inside = np.isfinite(easting) & np.isfinite(northing)
         if inside.any():
             part = np.array([[values.min(), values.max()] for values in (easting[inside], northing[inside])])
-            self.bounds[:2] = np.minimum(self.bounds[:2], part[:, 0])
-            self.bounds[2:] = np.maximum(self.bounds[2:], part[:, 1])
+            seen.bounds[:2] = np.minimum(seen.bounds[:2], part[:, 0])
+            seen.bounds[2:] = np.maximum(seen.bounds[2:], part[:, 1])
         return found
+
+    def errors(self, easting: Floats, northing: Floats, numbers: NDArray[np.int8]) -> Floats:
+        """Return the estimated errors (m) at points on levels, in the CRS of the run."""
+        return self.ground.errors(easting, northing, numbers)
 
     def require_heights(self) -> None:
         """Raise an error if no point has had a height."""
-        if self.known:
+        if self.seen.known:
             return
-        if not np.isfinite(self.bounds).all():
+        if not np.isfinite(self.seen.bounds).all():
             raise TaskError("has no road or feature with coordinates")
-        tiles = np.array([tile.grid.bounds for tile in self.ground.run.catalog.usable])
-        of_tiles = [*tiles[:, :2].min(axis=0), *tiles[:, 2:].max(axis=0)]
         raise TaskError(
-            f"does not lie on the finished tiles: it lies in {_box(self.bounds)}, they in "
-            f"{_box(of_tiles)} ({short(self.run_crs)}); correct its CRS with --crs and --offset"
+            f"does not lie on the finished tiles: it lies in {_box(self.seen.bounds)}, they in "
+            f"{_box(self.bounds)} ({short(self.run_crs)}); correct its CRS with --crs and --offset"
         )
 
 
@@ -195,7 +255,28 @@ def _format(source: Path) -> ModuleType:
         if name in XML_FORMATS:
             return XML_FORMATS[name]
         raise TaskError(f"has the root element {name or 'none'}; give {KINDS}")
+    for module in VECTORS:
+        if module.begins(head(source)):
+            return module
     raise TaskError(f"is of no known format; give {KINDS}")
+
+
+def _require_suffix(module: ModuleType, source: Path, out: Path) -> None:
+    """Raise an error if a copy of features is to be of another format, or is open in another program."""
+    if module not in VECTORS:
+        return
+    if out.suffix.lower() not in module.SUFFIXES:
+        own = module.SUFFIXES[0]
+        raise ConfigError(
+            f"-o {out}: is of another format than {source}; write {out.stem}{own}, then "
+            f"ogr2ogr {shlex.quote(out.name)} {shlex.quote(out.stem + own)}"
+        )
+    for end in SQLITE_PARTS if module is geopackage else ():
+        part = out.with_name(out.name + end)
+        if part.exists():
+            raise ConfigError(
+                f"-o {out}: is open in another program, as {part.name} is there; close it there"
+            )
 
 
 def _plan(crs: str) -> str:
@@ -241,6 +322,15 @@ def _move(scratch: Path, out: Path) -> tuple[Path, ...]:
     return tuple(files)
 
 
+def _remove_parts(out: Path, files: Sequence[Path]) -> None:
+    """Remove the parts of a Shapefile that has been replaced, of which the new one has none: old indices."""
+    if out.suffix.lower() == shapefile.SUFFIXES[0]:
+        for end in SHAPEFILE_PARTS:
+            part = out.with_suffix(end)
+            if part not in files and part.is_file():
+                part.unlink()
+
+
 def _write_report(rows: Sequence[Lifted], report: Path, in_run: _InRun) -> tuple[Path, ...]:
     """Write the table, and the places above limits if there are any; return the files."""
     text = io.StringIO(newline="")
@@ -281,8 +371,10 @@ def _row(row: Lifted) -> dict[str, str | int | float]:
         "shape_max_mm": (row.shape_m, 1000, 1),
         "grade_max_percent": (row.grade, 100, 3),
         "crossfall_max_percent": (row.crossfall, 100, 3),
+        "error_estimate_mm": (row.error_m, 1000, 1),
     }
     values: dict[str, str | int | float] = {"id": row.id, "levels": " ".join(map(str, row.levels))}
+    values["points_without_ground"] = row.points_without_ground
     for name, (value, factor, digits) in figures.items():
         values[name] = round(value * factor, digits) if np.isfinite(value) else ""
     return {**values, "note": row.note}

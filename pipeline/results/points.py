@@ -18,7 +18,13 @@ from shapely import STRtree, box, points
 
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.finished import FinishedTile, RunPlace, open_variant
+from flexroad.pipeline.run.finished import (
+    FinishedTile,
+    GroundTile,
+    RunPlace,
+    estimate,
+    open_variant,
+)
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, peek_statuses
 from flexroad.tasks.lift.types import Heights
@@ -166,6 +172,24 @@ class Ground:
                     row[here[on]] = surface.at(own.level.number).height(east[on], north[on])
         numbers = tuple(sorted(rows))
         return Heights(numbers, np.stack([rows[number] for number in numbers])), tuple(earlier)
+
+    def errors(self, easting: Floats, northing: Floats, numbers: NDArray[np.int8]) -> Floats:
+        """Return the estimated errors (m) of the surface at n points on given levels.
+
+        They are those of the cell at each point. NaN off the finished tiles, and where the sources of a tile
+        have changed or are gone.
+        """
+        error = np.full(easting.shape, np.nan)
+        for status, selected in self._owners(easting, northing):
+            if not status.done:
+                continue
+            tile = GroundTile.of(FinishedTile.of(self.run, status, self.variant))
+            for number in np.unique(numbers[selected]).tolist():
+                here = selected[numbers[selected] == number]
+                estimates = estimate(tile, number)
+                if estimates is not None:
+                    error[here] = estimates[0][tile.grid.cells(easting[here], northing[here])]
+        return error
 
     def on_every_level(self, easting: Floats, northing: Floats) -> tuple[NDArray[np.intp], Answer]:
         """Return what `at` returns for all levels of each point, and the number of the point of each row.

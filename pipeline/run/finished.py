@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.catalog import Tile
+from flexroad.catalog import Grid, Tile
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.storage.paths import Location, parse_location, read, stat
@@ -44,6 +44,8 @@ from flexroad.tasks.types import (
     TileData,
 )
 
+ESTIMATES = 32
+"""Number of tiles of which a process keeps the error estimates (0.6 MB each)."""
 COMPUTED_AGAIN = "it was computed again while it was exported; export again"
 
 
@@ -346,3 +348,37 @@ class FinishedTile:
             return self._evaluator(name)
         except StageError as error:
             raise ConfigError(f"{self.label}: {error}") from error
+
+
+@dataclass(frozen=True)
+class GroundTile:
+    """A finished tile by the name of its assessment, which depends on its surface and on its input."""
+
+    id: str
+    name: str
+    tile: FinishedTile = field(compare=False, repr=False)
+
+    @classmethod
+    def of(cls, tile: FinishedTile) -> GroundTile:
+        """Return that of a tile."""
+        return cls(tile.id, tile.snapshot.nodes["assess"], tile)
+
+    @property
+    def grid(self) -> Grid:
+        """The cells of the tile."""
+        return self.tile.tile.grid
+
+    @property
+    def unread(self) -> FinishedTile:
+        """The tile without the results that were read, which would stay in memory with it."""
+        return replace(self.tile)
+
+
+@lru_cache(maxsize=ESTIMATES)
+def estimate(tile: GroundTile, number: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]] | None:
+    """Return `FinishedTile.level_errors`; None if the tile's input cannot be read any more."""
+    try:
+        error, support = tile.unread.level_errors(number)
+    except ConfigError:
+        return None
+    return error.astype(np.float32), support

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,29 @@ HeightsAt = Callable[[Floats, Floats], Heights]
 """Heights at x and y, ``(n,)`` each, in the coordinates of the file."""
 
 
+class RunSurface(Protocol):
+    """The surface of a run for a file, or for a layer of a file with several."""
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east and north of the tiles of the run (m, in its CRS)."""
+
+    def __call__(self, x: Floats, y: Floats) -> Heights:
+        """Return the heights at coordinates of the file."""
+
+    def to_run(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Return easting and northing (m) in the CRS of the run."""
+
+    def at(self, easting: Floats, northing: Floats) -> Heights:
+        """Return the heights at points in the CRS of the run."""
+
+    def errors(self, easting: Floats, northing: Floats, numbers: NDArray[np.int8]) -> Floats:
+        """Return the estimated errors (m) at points on levels; NaN where they are not known."""
+
+    def in_crs(self, crs: str | None, layer: str) -> RunSurface:
+        """Return the surface for a layer with its own CRS; a CRS that the user gave goes first."""
+
+
 @dataclass(frozen=True)
 class Frame:
     """Where the coordinates of a file are: turned, then added to ``x``, ``y`` and ``z``, those of a CRS."""
@@ -65,14 +88,15 @@ class Options:
     """Whether lines get vertices where they leave the surface by more than the tolerance; None: as the format
     does by default."""
     columns: bool = False
-    """Whether features get the columns ``grade_max``, ``crossfall_max`` and ``error_estimate_m``."""
+    """Whether features get the columns ``grade_max_percent``, ``crossfall_max_percent`` and
+    ``error_estimate_m``."""
     grade_limit: float | None = None
     """Places with a steeper grade are listed (m/m)."""
     crossfall_limit: float | None = None
     """Places with a steeper crossfall are listed (m/m)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Steep:
     """A place above a limit."""
 
@@ -84,7 +108,7 @@ class Steep:
     y: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Lifted:
     """One road or feature of a file: a row of the report. Lengths and heights in m, grades in m/m.
 
@@ -111,5 +135,13 @@ class Lifted:
     """Largest grade."""
     crossfall: float = np.nan
     """Largest crossfall."""
+    error_m: float = np.nan
+    """Largest estimated error of the surface."""
     steep: tuple[Steep, ...] = ()
     note: str = ""
+    points_without_ground: int = 0
+    """Number of points where the run has no surface."""
+
+    def noted(self, note: str) -> Lifted:
+        """Return the row with a note."""
+        return replace(self, note=note)

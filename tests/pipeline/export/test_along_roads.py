@@ -18,6 +18,7 @@ from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.export import ground, pieces
 from flexroad.pipeline.export.driver import BEGUN, export
 from flexroad.pipeline.export.source import Options, select
+from flexroad.pipeline.run.finished import estimate
 from flexroad.tasks.spline.stepped import without_steps
 from tests import validators
 from tests.make_city import TILE_M, bend, make_city, south_west, write_lines
@@ -274,7 +275,7 @@ def test_workers_write_the_same_files(city, streets, exported, tmp_path, cluster
 
 
 def test_lines_of_a_run_without_its_rasters_have_no_error_estimate(city, streets, exported, tmp_path):
-    ground._estimate.cache_clear()  # of the exports before
+    estimate.cache_clear()  # of the exports before
     rasters = city.parent / "survey"
     rasters.rename(city.parent / "away")
     try:
