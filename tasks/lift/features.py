@@ -14,7 +14,7 @@ from flexroad.catalog.lazy import lazy
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.lift.batches import POINTS
 from flexroad.tasks.lift.levels import ANY, Numbers, along
-from flexroad.tasks.lift.profile import vertices
+from flexroad.tasks.lift.lines import STEP_M, Line
 from flexroad.tasks.lift.shapes import POINT, POLYGON, Shape
 from flexroad.tasks.lift.types import Heights, Lifted, Options, RunSurface, Steep
 from flexroad.tasks.roads import level_numbers
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 else:
     pd = lazy("pandas")
 
-STEP_M = 0.5
-"""Distance of the points along lines at which the surface is looked up (m)."""
 MOST_PIECES = 200_000
 """Largest number of such points of one segment: a longer one than 100 km has them further apart."""
 ACROSS_M = 1.0
@@ -325,7 +323,8 @@ def _with_heights(
     new, kept = list[Floats](), list[NDArray[np.intp]]()
     for path in paths:
         profile = z[path.start - place.start : path.end - place.start]
-        chosen = _chosen(path, profile, group)
+        add = group.options.add_vertices is not False
+        chosen = _line(path, group.samples).needed(profile, group.options.tolerance_m, add)
         values = path.of(group.samples.values)[chosen]
         values[:, 2] = profile[chosen]
         new.append(values if path.m else values[:, :3])
@@ -351,12 +350,9 @@ def _filled(group: _Group, place: slice, known: Bools) -> Floats:
     return np.where(has, z, np.interp(index, index[has], z[has]))
 
 
-def _chosen(path: _Path, z: Floats, group: _Group) -> NDArray[np.intp]:
-    """Return the points of a path that its copy has."""
-    is_vertex = path.of(group.samples.is_vertex)
-    if group.options.add_vertices is False or is_vertex.all():
-        return np.flatnonzero(is_vertex)
-    return vertices(path.of(group.samples.along), z, is_vertex, group.options.tolerance_m)
+def _line(path: _Path, samples: _Samples) -> Line:
+    x, y, *_ = path.of(samples.values).T
+    return Line(x, y, path.of(samples.along), path.of(samples.is_vertex))
 
 
 def _row(
@@ -376,10 +372,9 @@ def _row(
             continue
         lines, s = True, path.of(samples.along)
         length += s[-1] - s[0]
-        # Half of the steps at both sides of each point.
-        share = np.convolve(np.diff(s), [0.5, 0.5]) if len(s) > 1 else np.zeros(1)
-        without += share[~known[own]].sum()
-        unknown += share[missing[own]].sum()
+        line = _line(path, samples)
+        without += line.length_where(~known[own])
+        unknown += line.length_where(missing[own])
         off.append(_most(np.abs(np.interp(s, s[chosen], z[own][chosen]) - z[own])[known[own]]))
         slopes = np.abs(grades(s, np.where(known[own], z[own], np.nan), 0.999 * STEP_M))
         grade.append(_most(slopes))

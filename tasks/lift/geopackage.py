@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.headers.open_vector import GEOPACKAGES, SQLITE, in_its_encoding, vector_name
-from flexroad.catalog.lazy import lazy
+from flexroad.catalog.headers.open_vector import GEOPACKAGES, SQLITE, vector_name
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.lift.features import (
     BATCH_BYTES,
@@ -31,8 +30,6 @@ from flexroad.tasks.lift.features import (
 )
 from flexroad.tasks.lift.shapes import Shape, of_wkb, to_wkb
 from flexroad.tasks.lift.types import Frame, Lifted, Options, RunSurface
-
-pyogrio = lazy("pyogrio")
 
 STEPS = True
 """Whether heights have the steps beside roads."""
@@ -62,7 +59,7 @@ def frame(source: Path) -> Frame:
     """Return the CRS of the first layer that has one."""
     path = vector_name(source)
     with _opened(Path(path)) as file:
-        return Frame(next((layer.crs for layer in _layers(file, path) if layer.crs), None))
+        return Frame(next((layer.crs for layer in _layers(file) if layer.crs), None))
 
 
 def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
@@ -81,7 +78,7 @@ def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator
             # The copy is not yet in its place: a crash leaves nothing behind.
             file.execute("PRAGMA journal_mode=OFF")
             file.execute("PRAGMA synchronous=OFF")
-            layers = _layers(file, path)
+            layers = _layers(file)
             for layer in layers:
                 yield from _lift_layer(file, layer, run, options, len(layers) > 1)
             _make_views_3d(file)
@@ -101,7 +98,7 @@ def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
-def _layers(file: sqlite3.Connection, path: str) -> list[_Layer]:
+def _layers(file: sqlite3.Connection) -> list[_Layer]:
     """Return the tables with geometries; views show those of their tables."""
     try:
         found = file.execute(
@@ -112,18 +109,27 @@ def _layers(file: sqlite3.Connection, path: str) -> list[_Layer]:
         for table, column, srs in found:
             info = file.execute(f"PRAGMA table_info({_quoted(table)})").fetchall()
             keys = [row[1] for row in info if row[5] == 1 and row[2].upper() == "INTEGER"]
-            crs = None
-            if srs not in UNDEFINED:
-                crs = in_its_encoding(
-                    lambda table=table, **more: pyogrio.read_info(path, layer=table, **more)
-                )[0]["crs"]
             names = tuple(row[1] for row in info)
-            layers.append(_Layer(table, column, keys[0] if len(keys) == 1 else "rowid", crs, names))
+            layers.append(
+                _Layer(table, column, keys[0] if len(keys) == 1 else "rowid", _crs(file, srs), names)
+            )
     except sqlite3.Error as error:
         raise TaskError(f"is a damaged GeoPackage: {error}; repair it with ogr2ogr NEW.gpkg FILE") from error
     if not layers:
         raise TaskError("has no layer with geometries")
     return layers
+
+
+def _crs(file: sqlite3.Connection, number: int) -> str | None:
+    """Return a coordinate system by its number; None if it says nothing."""
+    query = (
+        "SELECT organization, organization_coordsys_id, definition FROM gpkg_spatial_ref_sys WHERE srs_id = ?"
+    )
+    found = file.execute(query, (number,)).fetchone()
+    if found is None or number in UNDEFINED:
+        return None
+    organisation, code, definition = found
+    return f"EPSG:{code}" if str(organisation).upper() == "EPSG" else str(definition)
 
 
 def _lift_layer(

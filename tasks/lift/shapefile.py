@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import struct
+import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -60,8 +61,15 @@ def begins(data: bytes) -> bool:
 
 def frame(source: Path) -> Frame:
     """Return the CRS in the ``.prj``."""
+    return Frame(_info(source)["crs"])
+
+
+def _info(source: Path) -> dict[str, Any]:
+    """Return what pyogrio knows of a file; it warns of M, which is read here."""
     try:
-        return Frame(layer_info(vector_name(source), source.stem)["crs"])
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Measured")
+            return layer_info(vector_name(source), source.stem)
     except ERRORS as error:
         raise TaskError(f"cannot be read: {reason(error)}") from error
 
@@ -170,13 +178,12 @@ def _records(file: BinaryIO) -> Iterator[_Record]:
 
 def _levels(source: Path, first: int, count: int) -> list[int]:
     """Return the levels of some features."""
+    columns = level_columns(_info(source)["fields"])
+    if not columns:
+        return wanted_levels({}, count)
     try:
-        name = vector_name(source)
-        columns = level_columns(layer_info(name, source.stem)["fields"])
-        if not columns:
-            return wanted_levels({}, count)
         options: dict[str, Any] = {"skip_features": first, "max_features": count, "columns": columns}
-        read = partial(pyogrio.read_dataframe, name, read_geometry=False, **options)
+        read = partial(pyogrio.read_dataframe, vector_name(source), read_geometry=False, **options)
         table, _ = in_its_encoding(read)
     except ERRORS as error:
         raise TaskError(f"cannot be read: {reason(error)}") from error

@@ -395,3 +395,16 @@ def test_lift_replaces_an_older_copy(run, flexroad, tmp_path):
     flexroad("lift", out, run, "-o", tmp_path / "again.gpkg").expected(0)
     first, again = geopandas.read_file(out), geopandas.read_file(tmp_path / "again.gpkg")
     assert list(first.geometry.to_wkb()) == list(again.geometry.to_wkb())
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_bridge_of_which_the_run_has_no_level_is_reported(run, flexroad, tmp_path, suffix):
+    lines = [LineString(place((2, 5), (30, 5))), LineString(place((5, 2), (5, 30)))]
+    columns = {"id": [1, 2], "bridge": [None, "yes"]}
+    source = write(tmp_path / f"in.{suffix}", lines, index=suffix != "fgb", **columns)
+    report = tmp_path / "rows.csv"
+    words = ["-o", tmp_path / f"out.{suffix}", "--report", report, "--crs", UTM]
+    said = flexroad("lift", source, run, *words).expected(0)
+    assert "28.0 m of 1 feature are on a deck of unknown height" in said.err
+    rows = list(csv.DictReader(report.open()))
+    assert [float(row["unknown_deck_m"]) for row in rows] == [0, 28]
