@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 from typing import Literal
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.text import shown
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.lift import lanes, levels, opendrive_text, plan_view, road_profiles, xml_text
+from flexroad.tasks.lift import lanes, levels, opendrive_text, plan_view, road_levels, road_profiles, xml_text
 from flexroad.tasks.lift.batches import with_heights
 from flexroad.tasks.lift.levels import ANY, Numbers
 from flexroad.tasks.lift.opendrive_crg import CrgFiles, CrgLine, crg_line
@@ -71,6 +72,17 @@ class Road:
         right, left = self.extent.right[:, None], self.extent.left[:, None]
         return np.asarray((self.t >= right - half) & (self.t <= left + half))
 
+    @property
+    def column(self) -> NDArray[np.intp]:
+        """The point in the middle of the lanes of each cross-section, ``(n,)``."""
+        middle = (self.extent.right + self.extent.left) / 2
+        return np.asarray(np.abs(self.t - middle[:, None]).argmin(axis=1))
+
+    def middle(self) -> tuple[Floats, Floats]:
+        """Return x and y in the middle of the lanes, ``(n,)`` each."""
+        away = self.t[self.column]
+        return self.x - away * np.sin(self.heading), self.y + away * np.cos(self.heading)
+
     def places(self) -> tuple[Floats, Floats]:
         """Return x and y of the points: cross-sections, the line, before and after its points, OpenCRG."""
         ahead, left = np.cos(self.heading), np.sin(self.heading)
@@ -126,7 +138,7 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
     TaskError
         If the file cannot be read; continues a sentence that begins with its name.
     """
-    crg = CrgFiles(out)
+    crg, of_links = CrgFiles(out), LinkedLevels(source, heights)
     with xml_text.opened(source) as file, xml_text.written(out) as copy:
         parts = (_read(part, options) for part in xml_text.parts(file, {"road"}))
         for part, found in with_heights(parts, _places, heights):
@@ -137,7 +149,7 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
                 copy.write(part.part.text)
                 yield Lifted(part.id, note=part.note)
             else:
-                text, row = _lifted(part, found, options, crg)
+                text, row = _lifted(part, found, options, crg, of_links)
                 copy.write(text)
                 yield row
 
@@ -216,9 +228,11 @@ def _old(road: ET.Element, path: str) -> Floats:
     return pieces if pieces[0, 0] <= 0 else np.vstack([NONE, pieces])
 
 
-def _lifted(road: Road, heights: Heights, options: Options, crg: CrgFiles) -> tuple[bytes, Lifted]:
+def _lifted(
+    road: Road, heights: Heights, options: Options, crg: CrgFiles, of_links: LinkedLevels
+) -> tuple[bytes, Lifted]:
     """Return the text of a road with heights, and its row."""
-    sections, used, unknown_m, rows = _sections(road, heights)
+    sections, used, unknown_m, rows = _sections(road, heights, of_links)
     beyond: road_profiles.Beyond = "flat" if options.flat_ends else "keep"
     tolerance = options.tolerance_m
     elevation = road_profiles.elevation(sections, road.elevation, beyond, tolerance)
@@ -243,13 +257,28 @@ def _lifted(road: Road, heights: Heights, options: Options, crg: CrgFiles) -> tu
     return text, row
 
 
-def _sections(road: Road, heights: Heights) -> tuple[CrossSections, Numbers, float, NDArray[np.intp]]:
+def _sections(
+    road: Road, heights: Heights, of_links: LinkedLevels
+) -> tuple[CrossSections, Numbers, float, NDArray[np.intp]]:
     """Return the cross-sections, their levels, the length of unknown ones (m), their rows of `Heights.z`."""
     n, m = len(road.s), len(road.t)
-    middle = (road.extent.right + road.extent.left) / 2
-    column = np.abs(road.t - middle[:, None]).argmin(axis=1)
-    line = heights[np.arange(n) * m + column]
-    wanted, joined, unknown_m = np.full(n, ANY), np.zeros(n, np.bool_), 0.0
+    line = heights[np.arange(n) * m + road.column]
+    wanted, joined, unknown_m = _wanted(road, line)
+    if (wanted == ANY).all() and road_levels.several(line):
+        wanted[:] = of_links.get(road.id, ANY)
+    _, chosen = levels.along(line, wanted)
+    rows = np.searchsorted(np.array(heights.numbers), chosen)
+    of_point = np.concatenate([np.repeat(rows, m), *[rows] * 3])
+    z = _on_rows(heights[: len(of_point)], of_point)
+    on, before, after = z[n * m :].reshape(3, n)
+    grid = z[: n * m].reshape(n, m)
+    sections = road_profiles.cross_sections(road.s, road.t, grid, (on, before, after), road.inside, joined)
+    return sections, chosen[np.isfinite(sections.line)], unknown_m, rows
+
+
+def _wanted(road: Road, line: Heights) -> tuple[Numbers, Bools, float]:
+    """Return the wanted levels, where a tunnel has none, and the length of structures without one (m)."""
+    wanted, joined, unknown_m = np.full(len(road.s), ANY), np.zeros(len(road.s), np.bool_), 0.0
     for kind, start, end in road.structures:
         here = (road.s >= start) & (road.s <= end)
         side = 1 if kind == "bridge" else -1
@@ -264,14 +293,42 @@ def _sections(road: Road, heights: Heights) -> tuple[CrossSections, Numbers, flo
             wanted[here] = 0
             joined |= here & (kind == "tunnel")
             unknown_m += max(0.0, min(end, float(road.s[-1])) - max(start, 0.0))
-    _, chosen = levels.along(line, wanted)
-    rows = np.searchsorted(np.array(heights.numbers), chosen)
-    of_point = np.concatenate([np.repeat(rows, m), *[rows] * 3])
-    z = _on_rows(heights[: len(of_point)], of_point)
-    on, before, after = z[n * m :].reshape(3, n)
-    grid = z[: n * m].reshape(n, m)
-    sections = road_profiles.cross_sections(road.s, road.t, grid, (on, before, after), road.inside, joined)
-    return sections, chosen[np.isfinite(sections.line)], unknown_m, rows
+    return wanted, joined, unknown_m
+
+
+class LinkedLevels:
+    """The levels of roads that have several from end to end, by the roads linked with them.
+
+    The file is read for them when the first such road comes.
+    """
+
+    def __init__(self, source: Path, heights: HeightsAt) -> None:
+        self._source, self._heights = source, heights
+
+    def get(self, name: str, otherwise: np.int8) -> int:
+        """Return the level of a road; `otherwise` if its links do not say it."""
+        return self._levels.get(name, int(otherwise))
+
+    @cached_property
+    def _levels(self) -> dict[str, int]:
+        roads = dict[str, road_levels.Ends]()
+        with xml_text.opened(self._source) as file:
+            parts = (_read(part, Options()) for part in xml_text.parts(file, {"road"}))
+            lines = (part for part in parts if isinstance(part, Road))
+            for road, line in with_heights(lines, Road.middle, self._heights):
+                assert line is not None
+                roads[road.id] = _ends(road, line)
+        return road_levels.decided(roads)
+
+
+def _ends(road: Road, line: Heights) -> road_levels.Ends:
+    wanted, _, _ = _wanted(road, line)
+    z, numbers = levels.along(line, wanted)
+    known = {int(numbers[0]): (float(z[0]), float(z[-1]))}
+    if (wanted == ANY).all() and (numbers_of := road_levels.several(line)):
+        rows = {number: line.z[line.numbers.index(number)] for number in numbers_of}
+        known = {number: (float(row[0]), float(row[-1])) for number, row in rows.items()}
+    return road_levels.Ends(known, road_levels.links(road.part.element))
 
 
 def _on_rows(heights: Heights, rows: NDArray[np.intp]) -> Floats:

@@ -25,6 +25,8 @@ INCREMENT_M = 0.5
 SHORTEST_M = 2.0
 """Roads that are shorter have none (m)."""
 ROUNDS = 20
+LONGEST_NAME = 100
+"""Number of characters of a road's id in the name of its file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +92,7 @@ class CrgFiles:
             data = opencrg.encode(HeightGrid(crg.line, crg.v, heights), "x, y and heights as in OpenDRIVE")
         except TaskError:
             return None
-        name = safe_name(road)
+        name = safe_name(road)[:LONGEST_NAME]
         while name in self._names:
             name += "_"
         self._names.add(name)

@@ -318,6 +318,39 @@ def test_level_lanes_are_not_superelevated_and_named(tmp_path):
     assert 'level="true"' in row.note
 
 
+def linked(name: str, x: float, heading: float, before: str = "", after: str = "") -> str:
+    """A road of 12 m with links to the start of the one after it and to the end of the one before."""
+    plan = f'<geometry s="0" x="{x}" y="20" hdg="{heading}" length="{{length}}"><line/></geometry>'
+    links = "".join(
+        f'<{kind} elementType="road" elementId="{other}" contactPoint="{end}"/>'
+        for kind, other, end in (("predecessor", before, "end"), ("successor", after, "start"))
+        if other
+    )
+    return road(plan, 12.0, name, profiles="").replace("<link/>", f"<link>{links}</link>")
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_road_with_several_levels_goes_on_where_its_links_do(tmp_path, order):
+    # Three roads in line below a wide deck, of which the first comes from outside; one alone is on the deck.
+    def covered(x, y):
+        return Heights((0, 1), np.stack([plane(x, y), np.where(x > 15, plane(x, y) + 6, np.nan)]))
+
+    roads = [
+        linked("1", 8, 0, after="2"),
+        linked("2", 20, 0, before="1", after="3"),
+        linked("3", 32, 0, before="2"),
+        linked("4", 60, 0),
+    ]
+    root, rows = lifted(write(tmp_path, *roads[::order]), covered)
+    levels = {row.id: row.levels for row in rows}
+    assert levels == {"1": (0,), "2": (0,), "3": (0,), "4": (1,)}
+    heights = {
+        each.get("id"): polynomial(each, "elevationProfile/elevation", 6) for each in root.iter("road")
+    }
+    assert heights["3"] == pytest.approx(plane(38, 20))
+    assert heights["4"] == pytest.approx(plane(66, 20) + 6)
+
+
 LANE = '<lane id="{0}" type="driving"><width sOffset="0" a="{1}" b="{2}" c="0" d="0"/></lane>'
 OTHER_LANES = [
     # Shifted, and wider along the road.
