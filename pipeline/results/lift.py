@@ -33,7 +33,7 @@ from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.results.query import required_crs
 from flexroad.pipeline.results.query_files import to_crs
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, xml_text
+from flexroad.tasks.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text
 from flexroad.tasks.lift.types import Frame, Heights, Lifted, Options
 from flexroad.tasks.types import Floats
 
@@ -42,11 +42,19 @@ if TYPE_CHECKING:
 else:
     geopandas = lazy("geopandas")
 
-XML_FORMATS: dict[str, ModuleType] = {"OpenDRIVE": opendrive, "osm": osm}
+XML_FORMATS: dict[str, ModuleType] = {"OpenDRIVE": opendrive, "net": sumo, "osm": osm}
 """Formats by the name of the outermost element."""
 VECTORS: tuple[ModuleType, ...] = (geopackage, geojson, flatgeobuf, shapefile)
 """Formats of features; each has its ``SUFFIXES``, and ``begins`` tells it by the first bytes of a file."""
-KINDS = "OpenDRIVE (.xodr), OSM (.osm), a GeoPackage, GeoJSON, FlatGeobuf or Shapefile"
+KINDS = (
+    "OpenDRIVE (.xodr), a network of SUMO (.net.xml), OSM (.osm), a GeoPackage, GeoJSON, FlatGeobuf or "
+    "Shapefile"
+)
+PACKED = {
+    b"BZh": "is compressed with bzip2; unpack it: bunzip2 --keep {file}",
+    b"OSMHeader": "is OSM's PBF; convert it: osmium cat {file} -o streets.osm",
+}
+"""What to do with files that are not read, by their first bytes."""
 PLACES = ".gpkg"
 """Places above limits are in a file beside the report, of the same name with this suffix."""
 
@@ -60,12 +68,24 @@ class LiftedFile:
     """The files written."""
     earlier: int
     """Number of tiles whose heights are of earlier sources or options."""
+    noun: str
+    """What a row is."""
+    options: Options
 
     @property
     def summary(self) -> str:
-        """One line: what was lifted, and how near to the surface."""
-        length = sum(row.length_m for row in self.rows if np.isfinite(row.length_m))
-        return f"{count(len(self.rows), 'feature')}, {length / 1000:.2f} km"
+        """One line: what has heights, and what has not."""
+        parts = [f"{count(len(self.rows), self.noun)}, {_length(self.rows, 'length_m')}"]
+        if any(row.without_ground_m > 0 for row in self.rows):
+            kept = "go on level" if self.options.flat_ends else "keep their heights"
+            parts.append(f"{_length(self.rows, 'without_ground_m')} beyond the tiles {kept}")
+        if any(row.unknown_deck_m > 0 for row in self.rows):
+            parts.append(f"{_length(self.rows, 'unknown_deck_m')} on decks or in tunnels of unknown height")
+        off = [[row.elevation_m, row.superelevation_m, row.shape_m] for row in self.rows]
+        least = [min(figures) for row in off if (figures := [value for value in row if np.isfinite(value)])]
+        if least:
+            parts.append(f"at most {1000 * max(least):.0f} mm from the surface")
+        return "; ".join(parts)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -78,31 +98,45 @@ class LiftedFile:
             points = sum(row.points_without_ground for row in without)
             parts = [f"{length:.1f} m"] if length else []
             parts += [count(points, "point")] if points else []
+            kept = "go on level there" if self.options.flat_ends else "keep their heights"
             notes.append(
-                f"{' and '.join(parts)} of {count(len(without), 'feature')} lie beyond the finished tiles "
-                f"and keep their heights ({without[0].id}{' and others' if len(without) > 1 else ''})"
+                f"{' and '.join(parts)} of {count(len(without), self.noun)} lie beyond the finished tiles "
+                f"and {kept} ({_first(without)})"
             )
-        notes += [
-            f"{count(len(ids), 'feature')}: {note} ({ids[0]}{' and others' if len(ids) > 1 else ''})"
-            for note, ids in self._by_note.items()
-        ]
+        for note, rows in self._by_note.items():
+            notes.append(f"{count(len(rows), self.noun)}: {note} ({_first(rows)})")
         if unknown:
             length = sum(row.unknown_deck_m for row in unknown)
             notes.append(
-                f"{length:.1f} m of {count(len(unknown), 'feature')} are on a deck of unknown height "
-                f"({unknown[0].id}{' and others' if len(unknown) > 1 else ''}); "
-                "a run with segment.levels=true has its level"
+                f"{length:.1f} m of {count(len(unknown), self.noun)} are on a deck of unknown height "
+                f"({_first(unknown)}); a run with segment.levels=true has its level"
+            )
+        if self.options.crossfall_limit is not None and not any(
+            np.isfinite(row.crossfall) for row in self.rows
+        ):
+            notes.append(
+                "--crossfall-limit: crossfalls are not known for this format; only grades are listed"
             )
         return tuple(notes)
 
     @property
-    def _by_note(self) -> dict[str, list[str]]:
-        """The features by what is noted of them."""
-        found = dict[str, list[str]]()
+    def _by_note(self) -> dict[str, list[Lifted]]:
+        """The rows by what is noted of them."""
+        found = dict[str, list[Lifted]]()
         for row in self.rows:
             if row.note:
-                found.setdefault(row.note, []).append(row.id)
+                found.setdefault(row.note, []).append(row)
         return found
+
+
+def _first(rows: Sequence[Lifted]) -> str:
+    return f"{rows[0].id}{' and others' if len(rows) > 1 else ''}"
+
+
+def _length(rows: Sequence[Lifted], name: str) -> str:
+    """Return the sum of lengths of rows, as a text."""
+    metres = float(np.nansum([getattr(row, name) for row in rows]))
+    return f"{metres:.0f} m" if metres < 100 else f"{metres / 1000:.1f} km"
 
 
 def lift(
@@ -149,13 +183,14 @@ def lift(
             ground, _plan(place.crs), place, required_crs(ground), module.STEPS, crs is not None, _Seen()
         )
         with made_folder(out.absolute().parent), ScratchFolder(out.absolute().parent) as scratch:
-            rows = tuple(module.lift(source, Path(scratch, out.name), in_run, options))
+            with _named(out, Path(scratch)):
+                rows = tuple(module.lift(source, Path(scratch, out.name), in_run, options))
             in_run.require_heights()
             files = _move(Path(scratch), out)
             _remove_parts(out, files)
     if report is not None:
         files += _write_report(rows, report, in_run)
-    return LiftedFile(rows, files, len(in_run.seen.earlier))
+    return LiftedFile(rows, files, len(in_run.seen.earlier), getattr(module, "NOUN", "feature"), options)
 
 
 @dataclass(eq=False)
@@ -254,10 +289,15 @@ def _format(source: Path) -> ModuleType:
         name = xml_text.root_name(source)
         if name in XML_FORMATS:
             return XML_FORMATS[name]
+        if name == "osmChange":
+            raise TaskError("is a list of changes (osmChange); give the complete file (.osm)")
         raise TaskError(f"has the root element {name or 'none'}; give {KINDS}")
     for module in VECTORS:
         if module.begins(head(source)):
             return module
+    for begin, said in PACKED.items():
+        if begin in head(source)[:64]:
+            raise TaskError(f"{said.format(file=shlex.quote(str(source)))}")
     raise TaskError(f"is of no known format; give {KINDS}")
 
 
@@ -298,6 +338,17 @@ def _require_outputs(source: Path, out: Path, report: Path | None) -> None:
             raise ConfigError(f"{option} {path}: is also {taken[path.resolve()]}; give another name")
         taken[path.resolve()] = f"{option} {path}"
         output_file(path)
+
+
+@contextmanager
+def _named(out: Path, scratch: Path) -> Iterator[None]:
+    """Name the output in errors of writing it in a scratch folder; that of a full disk names no file."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and scratch not in Path(error.filename).parents:
+            raise
+        raise OSError(error.errno, error.strerror or str(error), str(out)) from error
 
 
 @contextmanager

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from flexroad.tasks.lift.types import Heights
+from flexroad.tasks.roads.level_numbers import OSM_TAGS, level_numbers
 from flexroad.tasks.types import Bools, Floats
 
 ANY = np.int8(-128)
@@ -38,7 +42,7 @@ def along(heights: Heights, wanted: Numbers) -> tuple[Floats, Numbers]:
         several |= has & (wanted == ANY)
         chosen = has & (wanted == number)
         z[chosen], numbers[chosen] = row[chosen], number
-    for start, end in _stretches(several):
+    for start, end in stretches(several):
         candidates = [(0, z[start:end].copy())]
         candidates += [
             (number, row[start:end]) for number, row in others if np.isfinite(row[start:end]).all()
@@ -53,7 +57,30 @@ def along(heights: Heights, wanted: Numbers) -> tuple[Floats, Numbers]:
     return z, numbers
 
 
-def _stretches(places: Bools) -> list[tuple[int, int]]:
+def level_of(heights: Heights, number: int) -> int | None:
+    """Return the level of a bridge or tunnel at n points; None if none of them has one of its kind.
+
+    Sources may number the decks of one place differently, so the nearest number of the same sign counts.
+    """
+    own = [
+        each
+        for each, row in zip(heights.numbers, heights.z, strict=True)
+        if each * number > 0 and np.isfinite(row).any()
+    ]
+    return min(own, key=lambda each: (abs(each - number), abs(each))) if own else None
+
+
+def tagged_level(tags: Mapping[str, str]) -> int:
+    """Return the level that tags of OpenStreetMap name: above 0 on a bridge, below 0 in a tunnel."""
+    return _tagged_level(tuple((tag, tags[tag]) for tag in OSM_TAGS if tag in tags))
+
+
+@lru_cache(1000)
+def _tagged_level(tags: tuple[tuple[str, str], ...]) -> int:
+    return int(level_numbers(pd.DataFrame([dict(tags)]))[0][0]) if tags else 0
+
+
+def stretches(places: Bools) -> list[tuple[int, int]]:
     """Return start and end of each run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], places, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in pairwise(edges)][::2]

@@ -88,3 +88,9 @@ class Line:
         """Return the length (m) of some points of the line: each has half of the way to the next ones."""
         half = np.diff(self.s) / 2
         return float(np.sum(half * places[:-1]) + np.sum(half * places[1:]))
+
+
+def largest(values: Floats) -> float:
+    """Return the largest value that is finite; NaN if there is none."""
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else np.nan

@@ -26,6 +26,8 @@ from flexroad.tasks.lift.types import Frame, Heights, HeightsAt, Lifted, Options
 from flexroad.tasks.lift.xml_text import Part
 from flexroad.tasks.types import Bools, Floats
 
+NOUN = "road"
+"""What a row of the report is."""
 STEPS = False
 """Whether heights have the steps beside roads: OpenDRIVE has kerbs in its lanes."""
 ALONG_M, LEAST_ALONG = 1.0, 4

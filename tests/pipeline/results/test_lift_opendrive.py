@@ -40,7 +40,7 @@ def run(tmp_path_factory) -> Path:
 def test_roads_get_the_heights_of_the_run(run, flexroad, tmp_path, header, words):
     source, out, report = write(tmp_path, ROAD, header=header), tmp_path / "out.xodr", tmp_path / "report.csv"
     said = flexroad("lift", source, run, "-o", out, "--report", report, *words).expected(0)
-    assert said.out.startswith(f"{out}: 1 feature, 0.03 km")
+    assert said.out.startswith(f"{out}: 1 road, 3")
     element = ET.parse(out).getroot().find("road")
     down = 90 if "z=" in header else 0
     turned = "1.57" in header

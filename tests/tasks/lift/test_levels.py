@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexroad.tasks.lift.levels import ANY, along
+from flexroad.tasks.lift.levels import ANY, along, level_of, tagged_level
 from flexroad.tasks.lift.types import Heights
 
 S = np.arange(60.0)
@@ -69,3 +69,25 @@ def test_points_beyond_the_surface_have_no_height():
     ground = np.where(S < 10, NAN, GROUND)
     z, _ = along(heights(ground=ground), any_level())
     np.testing.assert_array_equal(z, ground)
+
+
+@pytest.mark.parametrize(("number", "level"), [(1, 2), (3, 2), (-1, -1), (-2, -1)])
+def test_a_bridge_has_the_level_of_its_kind_whose_number_is_nearest(number, level):
+    row = np.where(S > 30, 1.0, NAN)
+    found = Heights((-1, 0, 2, 4), np.stack([row, GROUND, row, row]))
+    assert level_of(found, number) == level
+    assert level_of(found[S < 20], number) is None
+
+
+@pytest.mark.parametrize(
+    ("tags", "level"),
+    [
+        ({}, 0),
+        ({"layer": "1"}, 0),
+        ({"bridge": "yes"}, 1),
+        ({"bridge": "viaduct", "layer": "2", "name": "A"}, 2),
+        ({"tunnel": "yes", "bridge": "no"}, -1),
+    ],
+)
+def test_tags_name_levels_of_bridges_and_tunnels_alone(tags, level):
+    assert tagged_level(tags) == level
