@@ -31,6 +31,8 @@ CHUNK = 1_000_000
 CHUNK_BYTES = 256 * 2**20
 """Largest size of points decoded at a time; a point of an absurd format has 64 KiB."""
 RGB = ("red", "green", "blue")
+USED = ("Z", "CLASSIFICATION", "FLAGS", "RGB", "GPS_TIME")
+"""Fields that are decoded besides the coordinates in plan, as laspy calls them."""
 DEGREES = 360.0
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(seconds=10**9)
 """The zero of adjusted standard GPS time (ASPRS LAS 1.4), without leap seconds."""
@@ -176,7 +178,7 @@ def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iter
         If the file is missing, unreadable, truncated or damaged. LAZ has no checksum: a file is taken as
         damaged if points lie beyond the header's bounds.
     """
-    with _opened(path) as reader:
+    with _opened(path, fields=USED) as reader:
         header, done = reader.header, 0
         low, high = np.asarray(header.mins), np.asarray(header.maxs)
         slack = SLACK * (high - low) + 1
@@ -208,7 +210,7 @@ def _chunk(
     colour = None
     if set(RGB) <= set(points.point_format.dimension_names):
         colour = np.stack([np.asarray(points[name], np.uint16) for name in RGB], axis=1)
-    kept = ~(np.asarray(points.withheld, bool) | np.isin(kind, list(drop)))
+    kept = ~(np.asarray(points.withheld, bool) | np.isin(np.arange(256), list(drop))[kind])
     gps = np.asarray(points.gps_time, np.float64) if has_dates else None
     if kept.all():
         return Chunk(x, y, z, kind, colour, gps)
@@ -216,14 +218,24 @@ def _chunk(
     return Chunk(x[kept], y[kept], z[kept], kind[kept], colour, None if gps is None else gps[kept])
 
 
-def _opened(path: Path) -> Any:
+def _opened(path: Path, fields: Collection[str] = ()) -> Any:
+    """Open a cloud; of compressed points only some fields are decoded, all if none are named."""
     if not _attempt(path, path.is_file):
         missing = "is not a file" if path.exists() else "does not exist"
         raise CatalogError(f"{path} {missing}; give LAS or LAZ files, or folders of them")
     largest = _attempt(path, lambda: las_header.check(path))
     # The parallel decoder allocates a complete chunk, which the header may give as 2^32 points.
     backend = laspy.LazBackend.Lazrs if largest > CHUNK_BYTES else laspy.LazBackend.LazrsParallel
-    return _attempt(path, lambda: laspy.open(path, laz_backend=backend))
+    selection = {"decompression_selection": _selection(fields)} if fields else {}
+    return _attempt(path, lambda: laspy.open(path, laz_backend=backend, **selection))
+
+
+def _selection(fields: Collection[str]) -> Any:
+    """Return what laspy decodes; formats before LAS 1.4 are always decoded completely."""
+    chosen = laspy.DecompressionSelection.xy_returns_channel()
+    for name in fields:
+        chosen |= laspy.DecompressionSelection[name]
+    return chosen
 
 
 def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Generic
 
@@ -138,6 +139,10 @@ class AdaptiveExecutor:
         if left < jobs.number:
             self._tell(jobs, left, times)
         yield from self.parallel.map(function, rest, lost, probe)
+
+    def held(self) -> AbstractContextManager[Executor]:
+        """Return a context manager of this executor; each call of `map` may start workers of its own."""
+        return nullcontext(self)
 
     def _tell(self, jobs: Jobs[J], left: int, times: Sequence[float]) -> None:
         line = decision(left, self.workers, *estimate(times, jobs.job_s))

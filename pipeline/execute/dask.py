@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
+from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
+from typing import Any
 
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute.executor import J, Probe, R
+from flexroad.pipeline.execute.executor import Executor, J, Probe, R
 
 LOCAL = Cluster()
 ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?([^\s:/\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}")
@@ -81,29 +83,61 @@ class DaskExecutor:
         if not first:
             # Without jobs no cluster is started.
             return
+        # The probe is left after the workers have ended, which may still write files of it.
+        with probe or contextlib.nullcontext(), self.held() as connected:
+            yield from connected.map(function, chain(first, queue), lost, probe)
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[_ConnectedExecutor]:
+        """Start the cluster or connect to it, for several calls of `map` of the executor that is yielded."""
         if self.scheduler:
             check_address(self.scheduler)
         # A run with nothing to do, which comes no further, starts without Dask.
-        from flexroad.pipeline.execute import clusters, session, workers  # noqa: PLC0415
+        from flexroad.pipeline.execute import clusters  # noqa: PLC0415
 
         with (
             clusters.quiet(),
-            # Left after the workers have ended, which may still write files of the probe.
-            probe or contextlib.nullcontext(),
             clusters.open_cluster(
                 self.cluster, self.workers, self.scheduler, self.dashboard, self.logs, self.say
             ) as target,
             clusters.connected(target, self.dashboard, self.say) as client,
         ):
-            jobs_on_cluster = session.Session(
-                client,
-                target.name,
-                workers.check_workers(client, target.name, probe),
-                function,
-                chain(first, queue),
-                lost,
-                self.cluster.model_copy(update={"patience_s": target.patience_s}),
-                self.say,
-                probe,
-            )
-            yield from jobs_on_cluster.results()
+            yield _ConnectedExecutor(client, target, self.cluster, self.say)
+
+
+@dataclass(frozen=True)
+class _ConnectedExecutor:
+    """Runs jobs on the workers of a cluster that is connected."""
+
+    client: Any
+    target: Any
+    cluster: Cluster
+    say: Callable[[str], None]
+
+    def map(
+        self,
+        function: Callable[[J], R],
+        jobs: Iterable[J],
+        lost: Callable[[J, str], R],
+        probe: Probe | None = None,
+    ) -> Generator[R, None, None]:
+        """Yield results as tiles finish; the caller has entered ``probe``."""
+        # A run with nothing to do, which comes no further, starts without Dask.
+        from flexroad.pipeline.execute import session, workers  # noqa: PLC0415
+
+        jobs_on_cluster = session.Session(
+            self.client,
+            self.target.name,
+            workers.check_workers(self.client, self.target.name, probe),
+            function,
+            iter(jobs),
+            lost,
+            self.cluster.model_copy(update={"patience_s": self.target.patience_s}),
+            self.say,
+            probe,
+        )
+        yield from jobs_on_cluster.results()
+
+    def held(self) -> contextlib.AbstractContextManager[Executor]:
+        """Return a context manager of this executor."""
+        return contextlib.nullcontext(self)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
@@ -72,6 +73,9 @@ class Executor(Protocol):
             If the scheduler is gone, or all workers are gone for too long; results yielded before are valid.
         """
 
+    def held(self) -> AbstractContextManager[Executor]:
+        """Return a context manager of an executor whose calls of `map` use the same workers."""
+
 
 class SerialExecutor:
     """Runs one job after the other in this process."""
@@ -86,3 +90,7 @@ class SerialExecutor:
         """Yield results in the order of the jobs; ``probe`` is not needed: there is no worker."""
         for job in jobs:
             yield function(job)
+
+    def held(self) -> AbstractContextManager[Executor]:
+        """Return a context manager of this executor: there are no workers."""
+        return nullcontext(self)

@@ -23,9 +23,9 @@ LONGEST_M = 500_000.0
 """Longest side of an area (m)."""
 MAX_CELLS = 10**10
 """100 km x 100 km at 1 m."""
-CELL_DISK, PIXEL_DISK = 26, 4
-"""Temporary files per cell and per pixel (bytes): DSM, DTM, bridges, three bands of road heights and two
-masks; colours and their mask."""
+CELL_DISK, PIXEL_DISK = 90, 4
+"""Temporary files per cell and per pixel (bytes): eight numbers from its points; DSM, DTM, bridges, three
+bands of road heights and two masks; colours and their mask."""
 ROAD_BYTES = 16
 """Memory of the road mask per cell (bytes): height and number of the highest face, and copies."""
 TILE_BYTES = 8

@@ -182,7 +182,7 @@ def _sample_points(
 ) -> BucketedPoints:
     """Sample points on the mesh and sort them into buckets on disk."""
     area = writer.grid.width * writer.grid.height * writer.grid.cell**2
-    reach = to_rasters.reach_m(options, writer.grid.cell)
+    reach = to_rasters.points_reach_m(options, writer.grid.cell)
     edge = block_edge(mesh_options.density * mesh.area, area, reach, step)
     buckets, occupied = PointBuckets(writer.scratch / "points", edge), set[BlockIndex]()
     with disk_errors(writer.out):

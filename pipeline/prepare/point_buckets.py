@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -23,6 +23,8 @@ from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.prepare.limits import check_extent
 from flexroad.pipeline.prepare.output import disk_errors
 from flexroad.tasks.acquire.types import Points
+from flexroad.tasks.compiled import compiled
+from flexroad.tasks.types import Floats
 
 PER_METRE = 10_000
 """Units of the stored coordinates: tenths of a millimetre."""
@@ -34,9 +36,13 @@ POINTS_PER_BLOCK = 2_000_000
 """Target number of points that a worker holds in memory, including the rim around its block."""
 SHORTEST_EDGE_M, LONGEST_EDGE_M = 50.0, 500.0
 """Limits of the edge of a block (m)."""
-BYTE = 255
+WORDS = 4
+"""Number of 32-bit words of a record; the last one has the class in its lowest byte, then the colour."""
+BYTE, BYTE_BITS = 255, 8
 
 Integers = NDArray[np.int64]
+Words = NDArray[np.int32]
+"""Records as 32-bit words, ``(n, 4)``, or some of these words."""
 BlockIndex = tuple[int, int]
 """Column and row of a block: easting and northing of its south-west corner, in multiples of the edge."""
 
@@ -94,22 +100,27 @@ class PointBuckets:
         file = self.path(index)
         return file.stat().st_size // RECORD.itemsize if file.exists() else 0
 
+    def remove(self, blocks: Collection[BlockIndex]) -> None:
+        """Remove the files of blocks that have points."""
+        for index in blocks:
+            self.path(index).unlink()
+
     def append(self, east: Integers, north: Integers, records: NDArray[np.void]) -> set[BlockIndex]:
         """Add points, ``(n,)``, with coordinates in stored units; return the blocks that received any."""
         edge = self.edge * PER_METRE
-        col = np.floor(east / edge).astype(np.int64)
-        row = np.ceil(north / edge).astype(np.int64) - 1
-        width = int(np.ptp(col)) + 1
-        block = (row - row.min()) * width + (col - col.min())
+        west, south = math.floor(east.min() / edge), math.ceil(north.min() / edge) - 1
+        width = math.floor(east.max() / edge) - west + 1
+        block = _block_numbers(east, north, edge, west, south, width)
         # NumPy sorts integers of one or two bytes by radix, which is faster.
         order = np.argsort(block.astype(np.min_scalar_type(int(block.max()))), kind="stable")
         ends = np.flatnonzero(np.diff(block[order])) + 1
         occupied = set()
         for members in np.split(order, ends):
-            index = int(col[members[0]]), int(row[members[0]])
-            corner = self.corner(index)
-            part = records[members]
-            part["east"], part["north"] = east[members] - corner[0], north[members] - corner[1]
+            row, col = divmod(int(block[members[0]]), width)
+            index = west + col, south + row
+            part = _relative(
+                records.view("<i4").reshape(-1, WORDS), east, north, members, *self.corner(index)
+            )
             with self.path(index).open("ab") as file:
                 file.write(part.tobytes())
             occupied.add(index)
@@ -126,44 +137,93 @@ class PointBuckets:
     def read(self, grid: Grid, reach_m: float, with_colours: bool) -> Points:
         """Return the points on a grid and a rim around it, in an order that depends only on the points."""
         west, south, east, north = (round(side * PER_METRE) for side in grid.buffered(reach_m).bounds)
-        easts, norths, rest = [], [], []
+        keys, rest = [np.zeros(0, np.int64)], [np.zeros((0, 2), np.int32)]
         for index in self.overlapping(grid, reach_m):
-            if not self.path(index).exists():
-                continue
-            records, corner = np.fromfile(self.path(index), RECORD), self.corner(index)
-            x, y = records["east"].astype(np.int64) + corner[0], records["north"].astype(np.int64) + corner[1]
-            inside = (x >= west) & (x <= east) & (y >= south) & (y <= north)
-            easts.append(x[inside])
-            norths.append(y[inside])
-            rest.append(records[inside])
-        if not rest:
-            return _points(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, RECORD), with_colours)
-        x, y, records = np.concatenate(easts), np.concatenate(norths), np.concatenate(rest)
-        order = _order(x - west, y - south, records)
-        return _points(x[order], y[order], records[order], with_colours)
+            if self.path(index).exists():
+                # Mapped: of most buckets around a block only a rim is used.
+                words = np.memmap(self.path(index), "<i4", "r").reshape(-1, WORDS)
+                x, y = self.corner(index)
+                inside = _inside(words, west - x, south - y, east - x, north - y)
+                keys.append(inside[0])
+                rest.append(inside[1])
+        plan, words = np.concatenate(keys), np.concatenate(rest)
+        columns = _columns(plan, words, _order(plan, words), west, south, with_colours)
+        return Points(*columns[:4], colour=columns[4] if with_colours else None)
 
 
-def _order(east: Integers, north: Integers, records: NDArray[np.void]) -> NDArray[np.intp]:
-    """Return the order by northing, easting and, for equal plan coordinates, by height, class and colour."""
-    plan = (north << 32) | east
+def _order(plan: Integers, words: Words) -> NDArray[np.intp]:
+    """Return the order by plan coordinates and, where they are equal, by height, class and colour."""
     order = np.argsort(plan)
     ties = np.flatnonzero(np.diff(plan[order]) == 0)
     ties = np.union1d(ties, ties + 1)
     tied = order[ties]
-    keys = [records["colour"][tied, band] for band in range(3)]
-    order[ties] = tied[np.lexsort((*keys, records["kind"][tied], records["height"][tied], plan[tied]))]
+    kind_and_colour = words[tied, 1].view(np.uint32)
+    keys = kind_and_colour >> BYTE_BITS, kind_and_colour & BYTE, words[tied, 0], plan[tied]
+    order[ties] = tied[np.lexsort(keys)]
     return order
 
 
-def _points(east: Integers, north: Integers, records: NDArray[np.void], with_colours: bool) -> Points:
-    # Division, not multiplication by 1e-4: whole centimetres are restored exactly.
-    return Points(
-        east / PER_METRE,
-        north / PER_METRE,
-        records["height"] / PER_METRE,
-        records["kind"],
-        records["colour"] if with_colours else None,
-    )
+@compiled()
+def _block_numbers(
+    east: Integers, north: Integers, edge: float, west: int, south: int, width: int
+) -> Integers:
+    """Return the row-major number of each point's block, from column ``west`` and row ``south``."""
+    numbers = np.empty(east.size, np.int64)
+    for i in range(east.size):
+        row = math.ceil(north[i] / edge) - 1 - south
+        numbers[i] = row * width + math.floor(east[i] / edge) - west
+    return numbers
+
+
+@compiled()
+def _relative(
+    words: Words, east: Integers, north: Integers, members: NDArray[np.intp], west: int, south: int
+) -> Words:
+    """Return some records, with plan coordinates from the corner of their block."""
+    part = np.empty((members.size, words.shape[1]), np.int32)
+    for k in range(members.size):
+        i = members[k]
+        part[k, 0], part[k, 1] = east[i] - west, north[i] - south
+        part[k, 2], part[k, 3] = words[i, 2], words[i, 3]
+    return part
+
+
+@compiled()
+def _inside(words: Words, west: int, south: int, east: int, north: int) -> tuple[Integers, Words]:
+    """Return the plan coordinates of the records in an area, as one number each, and their other words."""
+    count = 0
+    for i in range(words.shape[0]):
+        count += west <= words[i, 0] <= east and south <= words[i, 1] <= north
+    plan, rest = np.empty(count, np.int64), np.empty((count, 2), np.int32)
+    k = 0
+    for i in range(words.shape[0]):
+        x, y = words[i, 0], words[i, 1]
+        if west <= x <= east and south <= y <= north:
+            plan[k] = (np.int64(y) - south) << 32 | (np.int64(x) - west)
+            rest[k, 0], rest[k, 1] = words[i, 2], words[i, 3]
+            k += 1
+    return plan, rest
+
+
+@compiled()
+def _columns(
+    plan: Integers, words: Words, order: NDArray[np.intp], west: int, south: int, with_colours: bool
+) -> tuple[Floats, Floats, Floats, NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return eastings, northings and heights (m), classes and colours in an order."""
+    n = order.size
+    easting, northing, height = np.empty(n), np.empty(n), np.empty(n)
+    kind, colour = np.empty(n, np.uint8), np.empty((n if with_colours else 0, 3), np.uint8)
+    for k in range(n):
+        i = order[k]
+        # Division, not multiplication by 1e-4: whole centimetres are restored exactly.
+        easting[k] = ((plan[i] & 0xFFFFFFFF) + west) / PER_METRE
+        northing[k] = ((plan[i] >> 32) + south) / PER_METRE
+        height[k] = words[i, 0] / PER_METRE
+        kind[k] = words[i, 1] & 255
+        if with_colours:
+            for band in range(3):
+                colour[k, band] = words[i, 1] >> 8 * (band + 1) & 255
+    return easting, northing, height, kind, colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,23 +333,48 @@ class _ByteColours:
         """Whether any colour so far was not black."""
         return self._shift is not None
 
-    def bytes(self, colour: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    def shift(self, colour: NDArray[np.uint16]) -> int:
+        """Return by how many bits the colours of a chunk are moved to the right."""
         if self._shift is None and colour.any():
             self._shift = 8 if colour.max() > BYTE else 0
-        scaled: NDArray[np.uint16] = np.minimum(colour >> (self._shift or 0), BYTE)
-        return scaled.astype(np.uint8)
+        return self._shift or 0
 
 
 def _records(
     chunk: Chunk, frame: MetricTransform, colours: _ByteColours
 ) -> tuple[Integers, NDArray[np.void]]:
     """Return eastings and northings in stored units, ``(2, n)``, and records with all other fields set."""
-    easting, northing, height = frame.metres(chunk.x, chunk.y, chunk.z)
-    valid = (height >= LOWEST_M) & (height <= HIGHEST_M)
-    records = np.zeros(int(valid.sum()), RECORD)
-    records["height"] = np.rint(height[valid] * PER_METRE)
-    records["kind"] = chunk.kind[valid]
-    if chunk.colour is not None:
-        records["colour"] = colours.bytes(chunk.colour[valid])
-    plan = np.stack([easting[valid], northing[valid]])
-    return np.rint(plan * PER_METRE).astype(np.int64), records
+    metres = frame.metres(chunk.x, chunk.y, chunk.z)
+    colour = np.zeros((1, 3), np.uint16) if chunk.colour is None else chunk.colour
+    plan, words = _in_units(*metres, chunk.kind, colour, colours.shift(colour))
+    return plan, words.view(RECORD).reshape(-1)
+
+
+@compiled()
+def _in_units(
+    easting: Floats,
+    northing: Floats,
+    height: Floats,
+    kind: NDArray[np.uint8],
+    colour: NDArray[np.uint16],
+    shift: int,
+) -> tuple[Integers, Words]:
+    """Return plan coordinates, ``(2, n)``, and records of the points whose height is in range."""
+    count = 0
+    for i in range(height.size):
+        count += LOWEST_M <= height[i] <= HIGHEST_M
+    plan, words = np.empty((2, count), np.int64), np.zeros((count, WORDS), np.int32)
+    k = 0
+    for i in range(height.size):
+        if LOWEST_M <= height[i] <= HIGHEST_M:
+            plan[0, k] = np.rint(easting[i] * PER_METRE)
+            plan[1, k] = np.rint(northing[i] * PER_METRE)
+            words[k, 2] = np.rint(height[i] * PER_METRE)
+            word = np.uint32(kind[i])
+            if colour.shape[0] == height.size:
+                for band in range(3):
+                    shade = np.uint32(min(colour[i, band] >> shift, BYTE))
+                    word |= shade << np.uint32(8 * (band + 1))
+            words[k, 3] = np.int32(word)
+            k += 1
+    return plan, words

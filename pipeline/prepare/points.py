@@ -23,7 +23,7 @@ from flexroad.pipeline.prepare.output import scratch_folder
 from flexroad.pipeline.prepare.point_buckets import RECORD, BucketedPoints, block_edge_of, bucket_points
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, check_roads
-from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES, Options, reach_m, tags
+from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES, Options, points_reach_m, tags
 
 Ground = Literal["auto", "classes", "filter", "morphological"]
 MIN_GROUND = 0.01
@@ -87,7 +87,7 @@ def prepare_points(
     check_disk(out, RECORD.itemsize * sum(cloud.points for cloud in clouds), f"the points of {names}", FEWER)
     with scratch_folder(out) as folder:
         possible = ("classes", "filter") if ground == "auto" else (ground,)
-        farthest = max(reach_m(_with_method(options, method), common.cell_m) for method in possible)
+        farthest = max(points_reach_m(_with_method(options, method), common.cell_m) for method in possible)
         bucketed = bucket_points(clouds, frame, folder, block_edge_of(clouds, frame, farthest, step), log)
         method, notes = _ground(clouds, bucketed, options, ground)
         options, dense = _for_density(_with_method(options, method), bucketed)

@@ -49,6 +49,21 @@ class TopLayer:
 
 
 @dataclass(frozen=True, eq=False)
+class CellHeights:
+    """What the points of each cell give, without the cells around it."""
+
+    highest: Floats
+    """Highest point, ``(H, W)``, m; NaN where there is none."""
+    top: TopLayer
+    """The points close below the highest one."""
+    ground: Floats
+    """Mean easting from the grid's west, northing from its north, and height of the ground points,
+    ``(3, H, W)``, m; NaN where there are none."""
+    bridges: Floats
+    """Mean height of bridge decks, ``(H, W)``, m; NaN where there are none."""
+
+
+@dataclass(frozen=True, eq=False)
 class Rasters:
     """The rasters of an area."""
 

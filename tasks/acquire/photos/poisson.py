@@ -9,7 +9,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.acquire.mesh.sample import TexturedMesh
@@ -18,6 +17,7 @@ from flexroad.tasks.acquire.photos.sfm import colmap
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
+spatial = lazy("scipy.spatial")
 trimesh = lazy("trimesh")
 
 CELLS = 2.0
@@ -71,7 +71,7 @@ def poisson(
     pycolmap.poisson_meshing(work / "cloud.ply", work / "mesh.ply", options)
     mesh = trimesh.load(work / "mesh.ply", process=False)
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    distance, _ = cKDTree(cloud.points).query(vertices, distance_upper_bound=FAR * spacing_m)
+    distance, _ = spatial.cKDTree(cloud.points).query(vertices, distance_upper_bound=FAR * spacing_m)
     faces = faces[np.isfinite(distance)[faces].all(axis=1)]
     if not len(faces):
         raise TaskError(f"{len(cloud)} points give no surface; use photographs that overlap more")

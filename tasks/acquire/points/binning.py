@@ -66,14 +66,20 @@ def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats
     *values : Floats
         One value per point, ``(n,)``.
     """
-    inside = cells >= 0
-    cells = cells[inside]
     size = shape[0] * shape[1]
-    count = np.bincount(cells, minlength=size)
     with np.errstate(invalid="ignore"):
-        return tuple(
-            (np.bincount(cells, value[inside], minlength=size) / count).reshape(shape) for value in values
-        )
+        return tuple(np.divide(*_totals(cells, value, size)).reshape(shape) for value in values)
+
+
+@compiled()
+def _totals(cells: Cells, value: Floats, size: int) -> tuple[Floats, Floats]:
+    """Return the sum of the values and their number, per cell."""
+    total, count = np.zeros(size), np.zeros(size)
+    for i in range(cells.size):
+        if cells[i] >= 0:
+            total[cells[i]] += value[i]
+            count[cells[i]] += 1.0
+    return total, count
 
 
 def highest(cells: Cells, height: Floats, shape: tuple[int, int]) -> Floats:

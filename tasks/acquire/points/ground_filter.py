@@ -44,7 +44,9 @@ class Options(low_outliers.Options):
         return self.radius_m + self.low_reach_m
 
 
-def ground(easting: Floats, northing: Floats, height: Floats, options: Options) -> Bools:
+def ground(
+    easting: Floats, northing: Floats, height: Floats, options: Options, asked: Bools | None = None
+) -> Bools:
     """Return which points are ground.
 
     Point p is ground if ``h_p - h_q <= slope * d + confidence * sqrt(2) * noise_m`` for all q at a distance
@@ -54,6 +56,8 @@ def ground(easting: Floats, northing: Floats, height: Floats, options: Options) 
     ----------
     easting, northing, height : ndarray, (n,)
         In metres. Points with NaN or infinite coordinates are not ground.
+    asked : ndarray of bool, (n,), optional
+        Points for which the answer is needed; all others are returned as not ground. None asks for all.
 
     Returns
     -------
@@ -66,7 +70,8 @@ def ground(easting: Floats, northing: Floats, height: Floats, options: Options) 
         If the arrays differ in length.
     """
     points = low_outliers.without_low_outliers(easting, northing, height, options.radius_m, options)
-    is_ground = _ground(*points.arrays, options.radius_m, options.slope, options.tolerance_m)
+    is_asked = np.ones(points.order.size, bool) if asked is None else asked[points.order]
+    is_ground = _ground(*points.arrays, is_asked, options.radius_m, options.slope, options.tolerance_m)
     out = np.zeros(height.shape, bool)
     out[points.order[is_ground]] = True
     return out
@@ -104,11 +109,12 @@ def _ground(
     start: Indices,
     shape: tuple[int, int],
     side: float,
+    asked: Bools,
     radius: float,
     slope: float,
     tolerance: float,
 ) -> Bools:
-    out = np.ones(z.size, np.bool_)
+    out = asked.copy()
     rows, cols = shape
     floor = np.full(rows * cols, np.inf)
     for b in range(rows * cols):
@@ -116,13 +122,13 @@ def _ground(
             floor[b] = z[start[b]]
     candidates = np.empty((2 * math.ceil(radius / side) + 3) ** 2, np.int64)
     for b in range(rows * cols):
-        if start[b] == start[b + 1]:
+        if not asked[start[b] : start[b + 1]].any():
             continue
         # Comparing with one low point near by rejects most points that are not ground.
         low = start[_lowest(floor, shape, side, b, radius, slope)]
         top = -np.inf
         for p in range(start[b], start[b + 1]):
-            out[p] = not _over(x, y, z, p, low, low + 1, radius, slope, tolerance, 0.0)
+            out[p] = asked[p] and not _over(x, y, z, p, low, low + 1, radius, slope, tolerance, 0.0)
             if out[p]:
                 top = z[p]
         # The remaining points are compared with all buckets low enough to reject the highest of them.

@@ -23,6 +23,8 @@ Indices = NDArray[np.int64]
 POINTS_PER_BUCKET = 16
 BUCKETS_PER_RADIUS = 16
 """Buckets have about `POINTS_PER_BUCKET` points, more in dense clouds: their side is at least radius / 16."""
+FEW_POINTS = 64
+"""Points of a bucket that are sorted by insertion, which is fast for few."""
 SLACK_M = 1e-6
 """Margin of distances to buckets (m), for points that rounding moved across the edge of a bucket."""
 OUTNUMBERED = 20
@@ -109,10 +111,7 @@ class Buckets:
         mean_side = math.sqrt(POINTS_PER_BUCKET * width * depth / x.size)
         side = max(radius / BUCKETS_PER_RADIUS, mean_side, max(width, depth) / x.size)
         shape = int(depth / side) + 1, int(width / side) + 1
-        bucket = (y / side).astype(np.int64) * shape[1] + (x / side).astype(np.int64)
-        order = np.argsort(height, kind="stable")
-        order = order[np.argsort(bucket[order], kind="stable")]
-        start = np.concatenate([[0], np.cumsum(np.bincount(bucket, minlength=shape[0] * shape[1]))])
+        order, start = _sorted(x, y, height, shape, side)
         return cls(x[order], y[order], height[order], order, start, shape, side)
 
     def without(self, excluded: Bools) -> Buckets:
@@ -129,6 +128,35 @@ class Buckets:
     def arrays(self) -> tuple[Floats, Floats, Floats, Indices, tuple[int, int], float]:
         """Arguments of the compiled functions below."""
         return self.x, self.y, self.z, self.start, self.shape, self.side
+
+
+@compiled()
+def _sorted(x: Floats, y: Floats, z: Floats, shape: tuple[int, int], side: float) -> tuple[Indices, Indices]:
+    """Return the order by bucket and by height within it, and the first point of each bucket."""
+    bucket = np.empty(x.size, np.int64)
+    start = np.zeros(shape[0] * shape[1] + 1, np.int64)
+    for i in range(x.size):
+        bucket[i] = int(y[i] / side) * shape[1] + int(x[i] / side)
+        start[bucket[i] + 1] += 1
+    for b in range(1, start.size):
+        start[b] += start[b - 1]
+    free, order = start[:-1].copy(), np.empty(x.size, np.int64)
+    for i in range(x.size):
+        order[free[bucket[i]]] = i
+        free[bucket[i]] += 1
+    for b in range(start.size - 1):
+        first, end = start[b], start[b + 1]
+        if end - first > FEW_POINTS:
+            part = order[first:end].copy()
+            order[first:end] = part[np.argsort(z[part], kind="mergesort")]
+            continue
+        for k in range(first + 1, end):
+            i, place = order[k], k
+            while place > first and z[order[place - 1]] > z[i]:
+                order[place] = order[place - 1]
+                place -= 1
+            order[place] = i
+    return order, start
 
 
 @compiled()

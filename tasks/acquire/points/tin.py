@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.points.binning import Cells, means
 from flexroad.tasks.metrics.vertical_distance import drape
-from flexroad.tasks.types import Floats, Mesh
+from flexroad.tasks.types import Bools, Floats, Mesh
 
+Window = tuple[slice, slice]
+"""Rows and columns of a raster."""
 JITTER = 1e-6
 """Scale of the displacement of nodes (cells), which makes the triangulation of cocircular nodes unique."""
 SNAP_M = 1e-12
@@ -30,13 +31,14 @@ COUNT_OFFSET = 0.6180339887
 """Offset (cells) added before rounding down to whole cells, so that rounding errors do not matter."""
 EMPTY_CIRCLE_CELLS = 2 * math.sqrt(2)
 """Largest diameter (cells) of an empty circle between nodes at any position in cells that all have one."""
+CHAIN_CELLS = 4 * math.sqrt(2)
+"""Diameter (cells) of a disc that holds a square of 3 x 3 complete cells wherever it lies."""
+REACH_CELLS = math.ceil(CHAIN_CELLS)
 DIAGONAL = math.sqrt(2)
 """Largest distance of the centres of touching cells (cells), added to the width of a void."""
 
 
-def triangulated(
-    cells: Cells, easting: Floats, northing: Floats, height: Floats, grid: Grid, void_m: float
-) -> Floats:
+def triangulated(ground: Floats, grid: Grid, void_m: float, inner: Window | None = None) -> Floats:
     """Return the ground height at the cell centres, linear between the centroids of cells, ``(H, W)``, m.
 
     A centroid is the mean of the points of a cell in plan and height: it is exact on planes and not biased,
@@ -45,22 +47,17 @@ def triangulated(
 
     Parameters
     ----------
-    cells : Cells
-        The cells of the ground points, ``(n,)``.
-    easting, northing, height : Floats
-        The ground points, ``(n,)``, m.
+    ground : ndarray, (3, H, W)
+        Easting and northing of the cells' centroids from the grid's north-west corner, and their height (m);
+        NaN without ground points.
     void_m : float
         The DTM is NaN where a circle of this diameter plus `EMPTY_CIRCLE_CELLS` has no node (m).
+    inner : Window, optional
+        See `tin`.
     """
-    east, north, mean = means(cells, grid.shape, easting - grid.west, northing - grid.north, height)
-    ground = tin(east, north, mean, grid, void_m + EMPTY_CIRCLE_CELLS * grid.cell)
-    return np.where(np.isnan(ground), mean, ground)
-
-
-def averaged(cells: Cells, height: Floats, grid: Grid, void_m: float) -> Floats:
-    """Return the mean height of the ground points per cell, voids up to ``void_m`` filled, ``(H, W)``, m."""
-    (mean,) = means(cells, grid.shape, height)
-    return fill_voids(mean, grid, void_m)
+    east, north, height = ground
+    interpolated = tin(east, north, height, grid, void_m + EMPTY_CIRCLE_CELLS * grid.cell, inner)
+    return np.where(np.isnan(interpolated), height, interpolated)
 
 
 def tin_reach_m(void_m: float, cell: float) -> float:
@@ -68,7 +65,9 @@ def tin_reach_m(void_m: float, cell: float) -> float:
     return math.ceil(void_m / cell + EMPTY_CIRCLE_CELLS) * cell
 
 
-def tin(east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float) -> Floats:
+def tin(
+    east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float, inner: Window | None = None
+) -> Floats:
     """Return heights at the cell centres, interpolated over the triangles of the nodes, ``(H, W)``, m.
 
     Parameters
@@ -79,18 +78,55 @@ def tin(east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float
         Height of a cell's node, ``(H, W)``, m; NaN if the cell has no node.
     widest_m : float
         Largest diameter of a triangle's circumcircle (m).
+    inner : Window, optional
+        The cells whose heights are needed; others may be wrong. None needs all.
 
     Returns
     -------
     Floats
         NaN where there is no triangle.
     """
-    row, col = np.nonzero(np.isfinite(height))
-    nodes = np.column_stack([east[row, col], north[row, col], height[row, col]])
-    faces = _delaunay(nodes[:, :2] + JITTER * grid.cell * _noise(grid, row, col))
-    faces = _ordered(faces[_widths(nodes[:, :2], faces) <= widest_m * LIMIT_FACTOR], len(nodes))
-    corner = grid.west, grid.north, 0.0
-    return drape(Mesh(grid.crs, corner, nodes, faces, np.zeros(len(faces), bool)), grid)
+    nodes = np.isfinite(height)
+    if inner is not None:
+        nodes &= _acting(nodes, inner)
+    (result,) = _interpolated(east, north, height[None], nodes, grid, widest_m)
+    return result
+
+
+def _acting(nodes: Bools, inner: Window) -> Bools:
+    """Return the cells whose nodes may be those of triangles at inner cells, ``(H, W)``.
+
+    A node is not, if it is far from them and from each void that is connected to them: no circle without a
+    node inside then touches both. Let a disc of `CHAIN_CELLS` move within such a circle from the inner cell
+    to the node. Everywhere it holds a square of 3 x 3 cells, all of them without a node, so that these
+    squares are a chain from the inner cells to the node.
+    """
+    near = np.zeros(nodes.shape, bool)
+    rows, cols = (slice(max(part.start - REACH_CELLS, 0), part.stop + REACH_CELLS) for part in inner)
+    near[rows, cols] = True
+    # The ground beyond the grid has no nodes.
+    centres = ndimage.minimum_filter(~nodes, 3, mode="constant", cval=True)
+    numbers, count = ndimage.label(centres, np.ones((3, 3), bool))
+    connected = np.zeros(count + 1, bool)
+    connected[numbers[near]] = True
+    connected[0] = False
+    acting: Bools = ndimage.maximum_filter(connected[numbers], 2 * REACH_CELLS + 3, mode="constant")
+    return acting | near
+
+
+def _interpolated(
+    east: Floats, north: Floats, heights: Floats, is_node: Bools, grid: Grid, widest_m: float
+) -> list[Floats]:
+    """Return several heights of the same nodes, ``(n, H, W)``, interpolated over their triangles."""
+    row, col = np.nonzero(is_node)
+    plan = np.column_stack([east[row, col], north[row, col]])
+    faces = _delaunay(plan + JITTER * grid.cell * _noise(grid, row, col))
+    faces = _ordered(faces[_widths(plan, faces) <= widest_m * LIMIT_FACTOR], len(plan))
+    corner, none = (grid.west, grid.north, 0.0), np.zeros(len(faces), bool)
+    return [
+        drape(Mesh(grid.crs, corner, np.column_stack([plan, height[row, col]]), faces, none), grid)
+        for height in heights
+    ]
 
 
 def _noise(grid: Grid, row: NDArray[np.intp], col: NDArray[np.intp]) -> Floats:
@@ -144,17 +180,23 @@ def _ordered(faces: NDArray[np.int32], nodes: int) -> NDArray[np.int32]:
 
 
 def fill_voids(heights: Floats, grid: Grid, size_m: float) -> Floats:
-    """Return the heights with voids of up to ``size_m`` filled, ``(H, W)``, m.
+    """Return the heights with voids of up to ``size_m`` filled, m.
 
     The centres of the cells around the voids are triangulated (see `tin`). A square or a strip of n cells
     across is filled if ``size_m`` is at least n cells.
+
+    Parameters
+    ----------
+    heights : ndarray, (H, W) or (n, H, W)
+        One raster, or several with the same voids (m); NaN in voids.
     """
-    void = np.isnan(heights)
-    border = ~void & ndimage.binary_dilation(void, np.ones((3, 3), bool))
+    layers = heights.reshape(-1, *grid.shape)
+    void = np.isnan(layers[0])
+    border = ~void & ndimage.maximum_filter(void, 3, mode="constant")
     row, col = np.indices(grid.shape, np.float64)
     east, north = (col + 0.5) * grid.cell, -(row + 0.5) * grid.cell
-    interpolated = tin(east, north, np.where(border, heights, np.nan), grid, size_m + DIAGONAL * grid.cell)
-    return np.where(void, interpolated, heights)
+    filled = _interpolated(east, north, layers, border, grid, size_m + DIAGONAL * grid.cell)
+    return np.where(void, filled, layers).reshape(heights.shape)
 
 
 def voids_reach_m(size_m: float, cell: float) -> float:

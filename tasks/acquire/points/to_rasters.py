@@ -6,6 +6,7 @@ order of the points; heights agree to 1e-8 m, the rounding error of sums and lar
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -16,9 +17,9 @@ from flexroad.tasks import options as base
 from flexroad.tasks.acquire.points import ground_filter as slope_filter
 from flexroad.tasks.acquire.points import morphological as morphological_filter
 from flexroad.tasks.acquire.points import tin
-from flexroad.tasks.acquire.points.binning import Cells, bins, highest, means, spikes, top_layer
+from flexroad.tasks.acquire.points.binning import bins, highest, means, spikes, top_layer
 from flexroad.tasks.acquire.points.orthophoto import photo
-from flexroad.tasks.acquire.types import Points, Rasters, TopLayer
+from flexroad.tasks.acquire.types import CellHeights, Points, Rasters, TopLayer
 from flexroad.tasks.types import Bools, Floats, Orthophoto
 
 BRIDGE_CLASSES = {"asprs": (17,), "ahn": (26,)}
@@ -82,42 +83,90 @@ def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | No
     Rasters
         NaN without points, and the DTM without ground points; no orthophoto if the points have no colours.
     """
-    rim = grid.buffered(reach_m(options, grid.cell))
-    inner = rim.window(grid)
+    rim = grid.buffered(cells_reach_m(options, grid.cell))
+    pixels = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
+    heights, image = of_points(points, rim, options, pixels)
+    return replace(of_cells(heights, rim, grid, options), photo=image)
+
+
+def of_points(
+    points: Points, grid: Grid, options: Options, pixels: Grid | None
+) -> tuple[CellHeights, Orthophoto | None]:
+    """Return what the points of each cell give, and the orthophoto.
+
+    Parameters
+    ----------
+    points : Points
+        In the grid's CRS (m), including a rim of `points_reach_m` around the grid; others have no effect.
+    pixels : Grid, optional
+        Pixels of the orthophoto; None makes no orthophoto.
+
+    Returns
+    -------
+    CellHeights, Orthophoto or None
+        No orthophoto if the points have no colours.
+    """
     if options.despike_m is not None:
-        points = _without_spikes(points, rim, options.despike_m)
-    cells = bins(points.easting, points.northing, rim)
-    highest_points = highest(cells, points.height, rim.shape)
-    top = top_layer(cells, points.height, highest_points, options.top_layer_m, rim.shape)
-    decks = np.isin(points.kind, options.bridge_classes)
-    (bridges,) = means(cells[decks], rim.shape, points.height[decks])
-    ground = _is_ground(points, options) & ~decks
+        points = _without_spikes(points, grid.buffered(points_reach_m(options, grid.cell)), options.despike_m)
+    cells = bins(points.easting, points.northing, grid)
+    highest_points = highest(cells, points.height, grid.shape)
+    top = top_layer(cells, points.height, highest_points, options.top_layer_m, grid.shape)
+    decks = _has_class(points, options.bridge_classes)
+    (bridges,) = means(np.where(decks, cells, -1), grid.shape, points.height)
+    ground = _is_ground(points, cells >= 0, options) & ~decks
+    of_ground = means(
+        np.where(ground, cells, -1),
+        grid.shape,
+        points.easting - grid.west,
+        points.northing - grid.north,
+        points.height,
+    )
+    image = photo(points, pixels, options.dop_fill_m) if pixels and points.colour is not None else None
+    return CellHeights(highest_points, top, np.stack(of_ground), bridges), image
+
+
+def of_cells(heights: CellHeights, rim: Grid, grid: Grid, options: Options) -> Rasters:
+    """Return the rasters of a block of ground, without orthophoto.
+
+    Parameters
+    ----------
+    heights : CellHeights
+        On the cells of ``rim``: the grid and `cells_reach_m` around it.
+    """
+    inner = rim.window(grid)
+    top = heights.top
+    dsm, road_height = tin.fill_voids(np.stack([heights.highest, top.height]), rim, options.fill_m)
+    bridges = heights.bridges[inner]
     return Rasters(
         grid,
-        dsm=tin.fill_voids(highest_points, rim, options.fill_m)[inner],
-        dtm=_dtm(points[ground], rim, options)[inner],
-        top=TopLayer(
-            tin.fill_voids(top.height, rim, options.fill_m)[inner], top.count[inner], top.spread[inner]
-        ),
-        ground=_occupied(cells[ground], rim.shape)[inner],
-        bridges=bridges[inner] if np.isfinite(bridges[inner]).any() else None,
-        photo=_photo(points, grid, options, dop_cell),
+        dsm=dsm[inner],
+        dtm=_dtm(heights.ground, rim, grid, options)[inner],
+        top=TopLayer(road_height[inner], top.count[inner], top.spread[inner]),
+        ground=np.isfinite(heights.ground[2][inner]),
+        bridges=bridges if np.isfinite(bridges).any() else None,
     )
 
 
 def reach_m(options: Options, cell: float) -> float:
     """Return the largest distance from a grid of such cells at which points can change a value in it (m)."""
-    if options.dtm == "tin":
-        ground = tin.tin_reach_m(options.void_m, cell)
-    else:
-        ground = tin.voids_reach_m(options.void_m, cell)
+    return points_reach_m(options, cell) + cells_reach_m(options, cell)
+
+
+def points_reach_m(options: Options, cell: float) -> float:
+    """Return the largest distance at which points can change what `of_points` returns (m)."""
+    farthest = options.dop_fill_m
     if options.ground == "filter":
-        ground += options.filter.reach_m
+        farthest = max(farthest, options.filter.reach_m)
     if options.ground == "morphological":
-        ground += options.morphological.reach_m
-    farthest = max(ground, tin.voids_reach_m(options.fill_m, cell), options.dop_fill_m)
+        farthest = max(farthest, options.morphological.reach_m)
     # Whether a point is a spike depends on its own and the neighbouring cells.
     return farthest if options.despike_m is None else farthest + 2 * cell
+
+
+def cells_reach_m(options: Options, cell: float) -> float:
+    """Return the largest distance at which cells can change what `of_cells` returns (m)."""
+    reach = tin.tin_reach_m if options.dtm == "tin" else tin.voids_reach_m
+    return max(reach(options.void_m, cell), tin.voids_reach_m(options.fill_m, cell))
 
 
 def tags(options: Options) -> dict[str, str]:
@@ -162,30 +211,24 @@ def _without_spikes(points: Points, grid: Grid, despike_m: float) -> Points:
     return points[kept]
 
 
-def _is_ground(points: Points, options: Options) -> Bools:
+def _is_ground(points: Points, asked: Bools, options: Options) -> Bools:
+    """Return which of the points that are asked for are ground, ``(n,)``."""
     if options.ground == "classes":
-        return np.isin(points.kind, options.ground_classes)
+        return _has_class(points, options.ground_classes)
     if options.ground == "morphological":
         of = options.morphological
         return morphological_filter.ground(points.easting, points.northing, points.height, of)
-    return slope_filter.ground(points.easting, points.northing, points.height, options.filter)
+    return slope_filter.ground(points.easting, points.northing, points.height, options.filter, asked)
 
 
-def _occupied(cells: Cells, shape: tuple[int, int]) -> Bools:
-    """Return the cells that have a point, ``(H, W)``."""
-    occupied = np.zeros(shape, bool)
-    occupied.flat[cells[cells >= 0]] = True
-    return occupied
+def _has_class(points: Points, classes: tuple[int, ...]) -> Bools:
+    """Return which points have one of some classes, ``(n,)``."""
+    chosen = np.isin(np.arange(256), classes)
+    return chosen[points.kind]
 
 
-def _dtm(ground: Points, grid: Grid, options: Options) -> Floats:
-    cells = bins(ground.easting, ground.northing, grid)
+def _dtm(ground: Floats, rim: Grid, grid: Grid, options: Options) -> Floats:
+    """Return the bare ground, ``(H, W)``, m, on the cells of ``rim``; only those of ``grid`` are complete."""
     if options.dtm == "mean":
-        return tin.averaged(cells, ground.height, grid, options.void_m)
-    return tin.triangulated(cells, ground.easting, ground.northing, ground.height, grid, options.void_m)
-
-
-def _photo(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Orthophoto | None:
-    if points.colour is None or dop_cell is None:
-        return None
-    return photo(points, Grid.covering(grid.crs, grid.bounds, dop_cell), options.dop_fill_m)
+        return tin.fill_voids(ground[2], rim, options.void_m)
+    return tin.triangulated(ground, rim, options.void_m, rim.window(grid))

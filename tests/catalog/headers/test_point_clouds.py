@@ -5,7 +5,7 @@ from laspy.vlrs.known import GeoKeyDirectoryVlr
 
 from flexroad.catalog import CatalogError
 from flexroad.catalog.crs import in_plan
-from flexroad.catalog.headers.point_clouds import chunks, find, inspect
+from flexroad.catalog.headers.point_clouds import USED, _opened, chunks, find, inspect
 from tests.make_clouds import write_cloud
 
 N = 120_000
@@ -140,3 +140,24 @@ def test_find_searches_folders_and_removes_duplicates(tmp_path):
         find([tmp_path / "bare"])
     with pytest.raises(CatalogError, match="gone.laz does not exist"):
         find([tmp_path / "gone.laz"])
+
+
+def test_chunks_have_all_fields_that_they_hold_although_others_are_not_decoded(tmp_path):
+    rng, xyz = np.random.default_rng(1), some_points(500)
+    n, kind = len(xyz), np.arange(500) % 200
+    colour, gps = rng.integers(1, 2**16, (n, 3)), 1e8 + rng.random(n)
+    file = write_cloud(
+        tmp_path / "a.laz", xyz, kind, colour=colour, withheld=rng.random(n) < 0.3, gps=gps, standard=True
+    )
+    las = laspy.read(file)
+    las.intensity = rng.integers(0, 2**16, n)
+    las.write(file)
+    kept = ~np.asarray(las.withheld, bool)
+    got = list(chunks(file, 200, drop=()))
+    fields = {"x": las.x, "y": las.y, "z": las.z, "kind": las.classification, "gps": gps}
+    for name, expected in fields.items():
+        values = np.concatenate([getattr(chunk, name) for chunk in got])
+        np.testing.assert_array_equal(values, np.asarray(expected)[kept])
+    np.testing.assert_array_equal(np.concatenate([chunk.colour for chunk in got]), colour[kept])
+    with _opened(file, USED) as reader:
+        assert (reader.read_points(n).intensity != las.intensity).any()

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import rasterio
 
-from flexroad.catalog import Catalog, CatalogError
+from flexroad.catalog import Catalog, CatalogError, Grid
 from flexroad.catalog.crs import vertical
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.prepare import point_buckets, points
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.points import prepare_points
-from flexroad.tasks.acquire.points.to_rasters import Options
+from flexroad.tasks.acquire.points.to_rasters import Options, rasterise
+from flexroad.tasks.acquire.types import Points
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.load import Options as LoadOptions
 from flexroad.tasks.load import load
@@ -205,6 +206,35 @@ def test_prepare_points_in_other_order_gives_the_same_rasters(plain, tmp_path):
     two_files(tmp_path / "clouds", swap=True)
     prepare([tmp_path / "clouds"], tmp_path / "out", ground="filter")
     check_same(tmp_path / "out", plain[1])
+
+
+@pytest.mark.parametrize("despike_m", [None, 5])
+def test_prepare_points_in_blocks_gives_the_rasters_of_all_points_at_once(tmp_path, monkeypatch, despike_m):
+    """Points on the borders of cells, blocks and the area; voids and spikes at the borders of blocks."""
+    monkeypatch.setattr(point_buckets, "POINTS_PER_BLOCK", 1)
+    monkeypatch.setattr(point_buckets, "SHORTEST_EDGE_M", 37.0)
+    rng = np.random.default_rng(8)
+    east, north = (axis.ravel() for axis in np.meshgrid(np.arange(0, 90.5, 0.5), np.arange(0, 90.5, 0.5)))
+    xyz = np.stack(
+        [east + 356e3, north + 5699e3, ground(east, north) + rng.normal(0, 0.1, east.size)], axis=1
+    )
+    xyz[:, 2] = np.round(xyz[:, 2] + 20 * (rng.random(east.size) < 0.01), 2)
+    xyz = xyz[(abs(east % 37) > 2) | (north % 30 > 4)]
+    kind = rng.choice([2, 5, 17], len(xyz), p=[0.6, 0.3, 0.1]).astype(np.uint8)
+    colour = rng.integers(0, 256, (len(xyz), 3)).astype(np.uint16)
+    options = Options(despike_m=despike_m, void_m=6, fill_m=2)
+    file = write_cloud(tmp_path / "a.las", xyz, kind, "EPSG:25832", colour)
+    _, lines = prepare([file], tmp_path / "out", options=options, ground="classes")
+    assert any(line.endswith(" blocks of 37 m") for line in lines)
+    area = Grid("EPSG:25832", 356e3, 5699090.0, 1.0, 90, 90)
+    whole = rasterise(Points(*xyz.T, kind, colour.astype(np.uint8)), area, options, 0.5)
+    for layer in ("dsm", "dtm", "bridges"):
+        np.testing.assert_array_equal(
+            read(tmp_path / "out", layer)[0], getattr(whole, layer).astype(np.float32)
+        )
+    top = np.stack([whole.top.height, whole.top.count, whole.top.spread]).astype(np.float32)
+    np.testing.assert_array_equal(read(tmp_path / "out", "road_height")[0], top)
+    np.testing.assert_array_equal(read(tmp_path / "out", "dop")[0].filled(0), whole.photo.colour)
 
 
 def test_prepare_points_with_workers_gives_the_same_rasters(plain, tmp_path, monkeypatch, executor):

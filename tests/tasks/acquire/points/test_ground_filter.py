@@ -68,6 +68,17 @@ def test_ground_at_map_coordinates_equals_comparison_of_all_pairs(seed, options)
     assert 0 < ground(*cloud, options).sum() < cloud.shape[1]
 
 
+@pytest.mark.parametrize("n", [40, 3000])
+def test_ground_of_few_points_asked_for_is_that_of_all(n):
+    """With 3000 points buckets are full, and sorted in another way."""
+    rng = np.random.default_rng(n)
+    points = rng.uniform(0, 12, n), rng.uniform(0, 12, n), np.round(rng.uniform(0, 6, n), 1)
+    expected, asked = oracle.ground(*points, Options(radius_m=4)), points[0] > 7
+    np.testing.assert_array_equal(ground(*points, Options(radius_m=4)), expected)
+    np.testing.assert_array_equal(ground(*points, Options(radius_m=4), asked), expected & asked)
+    assert 0 < expected[asked].sum() < asked.sum()
+
+
 def test_ground_excludes_low_outliers_without_companions():
     x, y = lattice()
     z = np.zeros_like(x)

@@ -2,10 +2,11 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.points.binning import bins
-from flexroad.tasks.acquire.points.tin import averaged, tin, tin_reach_m, triangulated
+from flexroad.tasks.acquire.points.binning import bins, means
+from flexroad.tasks.acquire.points.tin import _acting, fill_voids, tin, tin_reach_m, triangulated
 
 CELL = 0.5
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
@@ -85,6 +86,23 @@ def test_tin_of_a_block_equals_that_of_all_nodes(spread):
         np.testing.assert_allclose(result, expected[core], rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
+@pytest.mark.parametrize("seed", range(3))
+def test_tin_of_inner_cells_is_the_same_without_nodes_that_cannot_act(seed, share):
+    """Voids of all sizes, some of which lead from the inner cells to the border."""
+    rng = np.random.default_rng(seed)
+    where = grid(90, 80)
+    rough = ndimage.gaussian_filter(rng.random(where.shape), 3)
+    is_node = (rough > np.quantile(rough, share)) & (rng.random(where.shape) < 0.95)
+    height = np.where(is_node, rng.uniform(100, 110, where.shape), np.nan)
+    nodes = nodes_of(where, rng.random((*where.shape, 2)), height)
+    inner = slice(30, 50), slice(32, 58)
+    expected = tin(*nodes, where, 25 * CELL)
+    np.testing.assert_array_equal(tin(*nodes, where, 25 * CELL, inner)[inner], expected[inner])
+    kept = (_acting(is_node, inner) & is_node).sum() / is_node.sum()
+    assert kept < 0.3 or share > 0
+
+
 @pytest.mark.parametrize(
     "cells", [[], [(3, 3)], [(3, 3), (4, 4)], [(2, 1), (2, 3), (2, 4)], [(1, 1), (2, 2), (5, 5)]]
 )
@@ -113,14 +131,17 @@ def scattered(rng, n=6000, lopsided=1.0):
 
 
 def dtm_of(easting, northing, height, void_m=50.0):
-    return triangulated(bins(easting, northing, GRID), easting, northing, height, GRID, void_m)
+    cells = bins(easting, northing, GRID)
+    centroids = means(cells, GRID.shape, easting - GRID.west, northing - GRID.north, height)
+    return triangulated(np.stack(centroids), GRID, void_m)
 
 
 def test_triangulated_plane_is_exact_for_any_sampling():
     points = scattered(np.random.default_rng(0), lopsided=3)
     inside = slice(2, -2), slice(2, -2)
     np.testing.assert_allclose(dtm_of(*points)[inside], TRUTH[inside], atol=1e-8)
-    difference = averaged(bins(points[0], points[1], GRID), points[2], GRID, 50) - TRUTH
+    (mean,) = means(bins(points[0], points[1], GRID), GRID.shape, points[2])
+    difference = fill_voids(mean, GRID, 50) - TRUTH
     # The mean per cell is the height at the centroid, a quarter of a cell to the north-west.
     assert difference.mean() == pytest.approx(-0.25 * 0.1 - 0.25 * 0.25, abs=2e-3)
 
