@@ -16,7 +16,7 @@ import flexroad
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ClusterLost, ConfigError
-from flexroad.pipeline.execute import DaskExecutor
+from flexroad.pipeline.execute import DaskExecutor, clusters
 from flexroad.pipeline.execute.clusters import kubernetes_options, open_cluster
 from flexroad.pipeline.execute.slurm import slurm_options
 from flexroad.pipeline.execute.workers import checksum_of_code
@@ -98,6 +98,15 @@ def test_map_many_jobs_cache_of_keys_stays_small(cluster, monkeypatch):
     key_split.cache_clear()
     assert len(list(DaskExecutor(scheduler=cluster.scheduler_address).map(double, range(70), lost))) == 70
     assert 0 < key_split.cache_info().currsize < 40
+
+
+def test_held_executor_has_one_connection_for_several_maps(cluster, monkeypatch):
+    opened, connected = [], clusters.connected
+    monkeypatch.setattr(clusters, "connected", lambda *given: opened.append(1) or connected(*given))
+    with DaskExecutor(scheduler=cluster.scheduler_address).held() as held:
+        for numbers in ([1, 2], [], [3]):
+            assert sorted(held.map(double, numbers, lost)) == [2 * number for number in numbers]
+    assert len(opened) == 1
 
 
 def threads(job):
