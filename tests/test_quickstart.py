@@ -23,7 +23,7 @@ def quick_starts() -> dict[str, list[list[str]]]:
     sections = PAGE.read_text().split("\n## ")[1:]
     blocks = [re.findall(r"^\$ flexroad (.*)$", section, flags=re.MULTILINE) for section in sections]
     commands = [[shlex.split(line) for line in lines] for lines in blocks]
-    return {lines[0][1]: lines for lines in commands}
+    return {lines[0][1]: lines for lines in commands if lines[0][0] == "init"}
 
 
 def test_page_has_a_section_per_download():
