@@ -298,7 +298,9 @@ def _format(source: Path) -> ModuleType:
     for begin, said in PACKED.items():
         if begin in head(source)[:64]:
             raise TaskError(f"{said.format(file=shlex.quote(str(source)))}")
-    raise TaskError(f"is of no known format; give {KINDS}")
+    raise TaskError(
+        f"is of no known format; give {KINDS}; convert others, such as DXF, with ogr2ogr NEW.gpkg FILE"
+    )
 
 
 def _require_suffix(module: ModuleType, source: Path, out: Path) -> None:

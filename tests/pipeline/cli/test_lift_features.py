@@ -408,3 +408,12 @@ def test_a_bridge_of_which_the_run_has_no_level_is_reported(run, flexroad, tmp_p
     assert "28.0 m of 1 feature are on a deck of unknown height" in said.err
     rows = list(csv.DictReader(report.open()))
     assert [float(row["unknown_deck_m"]) for row in rows] == [0, 28]
+
+
+def test_lift_of_a_dxf_is_refused_with_the_command_that_converts_it(run, flexroad, tmp_path):
+    # GDAL would write back lines without their texts, blocks, colours and header.
+    source = tmp_path / "in.dxf"
+    geopandas.GeoDataFrame(geometry=LINES[:1], crs=UTM).to_file(source, driver="DXF", engine="pyogrio")
+    said = flexroad("lift", source, run, "-o", tmp_path / "out.dxf", "--crs", UTM).expected(2)
+    assert "such as DXF, with ogr2ogr NEW.gpkg FILE" in said.err
+    assert not (tmp_path / "out.dxf").exists()
