@@ -1,8 +1,10 @@
 """``flexroad lift``: files of other programs with heights of tilted ground, and files that are refused."""
 
 import gzip
+import os
 import resource
 import signal
+import subprocess
 from pathlib import Path
 
 import geopandas
@@ -11,6 +13,8 @@ import pandas as pd
 import pyproj
 import pytest
 
+from tests import command_line
+from tests.faulty_files import FAULTS, Faulty, intercepted
 from tests.make_rasters import UTM
 from tests.pipeline.cli.test_query import SOUTH, WEST, ground, made_run
 from tests.tasks.lift.test_sumo import lane, points
@@ -243,3 +247,75 @@ def test_a_full_disk_leaves_what_was_there(run, flexroad, source, tmp_path):
     assert str(out) in line
     assert out.read_text() == "before"
     assert {path.name for path in tmp_path.iterdir()} == {source.name, out.name}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_at_any_operation_leaves_the_whole_copy_or_none(run, flexroad, tmp_path, fault):
+    text = net()
+    source = written(tmp_path / "n.net.xml", text.replace("\n", " " * 10_000 + "\n", 1))
+    flexroad("lift", source, run, "-o", tmp_path / "whole.net.xml").expected(0)
+    whole = (tmp_path / "whole.net.xml").read_bytes()
+    folder, seen = tmp_path / "out", Faulty(10**9, lambda: None)
+    with intercepted(tmp_path / "seen", seen):
+        flexroad("lift", source, run, "-o", tmp_path / "seen" / "o.net.xml").expected(0)
+    assert len(seen.met) > 3
+    codes, out = set(), folder / "o.net.xml"
+    for at in range(len(seen.met)):
+
+        def faulty(at=at) -> int:
+            with intercepted(folder, FAULTS[fault](at)):
+                said = command_line.call("lift", source, run, "-o", out)
+            assert len(said.err.splitlines()) == bool(said.code)
+            return said.code
+
+        codes.add(command_line.forked(faulty))
+        assert not out.exists() or out.read_bytes() == whole
+        left = [path.name for path in folder.iterdir()] if folder.exists() else []
+        # What a killed process leaves, or cannot remove, is hidden; the next command removes it.
+        assert all(name == out.name or name.startswith(".flexroad-") for name in left)
+        out.unlink(missing_ok=True)
+    # A lock of the temporary folder that cannot be made is no error.
+    assert codes in ({2}, {0, 2}, {-signal.SIGKILL})
+    flexroad("lift", source, run, "-o", out).expected(0)
+    assert [path.name for path in folder.iterdir()] == [out.name]
+
+
+def large_net(path: Path, size: int) -> None:
+    """Write a network of streets in the same place, of some bytes."""
+    begin, end = net().split('<edge id="ab"')[0], net()[net().index("<junction") :]
+    shape = " ".join(f"{1 + 0.38 * i:.2f},{20 + i % 2 / 10:.2f}" for i in range(101))
+    with path.open("w") as file:
+        file.write(begin)
+        for number in range(size // (2 * len(shape))):
+            file.write(lane(f"e{number}", 'from="a" to="b"', shape, shape))
+        file.write(end)
+
+
+def large_osm(path: Path, size: int) -> None:
+    """Write an OSM file of some bytes with many nodes and short ways."""
+    node, way = osm((20, 20)).splitlines()[1].replace(' id="1"', ""), '<tag k="highway" v="service"/></way>\n'
+    number = size // (len(node) + 30)
+    with path.open("w") as file:
+        file.write('<osm version="0.6">\n')
+        file.writelines(f'{node[:5]} id="{i}"{node[5:]}\n' for i in range(1, number))
+        for i in range(1, number - 10, 10):
+            refs = "".join(f'<nd ref="{i + k}"/>' for k in range(10))
+            file.write(f'<way id="{i}">{refs}{way}')
+        file.write("</osm>\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("write", [large_net, large_osm])
+def test_memory_does_not_grow_with_the_file(run, tmp_path, write):
+    peaks = []
+    for size in (10**5, 10**8):
+        source, out = tmp_path / "a.xml", tmp_path / "b.xml"
+        write(source, size)
+        words = ["lift", source, run, "-o", out]
+        child = subprocess.Popen([*command_line.PROCESS, *map(str, words)], stdout=subprocess.DEVNULL)
+        _, status, used = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        assert child.returncode == 0
+        assert out.stat().st_size > source.stat().st_size
+        peaks.append(used.ru_maxrss / 1024)
+    assert peaks[1] < peaks[0] + 700
