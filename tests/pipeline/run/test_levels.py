@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import geopandas
 import numpy as np
 import pandas as pd
+import pyproj
 import pytest
 import rasterio
 import shapely
@@ -21,6 +22,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.export.viewer import write_viewer
+from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.garbage import find_garbage
 from flexroad.pipeline.run.record import Run
@@ -502,3 +504,65 @@ def test_one_surface_of_tiles_with_decks_is_refused_with_a_remedy(run):
         else:
             x, y = (west + east) / 2, (south + north) / 2
             assert view.surface(inside).height(x, y) == pytest.approx(float(view.height(x, y)), abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["net.xml", "osm"])
+def test_networks_of_sumo_and_osm_have_the_level_of_each_road(run, tmp_path, kind):
+    """By the heights of the roads that an edge meets, or by the tags of OSM."""
+    roads = Crossings(SEED).roads(flexroad.open_run(run.path).tiles.total_bounds)
+    source, out, report = tmp_path / f"a.{kind}", tmp_path / f"b.{kind}", tmp_path / "r.csv"
+    source.write_text(network(roads) if kind == "net.xml" else streets(roads))
+    call("lift", source, run.path, "-o", out, "--report", report).expected(0)
+    levels = pd.read_csv(report, dtype=str, keep_default_na=False).set_index("id").levels
+    ground, decks, below = Ground.open(run.path), 0, 0
+    for number, road in enumerate(roads):
+        x, y, z = lifted(out, number).T
+        on = np.isfinite(z)
+        found, _ = ground.heights(x[on], y[on], steps=False)
+        low, deck = found.z if len(found.z) == 2 else (found.ground, np.full(on.sum(), np.nan))
+        if road.level:
+            decks += np.isfinite(deck).sum()
+            assert "1" in levels[str(number)] or not len(deck)
+        else:
+            below += np.isfinite(deck).sum()
+            deck = np.full(on.sum(), np.nan)
+        # Beyond its joints a road on a deck is on the ground.
+        np.testing.assert_allclose(z[on], np.where(np.isfinite(deck), deck, low), atol=0.006)
+    assert min(decks, below) > 0
+
+
+def network(roads) -> str:
+    """A network of SUMO with an edge for each road."""
+    edges = []
+    for number, road in enumerate(roads):
+        shape = " ".join(f"{x:.3f},{y:.3f}" for x, y in road.points)
+        edges.append(f'<edge id="{number}"><lane id="{number}_0" index="0" shape="{shape}"/></edge>')
+    return "\n".join(['<net><location netOffset="0,0" projParameter="EPSG:25832"/>', *edges, "</net>"])
+
+
+def streets(roads) -> str:
+    """An OSM file with a way for each road, and tags of bridges."""
+    to_degrees = pyproj.Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True)
+    nodes, ways = [], []
+    for number, road in enumerate(roads):
+        refs = ""
+        for lon, lat in zip(*to_degrees.transform(*road.points.T), strict=True):
+            nodes.append(f'<node id="{len(nodes) + 1}" lat="{lat:.10f}" lon="{lon:.10f}"/>')
+            refs += f'<nd ref="{len(nodes)}"/>'
+        bridge = '<tag k="bridge" v="yes"/>' if road.level else ""
+        ways.append(f'<way id="{number}">{refs}<tag k="highway" v="{road.highway}"/>{bridge}</way>')
+    return "\n".join(["<osm>", *nodes, *ways, "</osm>"])
+
+
+def lifted(path, number: int) -> np.ndarray:
+    """Easting, northing and height of the points of a road; NaN without height."""
+    root = ElementTree.parse(path).getroot()
+    if path.suffix == ".xml":
+        shape = root.find(f"edge[@id='{number}']/lane").get("shape")
+        return np.array([[*map(float, each.split(",")), np.nan][:3] for each in shape.split()])
+    nodes = {node.get("id"): node for node in root.findall("node")}
+    found = [nodes[each.get("ref")] for each in root.findall(f"way[@id='{number}']/nd")]
+    to_map = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:25832", always_xy=True)
+    x, y = to_map.transform(*([float(node.get(name)) for node in found] for name in ("lon", "lat")))
+    tags = [node.find("tag") for node in found]
+    return np.column_stack([x, y, [np.nan if tag is None else float(tag.get("v")) for tag in tags]])
