@@ -160,6 +160,17 @@ def test_causes_has_the_published_figures_of_the_calibrated_benchmark():
     assert [figure for figure in expected if figure not in quoted] == []
 
 
+def test_causes_has_road_l2_by_the_dsm():
+    """Each row of section 8 is one of the table that has both references."""
+    rows = tables("L2 on roads by the reference and by the DSM")
+    columns = [f"L2 road (m), {name}" for name in ("paper", "ours by the reference", "ours by the DSM")]
+    known = {f"| {row['variant']} | {' | '.join(row[column] for column in columns)} |" for row in rows}
+    section = (RESULTS / "causes.md").read_text().partition("## 8.")[2]
+    shown = [line for line in section.splitlines() if line.startswith("| ")][2:]
+    assert len(shown) > 8
+    assert [line for line in shown if line not in known] == []
+
+
 def test_data_page_has_the_errors_on_real_data():
     """Tiles, L2 on roads by three methods, and L2 of FlexRoad on terrain of each data set."""
     shown = (ROOT / "docs" / "data.md").read_text().partition("## Real data")[2].partition("\n## ")[0]

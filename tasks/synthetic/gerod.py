@@ -122,6 +122,8 @@ ERRORS: Mapping[str, float] = {
     "works": 0.25,
     # The paper's 10 cm of error of its height models, taken as two standard deviations.
     "flight_offset_m": 0.05,
+    # The published DSM has 14.482 of 15.0 million cells: 3.5% have no height.
+    "voids": 0.4,
 }
 """Errors of the masks and of the DTM, the same in all strata, with the figure that fixed each.
 

@@ -91,8 +91,8 @@ def orthophoto(
         If the tile is not a whole number of pixels wide or high, or the scene cannot be made.
     """
     pixels = _pixel_grid(grid, gsd)
-    # A photo shows surfaces, without the height noise of a scan.
-    noise_free = options.model_copy(update={"dsm_noise_m": (0.0, 0.0), "mixed": 0.0})
+    # A photo shows surfaces, without the height noise and the voids of a scan.
+    noise_free = options.model_copy(update={"dsm_noise_m": (0.0, 0.0), "mixed": 0.0, "voids": 0.0})
     scene = make_scene(pixels.buffered(MARGIN_M), seed, stratum, noise_free)
     rng = generator(seed, "orthophoto", *map(int, grid.origin))
     picture = _ground(scene, seed)

@@ -8,6 +8,7 @@ from flexroad.catalog import Grid
 from flexroad.tasks.synthetic import Kind, Scene, SceneOptions, block, make_scene
 from flexroad.tasks.synthetic.network import Plan
 from flexroad.tasks.synthetic.objects import Crown, from_middle
+from flexroad.tasks.synthetic.orthophoto import orthophoto
 from flexroad.tasks.synthetic.spoilers import Canvas
 from flexroad.tasks.synthetic.voids import hidden
 
@@ -71,3 +72,9 @@ def test_neighbouring_tiles_have_the_same_voids():
     parts = [made(WOODED, grid=tile) for _, tile in block(2)[:2]]
     joined = np.isnan(np.hstack([part.dsm for part in parts]))
     assert np.mean(joined != np.isnan(both.dsm)) < 0.002
+
+
+def test_photo_has_no_voids():
+    grid = Grid(GRID.crs, GRID.west, GRID.north, 1.0, 60, 60)
+    photos = [orthophoto(grid, 2, "rural", SceneOptions(**WOODED, voids=voids)) for voids in (0.0, 0.4)]
+    assert np.array_equal(*photos)
