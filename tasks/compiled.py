@@ -2,6 +2,9 @@
 
 Importing them does not import numba, so commands that compute nothing start fast. Compiled code is cached on
 disk and used by later processes.
+
+To compile all takes some seconds on a new machine. An array or a tuple that is assigned to a slice or a row
+takes most of a second of them, for the message that their shapes differ: assign element by element.
 """
 
 from __future__ import annotations

@@ -91,6 +91,6 @@ def _to_units(normals: Floats) -> None:
         x, y, z = normals[i]
         length = math.sqrt(x * x + y * y + z * z)
         if length > 0.0:
-            normals[i] /= length
+            normals[i, 0], normals[i, 1], normals[i, 2] = x / length, y / length, z / length
         else:
             normals[i, 2] = 1.0

@@ -34,7 +34,7 @@ def _normals(vertices: Floats, faces: Indices) -> Floats:
         bx, by, bz = vertices[faces[f, 1]]
         cx, cy, cz = vertices[faces[f, 2]]
         ux, uy, uz, vx, vy, vz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
-        normals[f] = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        normals[f, 0], normals[f, 1], normals[f, 2] = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     return normals
 
 

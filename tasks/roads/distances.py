@@ -124,6 +124,13 @@ def columns_of(mask: Bools) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
     before : (H * W + 1,) array of int
         Number of cells of the mask before each cell.
     """
-    before = np.zeros(mask.size + 1, np.int32)
-    before[1:] = np.cumsum(mask)
-    return np.flatnonzero(mask) % mask.shape[1], before
+    rows, wide = mask.shape
+    before, number = np.zeros(mask.size + 1, np.int32), 0
+    columns = np.empty(mask.size, np.intp)
+    for r in range(rows):
+        for c in range(wide):
+            if mask[r, c]:
+                columns[number] = c
+                number += 1
+            before[r * wide + c + 1] = number
+    return columns[:number].copy(), before

@@ -94,7 +94,10 @@ def extrapolated_plane(
     """
     datum, n = float(heights[valid].mean()), int(REACH_M / cell)
     bell = np.exp(-0.5 * (np.arange(-n, n + 1) * cell / NEAR_M) ** 2)
-    sums, nearest = _sums(heights, valid, np.argwhere(wanted), bell, cell, datum)
+    cells = np.argwhere(wanted)
+    # Cells in one column, one below the other, have most of their rows in common.
+    order = np.argsort(cells[:, 1], kind="stable")
+    sums, nearest = _sums(heights, valid, cells, order, bell, cell, datum)
     with np.errstate(invalid="ignore", divide="ignore"):
         r, c, rr, rc, cc, m, mr, mc, mm = sums[:, 1:].T / sums[:, 0]
         # Central moments give two equations for the slopes, then the height at offset 0.
@@ -114,7 +117,13 @@ def _least_spread(rr: Floats, rc: Floats, cc: Floats) -> Floats:
 
 @compiled()
 def _sums(
-    heights: Floats, valid: Bools, cells: NDArray[np.intp], bell: Floats, cell: float, datum: float
+    heights: Floats,
+    valid: Bools,
+    cells: NDArray[np.intp],
+    order: NDArray[np.intp],
+    bell: Floats,
+    cell: float,
+    datum: float,
 ) -> tuple[Floats, Floats]:
     """Return weighted sums over the valid cells around each cell, and the squared distance to the nearest.
 
@@ -123,14 +132,15 @@ def _sums(
     """
     reach = len(bell) // 2
     sums, nearest = np.zeros((len(cells), 10)), np.full(len(cells), np.inf)
-    # Cells in one column, one below the other, have most of their rows in common.
     row_sums, done_for = np.empty((len(valid), 7)), np.full(len(valid), -1)
     columns, before = columns_of(valid)
-    for k in np.argsort(cells[:, 1], kind="mergesort"):
+    for k in order:
         row, col = cells[k]
         for i in range(max(row - reach, 0), min(row + reach + 1, len(valid))):
             if done_for[i] != col:
-                row_sums[i] = _row_sums(heights, columns, before, i, col, bell, cell, datum)
+                of_row = _row_sums(heights, columns, before, i, col, bell, cell, datum)
+                for j in range(7):
+                    row_sums[i, j] = of_row[j]
                 done_for[i] = col
             n, c, cc, z, cz, zz, beside = row_sums[i]
             if n == 0.0:

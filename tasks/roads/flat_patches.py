@@ -76,7 +76,7 @@ def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple
                 if not whole:
                     break
             if whole:
-                slopes[r, c] = rz / spread, cz / spread
+                slopes[r, c, 0], slopes[r, c, 1] = rz / spread, cz / spread
                 square = zz - z * z / n - (rz * rz + cz * cz) / spread
                 smooth[r, c] = square <= largest * (n - 3)
     return slopes, smooth
@@ -106,7 +106,7 @@ def _along_street(slopes: Floats, smooth: Bools, around: int, largest: float) ->
                 for i in range(max(r - around, 0), min(r + around + 1, rows)):
                     n, down, across = n + beside[i, c, 0], down + beside[i, c, 1], across + beside[i, c, 2]
                 down, across = down / n, across / n
-                trend[r, c] = down, across
+                trend[r, c, 0], trend[r, c, 1] = down, across
                 bend = (slopes[r, c, 0] - down) ** 2 + (slopes[r, c, 1] - across) ** 2
                 centres[r, c] = bend <= largest
     return centres, trend

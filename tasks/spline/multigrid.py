@@ -167,7 +167,10 @@ def _prepare(
         if level == 0:
             n, width = levels[0, 0], levels[0, 1]
             mean = stencil[:, 0, 0].sum() / (n * (width - 2 * p))
-            stencil[:, 0, 0, p : width - p] += ridge * mean + 1e-300
+            added = ridge * mean + 1e-300
+            for j in range(n):
+                for i in range(p, width - p):
+                    stencil[j, 0, 0, i] += added
         else:
             coarsen(_stencil_of(stencils, levels, level - 1, lags), weights, stencil, lags)
         failed = _factor(stencil, is_free, _band_of(bands, levels, level, lags), lags)
@@ -233,7 +236,8 @@ def _sweep_down(
     """Solve one line after the other from the first; ``whole`` is false if ``x`` is 0 before."""
     work = np.zeros(x.shape[1])
     for j in range(len(x)):
-        work[:] = right[j]
+        for i in range(len(work)):
+            work[i] = right[j, i]
         add_lower(stencil, x, j, -1.0, work, lags)
         if whole:
             add_upper(stencil, x, j, -1.0, work, lags)
@@ -245,7 +249,8 @@ def _sweep_up(stencil: Floats, band: Floats, free: Floats, right: Floats, x: Flo
     """Solve one line after the other from the last."""
     work = np.zeros(x.shape[1])
     for j in range(len(x) - 1, -1, -1):
-        work[:] = right[j]
+        for i in range(len(work)):
+            work[i] = right[j, i]
         add_lower(stencil, x, j, -1.0, work, lags)
         add_upper(stencil, x, j, -1.0, work, lags)
         _solve_line(band[j], free[j], work, x[j], lags)
@@ -269,7 +274,8 @@ def _cycle(
             for j in range(len(y)):
                 r[j] = 0.0
                 add_upper(stencil, y, j, -1.0, r[j], lags)
-                r[j] *= is_free[j]
+                for i in range(r.shape[1]):
+                    r[j, i] *= is_free[j, i]
             restrict(
                 r, weights, _lines_of(free, levels, level + 1), _lines_of(right, levels, level + 1), lags
             )
@@ -284,6 +290,13 @@ def _cycle(
         if level < last:
             add_coarse(_lines_of(x, levels, level + 1), weights, is_free, y, lags)
         _sweep_up(stencil, band, is_free, b, y, lags)
+
+
+@compiled(error_model="numpy", fused=True)
+def _product(a: Floats, b: Floats, out: Floats) -> None:
+    for j in range(a.shape[0]):
+        for i in range(a.shape[1]):
+            out[j, i] = a[j, i] * b[j, i]
 
 
 @compiled(error_model="numpy", fused=True)
@@ -307,7 +320,7 @@ def _conjugate_gradients(
     residual, z = _lines_of(vectors[0], levels, 0), _lines_of(vectors[1], levels, 0)
     solution, direction = np.zeros_like(right), np.zeros_like(right)
     image = np.zeros_like(right)
-    residual[:] = right * is_free
+    _product(right, is_free, residual)
     before = 0.0
     for number in range(iterations):
         _cycle(
