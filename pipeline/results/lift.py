@@ -55,6 +55,8 @@ PACKED = {
     b"OSMHeader": "is OSM's PBF; convert it: osmium cat {file} -o streets.osm",
 }
 """What to do with files that are not read, by their first bytes."""
+DISTANCES = {"elevation_m": "", "superelevation_m": " with superelevation", "shape_m": " with shapes"}
+"""Distances from the surface in the summary, and what they are with."""
 PLACES = ".gpkg"
 """Places above limits are in a file beside the report, of the same name with this suffix."""
 
@@ -81,10 +83,13 @@ class LiftedFile:
             parts.append(f"{_length(self.rows, 'without_ground_m')} beyond the tiles {kept}")
         if any(row.unknown_deck_m > 0 for row in self.rows):
             parts.append(f"{_length(self.rows, 'unknown_deck_m')} on decks or in tunnels of unknown height")
-        off = [[row.elevation_m, row.superelevation_m, row.shape_m] for row in self.rows]
-        least = [min(figures) for row in off if (figures := [value for value in row if np.isfinite(value)])]
-        if least:
-            parts.append(f"at most {1000 * max(least):.0f} mm from the surface")
+        figures = [
+            f"{1000 * max(values):.0f} mm{words}"
+            for name, words in DISTANCES.items()
+            if (values := [value for row in self.rows if np.isfinite(value := getattr(row, name))])
+        ]
+        if figures:
+            parts.append(f"at most {', '.join(figures)} from the surface")
         return "; ".join(parts)
 
     @property

@@ -13,7 +13,6 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.catalog.text import shown
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.lift import lanes, levels, opendrive_text, plan_view, road_levels, road_profiles, xml_text
 from flexroad.tasks.lift.batches import with_heights
@@ -171,7 +170,7 @@ def _read(part: bytes | Part, options: Options) -> bytes | Left | Road:
         with np.errstate(all="ignore"):
             return _road(part, name, options)
     except TaskError as error:
-        return Left(part, name, f"road {shown(name)} {error}; it stays as it was")
+        return Left(part, name, f"{error}; it stays as it was")
 
 
 def _road(part: Part, name: str, options: Options) -> Road:

@@ -40,7 +40,10 @@ def run(tmp_path_factory) -> Path:
 def test_roads_get_the_heights_of_the_run(run, flexroad, tmp_path, header, words):
     source, out, report = write(tmp_path, ROAD, header=header), tmp_path / "out.xodr", tmp_path / "report.csv"
     said = flexroad("lift", source, run, "-o", out, "--report", report, *words).expected(0)
-    assert said.out.startswith(f"{out}: 1 road, 3")
+    across = 175 if "1.57" in header else 70
+    assert (
+        said.out == f"{out}: 1 road, 30 m; at most {across} mm, 0 mm with superelevation from the surface\n"
+    )
     element = ET.parse(out).getroot().find("road")
     down = 90 if "z=" in header else 0
     turned = "1.57" in header
@@ -51,6 +54,14 @@ def test_roads_get_the_heights_of_the_run(run, flexroad, tmp_path, header, words
     (row,) = csv.DictReader(report.open())
     assert float(row["superelevation_max_mm"]) < 1
     assert float(row["grade_max_percent"]) == pytest.approx(2 if turned else 5, abs=0.01)
+
+
+def test_roads_that_stay_are_named_with_the_reason(run, flexroad, tmp_path):
+    bad = road(length=0.0, name="9")
+    source, out = write(tmp_path, ROAD, bad, header=UTM + HERE), tmp_path / "out.xodr"
+    said = flexroad("lift", source, run, "-o", out).expected(0)
+    assert said.err == "note: 1 road: has a length of 0 m; it stays as it was (9)\n"
+    assert bad in out.read_text()
 
 
 @pytest.mark.parametrize(
