@@ -35,8 +35,8 @@ ACROSS_M, SHAPE_ACROSS_M = 1.0, 0.5
 """Distance of the points of a cross-section, and where shapes are written (m)."""
 LEAST_ACROSS, MOST_ACROSS = 4, 80
 """Number of the points of a cross-section, less one."""
-MOST_FINER = 8
-"""Cross-sections for each of the usual ones, at most, where a road bends."""
+MOST_FINER, MOST_FINE = 8, 4000
+"""Cross-sections for each of the usual ones, at most, where a road bends, and of a road that has more."""
 LONGEST_M = 50_000.0
 """Longest road (m)."""
 Structure = tuple[Literal["bridge", "tunnel"], float, float]
@@ -187,9 +187,12 @@ def _road(part: Part, name: str, options: Options) -> Road:
     kept = np.diff(np.searchsorted(plan.start[:, 0], s, side="right")) == 0
     turned = float(np.abs(np.diff(plan.at(s)[2]))[kept].max(initial=0.0)) * reach
     if np.isfinite(turned) and turned > ALONG_M:
-        s = np.linspace(0.0, length, count * int(min(np.ceil(turned / ALONG_M), MOST_FINER)) + 1)
+        finer = int(min(np.ceil(turned / ALONG_M), MOST_FINER, max(1, MOST_FINE // count)))
+        s = np.linspace(0.0, length, count * finer + 1)
         extent = lanes.extent(element, s)
     x, y, heading = plan.at(s)
+    if not np.isfinite([x, y, heading]).all():
+        raise TaskError("has a planView with places that are no numbers")
     right, left = float(extent.right.min()), float(extent.left.max())
     step = SHAPE_ACROSS_M if options.lateral == "shape" else ACROSS_M
     if left - right < ACROSS_M / 2:
@@ -386,7 +389,7 @@ def _notes(road: Road, options: Options) -> Iterator[str]:
     if road.extent.level and options.lateral != "none":
         yield ALL_LEVEL
     if options.crg and road.crg is None:
-        yield "has no OpenCRG file of the surface: it has one of its own, is too short, or bends too much"
+        yield "has no OpenCRG file: it has one of its own, is too short or too large, or bends too much"
 
 
 def _steep(

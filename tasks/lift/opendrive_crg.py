@@ -24,6 +24,8 @@ INCREMENT_M = 0.5
 """Distance of the rows of a file (m), about."""
 SHORTEST_M = 2.0
 """Roads that are shorter have none (m)."""
+MOST_HEIGHTS = 2_000_000
+"""Roads that would have more have none: 40 km of two lanes."""
 ROUNDS = 20
 LONGEST_NAME = 100
 """Number of characters of a road's id in the name of its file."""
@@ -46,7 +48,7 @@ class CrgLine:
 
 
 def crg_line(plan: PlanView, length: float, reach: float) -> CrgLine | None:
-    """Return the line of a road; None if it is too short, or bends too much.
+    """Return the line of a road; None if it is too short or too large, or bends too much.
 
     Parameters
     ----------
@@ -73,6 +75,8 @@ def crg_line(plan: PlanView, length: float, reach: float) -> CrgLine | None:
     width = np.full(len(s), 2 * reach)
     line = ReferenceLine(x, y, heading, s, float(increment), width, s, curve, 0.0)
     v = across(line)
+    if len(s) * len(v) > MOST_HEIGHTS:
+        return None
     beside_x, beside_y = line.beside(v)
     return CrgLine(line, v, beside_x.ravel(), beside_y.ravel())
 

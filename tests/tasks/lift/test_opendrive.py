@@ -464,3 +464,25 @@ def test_a_road_with_opencrg_of_its_own_keeps_it(tmp_path):
     assert [each.get("file") for each in root.iter("CRG")] == ["a.crg"]
     assert "has one of its own" in row.note
     assert not (tmp_path / "out_crg").exists()
+
+
+def test_large_roads_have_no_more_points_than_they_need(tmp_path):
+    asked = []
+
+    def counted(x, y):
+        asked.append(len(x))
+        return plane(x, y)
+
+    narrow = ARC.replace("0.01", "5")
+    wide = LANES.format(LEVEL).replace('a="3.5"', 'a="150"')
+    roads = [road(narrow, 9000.0), road(LINE, 6000.0, "8", lanes=wide)]
+    _, rows = lifted(write(tmp_path, *roads), counted, crg=True)
+    assert sum(asked) < 800_000
+    assert "too large" in rows[1].note
+
+
+def test_places_that_are_no_numbers_leave_the_road(tmp_path):
+    huge = LINE.replace('hdg="0"', 'hdg="1e308"').replace("<line/>", '<arc curvature="1e308"/>')
+    _, (bad, good) = lifted(write(tmp_path, road(huge, name="8"), road()), plane)
+    assert "places that are no numbers" in bad.note
+    assert good.note == ""
