@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -268,6 +269,8 @@ def _group(
     for feature, parts in zip(features, own, strict=True):
         if feature.shape is None or not parts:
             yield feature.shape and feature.shape.with_paths(iter(())), Lifted(feature.id)
+        elif feature.shape.code == POINT:
+            yield _point(feature.id, feature.shape, parts[0].start, group)
         else:
             yield _with_heights(feature, feature.shape, parts, group)
 
@@ -306,6 +309,22 @@ def _of_levels(heights: Heights, numbers: Numbers) -> Floats:
     for number, row in zip(heights.numbers, heights.z, strict=True):
         z[numbers == number] = row[numbers == number]
     return z
+
+
+def _point(name: str, shape: Shape, at: int, group: _Group) -> tuple[Shape, Lifted]:
+    """Return what `_with_heights` does, for a single point: a file may have millions."""
+    z = float(group.z[at])
+    if not math.isfinite(z):
+        return shape, Lifted(name, levels=(), points_without_ground=1)
+    values = group.samples.values[at : at + 1].copy()
+    before = abs(float(values[0, 2]) - z)
+    values[0, 2] = z
+    return Shape(POINT, True, shape.m, [values if shape.m else values[:, :3]]), Lifted(
+        name,
+        levels=(int(group.numbers[at]),),
+        before_m=before,
+        error_m=math.nan if group.errors is None else float(group.errors[at]),
+    )
 
 
 def _with_heights(
@@ -362,6 +381,7 @@ def _row(
     samples, options, place = group.samples, group.options, slice(paths[0].start, paths[-1].end)
     known, number = np.isfinite(group.z[place]), group.numbers[place]
     moved = np.abs(samples.values[place, 2] - z)[known & samples.is_vertex[place]]
+    beyond = not known.all()
     missing = known & (number == 0) & (feature.wanted not in (ANY, 0))
     length, without, unknown, points, steep = 0.0, 0.0, 0.0, 0, list[Steep]()
     off, grade, crossfall, lines = [np.nan], [np.nan], [np.nan], False
@@ -373,8 +393,10 @@ def _row(
         lines, s = True, path.of(samples.along)
         length += s[-1] - s[0]
         line = _line(path, samples)
-        without += line.length_where(~known[own])
-        unknown += line.length_where(missing[own])
+        if beyond:
+            without += line.length_where(~known[own])
+        if missing.any():
+            unknown += line.length_where(missing[own])
         off.append(_most(np.abs(np.interp(s, s[chosen], z[own][chosen]) - z[own])[known[own]]))
         slopes = np.abs(grades(s, np.where(known[own], z[own], np.nan), 0.999 * STEP_M))
         grade.append(_most(slopes))
