@@ -13,6 +13,10 @@ from flexroad.tasks.types import Bools, Floats
 
 STEP_M = 0.5
 """Largest distance of points at which the heights of a line are taken (m)."""
+LONGEST_M = 1e8
+"""Two vertices are no farther from each other on the earth (m)."""
+MOST_POINTS = 1_000_000
+"""Of a line; longer ones have points at larger distances, so that wrong ones do not fill the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +42,12 @@ class Line:
         metres : tuple of float
             Length of a unit of x and of y (m).
         """
-        away = np.nan_to_num(np.hypot(np.diff(x) * metres[0], np.diff(y) * metres[1]))
-        number = np.maximum(np.ceil(away / step - 1e-9), 1).astype(np.intp)
+        with np.errstate(over="ignore", invalid="ignore"):
+            away = np.nan_to_num(np.hypot(np.diff(x) * metres[0], np.diff(y) * metres[1]))
+        away = np.minimum(away, LONGEST_M)
+        steps = np.minimum(away / step, MOST_POINTS)
+        steps *= min(1.0, MOST_POINTS / max(float(steps.sum()), 1.0))
+        number = np.maximum(np.ceil(steps - 1e-9), 1).astype(np.intp)
         places = np.concatenate([[0], np.cumsum(number)])
         every = np.arange(places[-1] + 1)
         own = np.zeros(len(every), np.bool_)

@@ -13,6 +13,8 @@ from flexroad.tasks.lift.lines import Line
 from flexroad.tasks.lift.types import Heights
 from flexroad.tasks.types import Bools, Floats
 
+FAR_M = 1e12
+"""A coordinate that is beyond all others."""
 Key = tuple[str, ...]
 """The end of a line: lines that meet have equal ones."""
 
@@ -131,7 +133,8 @@ class Meetings:
                 break
             rest = left
         if self.beyond:
-            self.nearest = cKDTree(np.array([[float(number) for number in end] for end in self.beyond]))
+            places = np.array([[float(number) for number in end] for end in self.beyond])
+            self.nearest = cKDTree(np.where(np.isfinite(places), places, FAR_M))
 
     def _settle(self, line: _Line, *numbers: int) -> None:
         for i, number in zip((0, -1), numbers, strict=True):

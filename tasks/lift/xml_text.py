@@ -133,6 +133,7 @@ def root_name(path: Path) -> str:
 
         parser = expat.ParserCreate()
         parser.StartElementHandler = start
+        parser.XmlDeclHandler = _declaration
         try:
             while not names and (data := file.read(CHUNK_BYTES)):
                 parser.Parse(data)
@@ -177,6 +178,12 @@ def _broken(error: expat.ExpatError) -> TaskError:
     return TaskError(f"is not whole XML: {expat.ErrorString(error.code)}, {where}; save it again")
 
 
+def _declaration(version: str, encoding: str | None, standalone: int) -> None:
+    """Raise an error if a file declares an encoding that is not read."""
+    if (encoding or "utf-8").lower() not in ENCODINGS:
+        raise TaskError(f"is in {shown(encoding)}{LATER}")
+
+
 class _Reader:
     """The state of reading a file: what is not handed over yet, and the element that is being read."""
 
@@ -184,7 +191,7 @@ class _Reader:
         self.names = frozenset(names)
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True
-        self.parser.XmlDeclHandler = self.declaration
+        self.parser.XmlDeclHandler = _declaration
         self.parser.EntityDeclHandler = self.entity
         self.parser.StartElementHandler = self.start
         self.parser.EndElementHandler = self.end
@@ -218,10 +225,6 @@ class _Reader:
             self.ready.append(bytes(self.text[:length]))
             del self.text[:length]
             self.offset = index
-
-    def declaration(self, version: str, encoding: str | None, standalone: int) -> None:
-        if (encoding or "utf-8").lower() not in ENCODINGS:
-            raise TaskError(f"is in {shown(encoding)}{LATER}")
 
     def entity(self, name: str, *_: Any) -> None:
         raise TaskError(f"declares the entity {shown(name)}{LATER}")

@@ -161,6 +161,7 @@ def test_network_without_crs_needs_one(run, flexroad, tmp_path):
             lambda data: b'<!DOCTYPE a [<!ENTITY b "c"><!ENTITY d "&b;&b;">]>' + data,
             "declares the entity 'b'",
         ),
+        (lambda data: b'<?xml version="1.0" encoding="x"?>' + data, "is in 'x'; save it again"),
         (lambda data: b"", "is of no known format"),
         (lambda data: b"<svg/>", "has the root element svg; give "),
         (lambda data: data.decode().encode("utf-16"), ""),

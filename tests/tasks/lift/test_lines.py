@@ -63,3 +63,9 @@ def test_the_length_of_places_is_that_of_the_line_around_them():
     line = Line.of(X, Y)
     assert line.length_where(np.ones(len(line.s), bool)) == pytest.approx(70)
     assert line.length_where(line.s <= 10) == pytest.approx(10.25)
+
+
+def test_a_line_with_wrong_coordinates_has_a_bounded_number_of_points():
+    line = Line.of(np.array([0, 1e308, 5.0, 6.0, 1e12]), np.zeros(5))
+    assert line.own.sum() == 5
+    assert len(line.x) <= 1_000_010
