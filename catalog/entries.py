@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 import struct
+import sys
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,9 @@ MAX_LABEL = 200
 WORDS = {dict: "not an object", list: "not a list", bool: "neither true nor false"}
 """What a value of another type is."""
 PROPERTIES = "properties."
+RECENT = 2**14
+"""Layers and dates that are kept to be shared: of the last thousands of tiles."""
+T = TypeVar("T", Layer, datetime)
 
 
 class _Names(dict[str, str]):
@@ -153,15 +157,17 @@ class TileReader:
             system = _optional(asset, "flexroad:crs", str)
             if system is not None:
                 _check_crs(system, "flexroad:crs")
-            return Layer(
-                name,
-                self._named(names, "flexroad:files"),
-                tuple(values),
-                system,
-                _extents(asset, len(names)),
-                bool(_optional(asset, "flexroad:reproject", bool)),
-                _optional(asset, "flexroad:sublayer", str),
-                _height_unit(asset),
+            return _shared(
+                Layer(
+                    name,
+                    self._named(names, "flexroad:files"),
+                    tuple(values),
+                    system,
+                    _extents(asset, len(names)),
+                    bool(_optional(asset, "flexroad:reproject", bool)),
+                    _optional(asset, "flexroad:sublayer", str),
+                    _height_unit(asset),
+                )
             )
         except CatalogError as error:
             raise CatalogError(f"assets.{name}.{error}") from error
@@ -179,6 +185,12 @@ class TileReader:
     def _root(self, properties: dict[str, Any]) -> str:
         root = properties.get("flexroad:root")
         return self._named([root], "properties.flexroad:root")[0] if root else ""
+
+
+@lru_cache(RECENT)
+def _shared(value: T) -> T:
+    """Return the first one of equal values: most tiles have the layers and the date of a neighbour."""
+    return value
 
 
 def _known_fault(entry: dict[str, Any]) -> str:
@@ -240,7 +252,7 @@ def _grid(properties: dict[str, Any]) -> Grid:
         raise CatalogError(f"proj:shape: {shown(shape)} is not at least one cell")
     if width * height > MAX_CELLS:
         raise CatalogError(f"proj:shape: {shown(shape)} is more than {MAX_CELLS} cells")
-    grid = Grid(system, west, north, cell, width, height)
+    grid = Grid(sys.intern(system), west, north, cell, width, height)
     if max(map(abs, grid.bounds)) > MAX_COORDINATE_M:
         raise CatalogError(f"proj:transform: {shown(grid.bounds)} lies beyond {MAX_COORDINATE_M:g} m")
     return grid
@@ -298,7 +310,7 @@ def _date(properties: dict[str, Any]) -> datetime:
         raise CatalogError(f"datetime: {shown(value)} is not a date, as 2020-05-01T10:00:00Z") from error
     if date.year not in YEARS:
         raise CatalogError(f"datetime: the year {date.year} is not within {YEARS[0]} to {YEARS[-1]}")
-    return date
+    return _shared(date)
 
 
 def _label(properties: dict[str, Any], name: str) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime, timedelta
-from itertools import islice, pairwise
+from itertools import islice, pairwise, repeat
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ Item = dict[str, Any]
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 AT_ONCE = 1000
 """Rows that are objects at a time: these take many times the memory of a table."""
+GROUP = 10_000
+"""Rows of a row group, which are a table in memory until they are written; a multiple of `AT_ONCE`."""
 MAX_ROWS = 10_000_000
 MAX_UNPACKED = 8 * 2**30
 """Most rows and bytes of a table, unpacked; ten million tiles of 250 m are 625,000 km2."""
@@ -59,22 +61,19 @@ def entries(data: bytes) -> Iterator[Item]:
     columns = dict.fromkeys(".".join(path[:3] if path[0] == "assets" else path[:1]) for path in paths)
     plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
     plain += [name for name in columns if name.startswith("assets.") and name.endswith(FIELDS)]
-    # Reader threads may still be alive when a short process ends, and would abort it.
-    table = file.read(plain, use_threads=False)
     names = [name for name in columns if name.endswith(".flexroad:extents")]
-    extents = {}
-    if names:
-        assets = file.read(names, use_threads=False)["assets"].combine_chunks()
-        extents = {field.name: assets.field(field.name).field("flexroad:extents") for field in assets.type}
-    return _rows(table, extents)
+    return _rows(file, plain, names)
 
 
-def _rows(table: Any, extents: Mapping[str, Any]) -> Iterator[Item]:
-    """Yield the fields of each row; as objects, a part of the rows at a time."""
-    for start in range(0, table.num_rows, AT_ONCE):
-        rows = _values(table.slice(start, AT_ONCE))
-        for name, column in extents.items():
-            _add_extents(rows, name, column.slice(start, AT_ONCE))
+def _rows(file: Any, plain: list[str], names: list[str]) -> Iterator[Item]:
+    """Yield the fields of each row; as a table and as objects, a part of the rows at a time."""
+    # Reader threads may still be alive when a short process ends, and would abort it.
+    parts = file.iter_batches(AT_ONCE, columns=plain, use_threads=False)
+    extents = file.iter_batches(AT_ONCE, columns=names, use_threads=False) if names else repeat(None)
+    for part, assets in zip(parts, extents, strict=False):
+        rows = _values(pa.Table.from_batches([part]))
+        for field in assets["assets"].type if assets else ():
+            _add_extents(rows, field.name, assets["assets"].field(field.name).field("flexroad:extents"))
         yield from ({**_top(row), "properties": row} for row in rows)
 
 
@@ -156,19 +155,22 @@ def table_bytes(items: Iterable[Item], schema: Any) -> bytes:
     schema : pyarrow.Schema
         Of `schema_of`.
     """
-    rows, parts = map(row, items), [schema.empty_table()]
-    while part := list(islice(rows, AT_ONCE)):
-        parts.append(pa.Table.from_pylist(part, schema))
     column = {"encoding": "WKB", "geometry_types": [], "crs": _crs(), "edges": "planar"}
     column["covering"] = {"bbox": {name: ["bbox", name] for name in EDGES}}
     geo = {"version": "1.1.0", "columns": {"geometry": column}, "primary_column": "geometry"}
     metadata = {"geo": json.dumps(geo), "stac-geoparquet": json.dumps({"version": "1.0.0"})}
-    table = pa.concat_tables(parts).combine_chunks().replace_schema_metadata(metadata)
-    written = pa.BufferOutputStream()
-    with pq.ParquetWriter(written, table.schema, write_page_checksum=True) as writer:
-        for batch in table.to_batches():
-            writer.write_batch(batch)
+    schema, rows, written = schema.with_metadata(metadata), map(row, items), pa.BufferOutputStream()
+    with pq.ParquetWriter(written, schema, write_page_checksum=True) as writer:
+        while group := list(_tables(islice(rows, GROUP), schema)):
+            for batch in pa.concat_tables(group).combine_chunks().to_batches():
+                writer.write_batch(batch)
     return bytes(written.getvalue())
+
+
+def _tables(rows: Iterator[Item], schema: Any) -> Iterator[Any]:
+    """Yield rows as tables of `AT_ONCE` rows."""
+    while part := list(islice(rows, AT_ONCE)):
+        yield pa.Table.from_pylist(part, schema)
 
 
 def _crs() -> Item:

@@ -86,21 +86,20 @@ class Catalog:
         except OSError as error:
             raise CatalogError(f"cannot read catalog {path}: {error.strerror or error}") from error
         is_json = path.suffix in JSON_SUFFIXES
+        kind = "feature" if is_json else "row"
+        allowed = AllowedFolders.of(path.parent, allow)
+        reader = TileReader(str(absolute(path).parent), allowed, kind, path.name)
         try:
-            entries: Iterable[Any] = _from_json(data) if is_json else geoparquet.entries(data)
+            tiles = reader.tiles(_from_json(data) if is_json else geoparquet.entries(data))
         except ImportError:
             # A fault of this installation, not of the file.
             raise
+        except CatalogError as error:
+            raise _not_a_catalog(path, str(error)) from error
         except Exception as error:
             # Damaged files raise any error in the readers of JSON and Parquet.
             reason = printable(" ".join(str(error).split()))[:200] or type(error).__name__
             raise _not_a_catalog(path, reason) from error
-        kind = "feature" if is_json else "row"
-        allowed = AllowedFolders.of(path.parent, allow)
-        try:
-            tiles = TileReader(str(absolute(path).parent), allowed, kind, path.name).tiles(entries)
-        except CatalogError as error:
-            raise _not_a_catalog(path, str(error)) from error
         catalog = cls(tiles)
         if tiles and not catalog.usable:
             raise _not_a_catalog(path, f"no entry can be used: {tiles[0].fault}")
@@ -158,7 +157,8 @@ class Catalog:
             if tile_id not in all_ids:
                 near = difflib.get_close_matches(tile_id, all_ids, n=3) or sorted(all_ids)[:3]
                 raise CatalogError(f"no tile {tile_id!r} in the catalog; did you mean {', '.join(near)}?")
-        tiles = [tile for tile in self.tiles if not ids or tile.id in set(ids)]
+        wanted = set(ids)
+        tiles = [tile for tile in self.tiles if not ids or tile.id in wanted]
         if bbox is not None:
             self._check_bbox(bbox)
             tiles = [tile for tile in tiles if not tile.fault and overlap(tile.grid.bounds, bbox)]

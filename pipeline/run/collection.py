@@ -72,8 +72,10 @@ def write_collection(run: Run, done: Sequence[Tile]) -> None:
     if not done:
         remove(run.path / COLLECTION)
         return
-    content = json.dumps(collection(run, done, mosaics), indent=1, allow_nan=False).encode()
-    write(run.path / COLLECTION, content, run.config.cluster.flush)
+    content = collection(run, done, mosaics)
+    # As a stream: the parts of its text take more memory than the catalog.
+    with atomic_file(run.path / COLLECTION, run.config.cluster.flush) as local, local.open("w") as file:
+        json.dump(content, file, indent=1, allow_nan=False)
 
 
 def collection(run: Run, done: Sequence[Tile], mosaics: Sequence[Kind]) -> dict[str, Any]:
@@ -290,21 +292,24 @@ def write_states(run: Run, where: Location) -> None:
         If the file cannot be written.
     """
     variant = run.config.export.variants[0]
-    with open_database(run) as database:
-        rows = [
-            _map_row(tile_id, state, record, variant) for tile_id, state, record in recorded(run, database)
-        ]
-    features = [
-        {
-            "id": row["id"],
-            "type": "Feature",
-            "properties": {name: row.get(name) for name in MAP_COLUMNS},
-            "geometry": json.loads(outline) if outline else None,
-        }
-        for row, outline in zip(rows, shapely.to_geojson(outlines(run.catalog.tiles)), strict=True)
-    ]
-    content = {"type": "FeatureCollection", "features": features}
-    write(where, json.dumps(content).encode(), run.config.cluster.flush)
+    places, flush = shapely.to_geojson(outlines(run.catalog.tiles)), run.config.cluster.flush
+    with open_database(run) as database, atomic_file(where, flush) as local, local.open("w") as file:
+        # As a stream: the features of all tiles take more memory than the catalog.
+        file.write('{"type": "FeatureCollection", "features": [')
+        rows = zip(recorded(run, database), places, strict=True)
+        for number, ((tile_id, state, record), place) in enumerate(rows):
+            feature = _feature(_map_row(tile_id, state, record, variant), place)
+            file.write(f"{', ' if number else ''}{json.dumps(feature)}")
+        file.write("]}")
+
+
+def _feature(row: Mapping[str, Any], outline: str | None) -> dict[str, Any]:
+    return {
+        "id": row["id"],
+        "type": "Feature",
+        "properties": {name: row.get(name) for name in MAP_COLUMNS},
+        "geometry": json.loads(outline) if outline else None,
+    }
 
 
 def outlines(tiles: Sequence[Tile]) -> Any:

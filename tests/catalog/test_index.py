@@ -77,6 +77,40 @@ def test_catalog_in_parts_is_the_same(tmp_path, monkeypatch):
         assert Catalog.read(tmp_path / "b.parquet").tiles == tiles
 
 
+def test_catalog_in_row_groups_is_the_same(tmp_path, monkeypatch):
+    tiles = tuple(with_extents(tile(295500 + 250 * k, tmp_path, layers=LAYERS[: k + 1])) for k in range(7))
+    monkeypatch.setattr(geoparquet, "GROUP", 4)
+    monkeypatch.setattr(geoparquet, "AT_ONCE", 3)
+    Catalog(tiles).write(path := tmp_path / "a.parquet")
+    assert pq.ParquetFile(path).metadata.num_row_groups == 2
+    assert Catalog.read(path).tiles == tiles
+
+
+def test_damage_in_a_later_row_group_names_the_catalog(tmp_path, monkeypatch):
+    tiles = tuple(with_extents(tile(295500 + 250 * k, tmp_path)) for k in range(6))
+    monkeypatch.setattr(geoparquet, "GROUP", 3)
+    monkeypatch.setattr(geoparquet, "AT_ONCE", 3)
+    Catalog(tiles).write(path := tmp_path / "a.parquet")
+    last = pq.ParquetFile(path).metadata.row_group(1)
+    columns = [last.column(number) for number in range(last.num_columns)]
+    ids = next(column for column in columns if column.path_in_schema == "id")
+    data = bytearray(path.read_bytes())
+    data[ids.data_page_offset + ids.total_compressed_size // 2] ^= 255
+    path.write_bytes(data)
+    with pytest.raises(CatalogError, match=r"a\.parquet is not a FlexRoad catalog: "):
+        Catalog.read(path)
+
+
+def test_equal_layers_of_tiles_are_read_as_one_object(tmp_path):
+    """A survey of a state is larger in memory than a client has otherwise."""
+    one, other = (with_extents(tile(295500, tmp_path)) for _ in range(2))
+    Catalog((one, replace(other, id="next"))).write(tmp_path / "a.parquet")
+    first, second = Catalog.read(tmp_path / "a.parquet").tiles
+    assert first.layers == one.layers
+    assert all(a is b for a, b in zip(first.layers, second.layers, strict=True))
+    assert first.datetime is second.datetime
+
+
 def test_objects_exist_of_a_part_of_the_rows_at_a_time(tmp_path, monkeypatch):
     tiles = tuple(with_extents(tile(295500 + 250 * k, tmp_path, layers=LAYERS)) for k in range(300))
     path = tmp_path / "a.parquet"
