@@ -157,7 +157,7 @@ class TileReader:
             system = _optional(asset, "flexroad:crs", str)
             if system is not None:
                 _check_crs(system, "flexroad:crs")
-            return _shared(
+            layer: Layer = _shared(
                 Layer(
                     name,
                     self._named(names, "flexroad:files"),
@@ -169,6 +169,7 @@ class TileReader:
                     _height_unit(asset),
                 )
             )
+            return layer
         except CatalogError as error:
             raise CatalogError(f"assets.{name}.{error}") from error
 
@@ -310,7 +311,8 @@ def _date(properties: dict[str, Any]) -> datetime:
         raise CatalogError(f"datetime: {shown(value)} is not a date, as 2020-05-01T10:00:00Z") from error
     if date.year not in YEARS:
         raise CatalogError(f"datetime: the year {date.year} is not within {YEARS[0]} to {YEARS[-1]}")
-    return _shared(date)
+    shared: datetime = _shared(date)
+    return shared
 
 
 def _label(properties: dict[str, Any], name: str) -> str:
