@@ -195,7 +195,7 @@ def lift(
             _remove_parts(out, files)
     if report is not None:
         files += _write_report(rows, report, in_run)
-    return LiftedFile(rows, files, len(in_run.seen.earlier), getattr(module, "NOUN", "feature"), options)
+    return LiftedFile(rows, files, len(in_run.seen.earlier), module.NOUN, options)
 
 
 @dataclass(eq=False)

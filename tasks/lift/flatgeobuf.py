@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 else:
     pa = lazy("pyarrow")
 
+NOUN = "feature"
+"""What a row of the report is."""
 STEPS = True
 """Whether heights have the steps beside roads."""
 SUFFIXES = (".fgb",)

@@ -33,6 +33,8 @@ from flexroad.tasks.lift.shapes import COLLECTION, LINE, NAMES, POINT, POLYGON, 
 from flexroad.tasks.lift.types import Frame, Lifted, Options, RunSurface
 from flexroad.tasks.types import Floats
 
+NOUN = "feature"
+"""What a row of the report is."""
 STEPS = True
 """Whether heights have the steps beside roads."""
 SUFFIXES = (".geojson", ".json")

@@ -31,6 +31,8 @@ from flexroad.tasks.lift.features import (
 from flexroad.tasks.lift.shapes import Shape, of_wkb, to_wkb
 from flexroad.tasks.lift.types import Frame, Lifted, Options, RunSurface
 
+NOUN = "feature"
+"""What a row of the report is."""
 STEPS = True
 """Whether heights have the steps beside roads."""
 SUFFIXES = (".gpkg",)

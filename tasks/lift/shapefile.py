@@ -40,6 +40,8 @@ from flexroad.tasks.types import Floats
 
 pyogrio = lazy("pyogrio")
 
+NOUN = "feature"
+"""What a row of the report is."""
 STEPS = True
 """Whether heights have the steps beside roads."""
 SUFFIXES = (".shp",)
