@@ -70,6 +70,10 @@ def cross_sections(
         slope, at_line = np.polyfit(t[known[row]], used[row, known[row]], 1)
         line[row] = at_line if abs(slope) < STEEPEST else np.nan
     line[joined] = np.nan
+    # A single place with ground is no part of a profile.
+    has = np.isfinite(line)
+    beside_one = np.convolve(has, [1, 0, 1], "same") > 0
+    line[~beside_one] = np.nan
     grade = (after - before) / (2 * AHEAD_M)
     for one_sided in ((after - on) / AHEAD_M, (on - before) / AHEAD_M):
         grade = np.where(np.isfinite(grade), grade, one_sided)
