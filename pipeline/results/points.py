@@ -114,15 +114,10 @@ class Ground:
         tile[:] = ""
         earlier, numbers = [], {0}
         of_level = np.zeros(easting.shape, np.int8)
-        for status, selected in self._owners(easting, northing):
-            graph = status.graph
-            found = self._current(status) if status.done else self._last(graph.tile.id)
-            if found is None:
-                continue
-            surface, road = found
-            earlier += [] if status.done else [graph.tile.id]
-            tile[selected] = graph.tile.id
-            selected = selected[~road.outside[road.grid.cells(easting[selected], northing[selected])]]
+        for status, surface, road, selected in self._surfaces(easting, northing):
+            earlier += [] if status.done else [status.graph.tile.id]
+            tile[selected] = status.graph.tile.id
+            selected = _inside(road, easting, northing, selected)
             numbers.update(surface.numbers if isinstance(surface, LevelledSurface) else ())
             for number, chosen, own in _by_level(surface, easting, northing, selected, level):
                 east, north = easting[chosen], northing[chosen]
@@ -153,13 +148,9 @@ class Ground:
         """
         easting, northing = np.asarray(easting, np.float64), np.asarray(northing, np.float64)
         rows, earlier = {0: np.full(easting.shape, np.nan)}, list[str]()
-        for status, selected in self._owners(easting, northing):
-            found = self._current(status) if status.done else self._last(status.graph.tile.id)
-            if found is None:
-                continue
+        for status, surface, road, selected in self._surfaces(easting, northing):
             earlier += [] if status.done else [status.graph.tile.id]
-            surface, road = found
-            here = selected[~road.outside[road.grid.cells(easting[selected], northing[selected])]]
+            here = _inside(road, easting, northing, selected)
             east, north = easting[here], northing[here]
             if isinstance(surface, SteppedSurface) and not steps:
                 rows[0][here] = surface.smooth(east, north)
@@ -213,6 +204,15 @@ class Ground:
         columns = {name: values[order] for name, values in columns.items()}
         return points[order], replace(ground, **columns)
 
+    def _surfaces(
+        self, easting: Floats, northing: Floats
+    ) -> Iterator[tuple[TileStatus, Surface, RoadMask, NDArray[np.intp]]]:
+        """Yield what `_owners` does, with surface and road of each tile that still has them."""
+        for status, selected in self._owners(easting, northing):
+            found = self._current(status) if status.done else self._last(status.graph.tile.id)
+            if found is not None:
+                yield status, *found, selected
+
     def _owners(self, easting: Floats, northing: Floats) -> Iterator[tuple[TileStatus, NDArray[np.intp]]]:
         """Yield the state of each finished tile that has points, with the indices of the points."""
         tiles = self.run.catalog.usable
@@ -247,6 +247,13 @@ class Ground:
     def _current(self, status: TileStatus) -> tuple[Surface, RoadMask]:
         tile = FinishedTile.of(self.run, status, self.variant)
         return tile.surface, tile.road
+
+
+def _inside(
+    road: RoadMask, easting: Floats, northing: Floats, selected: NDArray[np.intp]
+) -> NDArray[np.intp]:
+    """Return those of the selected points that are not beyond the survey."""
+    return selected[~road.outside[road.grid.cells(easting[selected], northing[selected])]]
 
 
 def _by_level(

@@ -15,7 +15,7 @@ from flexroad.catalog.lazy import lazy
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.lift.batches import POINTS
 from flexroad.tasks.lift.levels import ANY, Numbers, along
-from flexroad.tasks.lift.lines import STEP_M, Line
+from flexroad.tasks.lift.lines import STEP_M, Line, largest, steepest
 from flexroad.tasks.lift.shapes import POINT, POLYGON, Shape
 from flexroad.tasks.lift.types import Heights, Lifted, Options, RunSurface, Steep
 from flexroad.tasks.roads import level_numbers
@@ -70,6 +70,13 @@ def percent_columns(row: Lifted) -> tuple[float | None, float | None, float | No
     values = (100 * row.grade, 100 * row.crossfall, row.error_m)
     grade, crossfall, error = (round(value, 4) if np.isfinite(value) else None for value in values)
     return grade, crossfall, error
+
+
+def with_zero(shape: Shape | None, row: Lifted) -> tuple[Shape | None, Lifted]:
+    """Return a geometry and its row for formats in which all have a z: 0, with a note, without ground."""
+    if shape is None or shape.z or not (shape.paths or shape.parts):
+        return shape and shape.flat(), row
+    return shape.flat(), row.noted(ZERO)
 
 
 def lifted(
@@ -280,9 +287,7 @@ def _on_levels(
 ) -> tuple[Floats, Numbers]:
     """Return the heights of points along paths, each on its level, and the numbers of the levels."""
     z, numbers = heights.ground.copy(), np.zeros(heights.z.shape[1], np.int8)
-    other = np.zeros(len(z), np.bool_)
-    for number, row in zip(heights.numbers, heights.z, strict=True):
-        other |= np.isfinite(row) if number != 0 else False
+    other = heights.several
     if not other.any():
         return z, numbers
     for feature, parts in zip(features, paths, strict=True):
@@ -397,13 +402,13 @@ def _row(
             without += line.length_where(~known[own])
         if missing.any():
             unknown += line.length_where(missing[own])
-        off.append(_most(np.abs(np.interp(s, s[chosen], z[own][chosen]) - z[own])[known[own]]))
+        off.append(largest(np.abs(np.interp(s, s[chosen], z[own][chosen]) - z[own])[known[own]]))
         slopes = np.abs(grades(s, np.where(known[own], z[own], np.nan), 0.999 * STEP_M))
-        grade.append(_most(slopes))
+        grade.append(largest(slopes))
         steep += _steep("grade", slopes, options.grade_limit, path, samples)
         if group.crossfalls is not None and path.code != POLYGON:
             slopes = path.of(group.crossfalls)
-            crossfall.append(_most(slopes))
+            crossfall.append(largest(slopes))
             steep += _steep("crossfall", slopes, options.crossfall_limit, path, samples)
     return Lifted(
         feature.id,
@@ -411,19 +416,14 @@ def _row(
         float(without),
         tuple(np.unique(number[known]).tolist()),
         float(unknown),
-        _most(moved),
-        _most(off),
-        grade=_most(grade),
-        crossfall=_most(crossfall),
-        error_m=np.nan if group.errors is None else _most(group.errors[place]),
+        largest(moved),
+        largest(off),
+        grade=largest(grade),
+        crossfall=largest(crossfall),
+        error_m=np.nan if group.errors is None else largest(group.errors[place]),
         points_without_ground=points,
         steep=tuple(steep),
     )
-
-
-def _most(values: Any) -> float:
-    """Return the largest known value, NaN without one."""
-    return float(np.fmax.reduce(values, initial=np.nan))
 
 
 @compiled()
@@ -452,14 +452,8 @@ def _steep(
     kind: Literal["grade", "crossfall"], values: Floats, limit: float | None, path: _Path, samples: _Samples
 ) -> list[Steep]:
     """Return the steepest place of each stretch above a limit."""
-    if limit is None:
-        return []
-    above = np.flatnonzero(values > limit)
-    if not len(above):
-        return []
     places = []
-    for stretch in np.split(above, np.flatnonzero(np.diff(above) > 1) + 1):
-        at = int(stretch[np.argmax(values[stretch])])
+    for at in steepest(values, limit):
         x, y = path.of(samples.values)[at, :2].tolist()
         places.append(Steep(kind, float(values[at]), x, y))
     return places

@@ -16,12 +16,12 @@ from flexroad.tasks.lift.features import (
     BATCH_BYTES,
     BATCH_FEATURES,
     COLUMNS,
-    ZERO,
     Feature,
     level_columns,
     lifted,
     percent_columns,
     wanted_levels,
+    with_zero,
 )
 from flexroad.tasks.lift.shapes import of_wkb, to_wkb
 from flexroad.tasks.lift.types import Frame, Lifted, Options, RunSurface
@@ -154,9 +154,9 @@ def _lifted_tables(
             columns = {name: batch.column(name) for name in batch.schema.names}
             wkb, own = list[bytes | None](), list[Lifted]()
             for shape, row in lifted(_features(columns, geometry, len(rows)), run, options):
-                zero = shape is not None and bool(shape.paths or shape.parts) and not shape.z
-                wkb.append(None if shape is None else to_wkb(shape.flat()))
-                own.append(row.noted(ZERO) if zero else row)
+                shape, row = with_zero(shape, row)
+                wkb.append(None if shape is None else to_wkb(shape))
+                own.append(row)
             rows += own
             columns[geometry] = pa.array(wkb, schema.field(geometry).type)
             if options.columns:

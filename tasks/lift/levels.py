@@ -36,13 +36,10 @@ def along(heights: Heights, wanted: Numbers) -> tuple[Floats, Numbers]:
     """
     z, numbers = heights.ground.copy(), np.zeros(len(wanted), np.int8)
     others = [(number, row) for number, row in zip(heights.numbers, heights.z, strict=True) if number != 0]
-    several = np.zeros(len(wanted), np.bool_)
     for number, row in others:
-        has = np.isfinite(row)
-        several |= has & (wanted == ANY)
-        chosen = has & (wanted == number)
+        chosen = np.isfinite(row) & (wanted == number)
         z[chosen], numbers[chosen] = row[chosen], number
-    for start, end in stretches(several):
+    for start, end in stretches(heights.several & (wanted == ANY)):
         candidates = [(0, z[start:end].copy())]
         candidates += [
             (number, row[start:end]) for number, row in others if np.isfinite(row[start:end]).all()

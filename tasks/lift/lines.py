@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.tasks.lift.levels import stretches
 from flexroad.tasks.lift.profile import vertices
 from flexroad.tasks.lift.types import Steep
 from flexroad.tasks.types import Bools, Floats
@@ -84,12 +86,9 @@ class Line:
         if not len(at):
             return np.nan, ()
         places = list[Steep]()
-        if limit is not None:
-            above = np.flatnonzero(grade > limit)
-            for run in np.split(above, np.flatnonzero(np.diff(above) > 1) + 1) if len(above) else ():
-                most = run[np.argmax(grade[run])]
-                x, y = ((values[at[most]] + values[at[most] + 1]) / 2 for values in (self.x, self.y))
-                places.append(Steep("grade", float(grade[most]), float(x), float(y)))
+        for most in steepest(grade, limit):
+            x, y = ((values[at[most]] + values[at[most] + 1]) / 2 for values in (self.x, self.y))
+            places.append(Steep("grade", float(grade[most]), float(x), float(y)))
         return float(grade.max()), tuple(places)
 
     def length_where(self, places: Bools) -> float:
@@ -98,7 +97,13 @@ class Line:
         return float(np.sum(half * places[:-1]) + np.sum(half * places[1:]))
 
 
-def largest(values: Floats) -> float:
-    """Return the largest value that is finite; NaN if there is none."""
-    known = values[np.isfinite(values)]
-    return float(known.max()) if len(known) else np.nan
+def largest(values: Floats | Sequence[float]) -> float:
+    """Return the largest known value; NaN if there is none."""
+    return float(np.fmax.reduce(values, initial=np.nan))
+
+
+def steepest(values: Floats, limit: float | None) -> list[int]:
+    """Return the index of the largest value of each stretch above a limit; without a limit, none."""
+    if limit is None:
+        return []
+    return [start + int(np.argmax(values[start:end])) for start, end in stretches(values > limit)]

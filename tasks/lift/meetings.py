@@ -19,15 +19,6 @@ Key = tuple[str, ...]
 """The end of a line: lines that meet have equal ones."""
 
 
-def several_levels(heights: Heights) -> Bools:
-    """Return which of n points have another level than the ground."""
-    several = np.zeros(heights.z.shape[1], np.bool_)
-    for number, row in zip(heights.numbers, heights.z, strict=True):
-        if number != 0:
-            several |= np.isfinite(row)
-    return several
-
-
 @dataclass(frozen=True, eq=False)
 class _Line:
     ends: tuple[Key, Key]
@@ -72,7 +63,7 @@ class Meetings:
         junctions: tuple[str, str] | None,
     ) -> None:
         """Remember a line if there are roads above roads at it."""
-        several = several_levels(heights)
+        several = heights.several
         if several.any():
             self.lines.append(_Line(ends, heights, several, number, junctions))
 
@@ -145,7 +136,7 @@ class Meetings:
 
     def wanted(self, heights: Heights, first: int | None, last: int | None) -> Numbers:
         """Return the wanted level of each point of a line with known levels at its ends."""
-        several = several_levels(heights)
+        several = heights.several
         wanted = np.full(len(several), ANY)
         for start, end in stretches(several):
             if end == len(several) and last is not None:

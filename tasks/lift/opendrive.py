@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
 from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree as ET
@@ -17,6 +16,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.lift import lanes, levels, opendrive_text, plan_view, road_levels, road_profiles, xml_text
 from flexroad.tasks.lift.batches import with_heights
 from flexroad.tasks.lift.levels import ANY, Numbers
+from flexroad.tasks.lift.lines import steepest
 from flexroad.tasks.lift.opendrive_crg import CrgFiles, CrgLine, crg_line
 from flexroad.tasks.lift.plan_view import numbers
 from flexroad.tasks.lift.profile import AHEAD_M, value_at
@@ -396,12 +396,6 @@ def _steep(
     road: Road, kind: Literal["grade", "crossfall"], values: Floats, limit: float | None
 ) -> Iterator[Steep]:
     """Yield the steepest place of each stretch that is steeper than a limit."""
-    if limit is None:
-        return
-    start = 0
-    for above, group in groupby((np.abs(values) > limit).tolist()):
-        end = start + len(list(group))
-        if above:
-            at = start + int(np.abs(values[start:end]).argmax())
-            yield Steep(kind, float(abs(values[at])), float(road.x[at]), float(road.y[at]))
-        start = end
+    slopes = np.abs(values)
+    for at in steepest(slopes, limit):
+        yield Steep(kind, float(slopes[at]), float(road.x[at]), float(road.y[at]))

@@ -27,12 +27,12 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.lift.features import (
     BATCH_BYTES,
     BATCH_FEATURES,
-    ZERO,
     Feature,
     level_columns,
     lifted,
     percent_columns,
     wanted_levels,
+    with_zero,
 )
 from flexroad.tasks.lift.shapes import COLLECTION, LINE, MULTI_POINT, POINT, POLYGON, Shape
 from flexroad.tasks.lift.types import Frame, Lifted, Options, RunSurface
@@ -147,9 +147,9 @@ def _lifted(source: Path, out: Path, run: RunSurface, options: Options) -> Itera
                     ) from error
                 features.append(Feature(str(record.number), shape, level))
             for shape, row in lifted(features, run, options):
-                zero = shape is not None and bool(shape.paths or shape.parts) and not shape.z
-                copy.add(shape.flat() if shape is not None else None)
-                yield row.noted(ZERO) if zero else row
+                shape, row = with_zero(shape, row)
+                copy.add(shape)
+                yield row
         copy.finish()
 
 

@@ -31,6 +31,12 @@ class Heights:
         """Heights of level 0, ``(n,)``, m."""
         return np.asarray(self.z[self.numbers.index(0)])
 
+    @property
+    def several(self) -> Bools:
+        """Whether a point has another level than the ground, ``(n,)``."""
+        others = [number != 0 for number in self.numbers]
+        return np.asarray(np.isfinite(self.z[others]).any(axis=0))
+
 
 HeightsAt = Callable[[Floats, Floats], Heights]
 """Heights at x and y, ``(n,)`` each, in the coordinates of the file."""
