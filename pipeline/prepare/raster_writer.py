@@ -317,6 +317,8 @@ def _to_cog(source: Path, target: Path, layer: str) -> None:
         target,
         driver="COG",
         compress="deflate",
+        # The default, 6, takes 1.4 times as long; the files are 2% smaller.
+        level=1,
         predictor="floating_point" if layer in HEIGHTS else "standard",
         overview_resampling="average" if smooth else "mode",
         statistics="yes",

@@ -120,7 +120,7 @@ def _interpolated(
     """Return several heights of the same nodes, ``(n, H, W)``, interpolated over their triangles."""
     row, col = np.nonzero(is_node)
     plan = np.column_stack([east[row, col], north[row, col]])
-    faces = _delaunay(plan + JITTER * grid.cell * _noise(grid, row, col))
+    faces = _delaunay(plan + JITTER * grid.cell * _noise(grid, row, col), _coarse_first(row, col))
     faces = _ordered(faces[_widths(plan, faces) <= widest_m * LIMIT_FACTOR], len(plan))
     corner, none = (grid.west, grid.north, 0.0), np.zeros(len(faces), bool)
     return [
@@ -146,15 +146,29 @@ def _noise(grid: Grid, row: NDArray[np.intp], col: NDArray[np.intp]) -> Floats:
     return halves / 2.0**32 - 0.5
 
 
-def _delaunay(plan: Floats) -> NDArray[np.int32]:
-    """Return the faces of the Delaunay triangulation, ``(F, 3)``, counter-clockwise."""
+def _coarse_first(row: NDArray[np.intp], col: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return an order of cells that begins with every 2^k-th one, ``(n,)``.
+
+    Triangles of few nodes that are spread evenly are split where the next ones lie. Row by row, each node
+    would change the long triangles beside the rows that are done, which takes 1.5 times as long.
+    """
+    position = row | col
+    # The greatest power of two that divides both row and column.
+    return np.argsort(-(position & -position), kind="stable")
+
+
+def _delaunay(plan: Floats, order: NDArray[np.intp]) -> NDArray[np.int32]:
+    """Return the faces of the Delaunay triangulation, ``(F, 3)``, counter-clockwise.
+
+    Nodes are inserted in an order, which changes only the time that this takes.
+    """
     if len(plan) < 3:
         return np.empty((0, 3), np.int32)
     triangulation = startinpy.DT()
     triangulation.snap_tolerance = SNAP_M
-    triangulation.insert(np.column_stack([plan, np.zeros(len(plan))]), insertionstrategy="BBox")
+    triangulation.insert(np.column_stack([plan, np.zeros(len(plan))])[order])
     # Vertex 0 of startinpy is at infinity; the points follow in their order.
-    faces: NDArray[np.int32] = triangulation.triangles.astype(np.int32).reshape(-1, 3) - 1
+    faces = order[triangulation.triangles.astype(np.intp).reshape(-1, 3) - 1].astype(np.int32)
     # The object may only be deleted in the thread that created it, but a sampling profiler such as Dask's may
     # keep this frame alive in another thread.
     del triangulation
