@@ -168,7 +168,8 @@ def _delaunay(plan: Floats, order: NDArray[np.intp]) -> NDArray[np.int32]:
     triangulation.snap_tolerance = SNAP_M
     triangulation.insert(np.column_stack([plan, np.zeros(len(plan))])[order])
     # Vertex 0 of startinpy is at infinity; the points follow in their order.
-    faces = order[triangulation.triangles.astype(np.intp).reshape(-1, 3) - 1].astype(np.int32)
+    numbers = triangulation.triangles.astype(np.intp).reshape(-1, 3) - 1
+    faces: NDArray[np.int32] = order[numbers].astype(np.int32)
     # The object may only be deleted in the thread that created it, but a sampling profiler such as Dask's may
     # keep this frame alive in another thread.
     del triangulation
