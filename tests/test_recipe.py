@@ -14,6 +14,7 @@ RECIPES = {
 }
 CONDA = {
     "dask[distributed]": ("dask-core", "distributed"),
+    "isal": ("python-isal",),
     "laspy[lazrs]": ("laspy", "lazrs-python"),
     "matplotlib": ("matplotlib-base",),
     "opencv-python-headless": ("py-opencv",),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass
 from typing import Any, NamedTuple
 
@@ -29,8 +29,10 @@ from flexroad.tasks.types import Level, Mesh, Metrics, Quality, RoadClusters, Ro
 HEADER = "header.json"
 SEPARATOR = "."
 """Between the names of a field and of a field of the result in it, in the names of arrays."""
+CHANGES = ".changes"
+"""End of the name of faces that are stored as differences from the face before, in a quarter of the bytes."""
 LEVELS = ("level", "levels", "structures")
-"""Fields that are left out if they are empty: results without levels have the bytes of earlier versions."""
+"""Fields that are left out if they are empty: results without levels have the header of earlier versions."""
 SHA256_BYTES = 32
 
 
@@ -66,7 +68,7 @@ def decode(data: bytes) -> Stored:
     if hashlib.sha256(payload).digest() != checksum:
         raise ValueError("the checksum does not match the data")
     with np.load(io.BytesIO(payload), allow_pickle=False) as archive:
-        arrays = {name: np.asarray(archive[name], order="C") for name in archive.files}
+        arrays = dict(_arrays(archive))
     header = json.loads(arrays.pop(HEADER).tobytes())
     # Stores of earlier versions have no notes.
     notes = tuple(header.get("notes", ()))
@@ -79,12 +81,29 @@ def _fields(value: Any, prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
     for field in fields(value):
         item, name = getattr(value, field.name), prefix + field.name
         if isinstance(item, np.ndarray):
-            # Points are a quarter smaller by columns: many have the same x or y.
-            points = item.dtype.kind == "f" and item.shape[1:] == (3,)
-            arrays[name] = np.asfortranarray(item) if points else item
+            arrays |= _compact(name, item)
         elif item or field.name not in LEVELS:
             plain[field.name] = _json(item, name, arrays)
     return plain
+
+
+def _compact(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
+    """Return an array in the form that has the smallest file, with its name in the file."""
+    if array.shape[1:] != (3,):
+        return {name: array}
+    if array.dtype.kind == "i":
+        return {name + CHANGES: np.diff(array, axis=0, prepend=np.zeros((1, 3), array.dtype))}
+    # Points are a quarter smaller by columns: many have the same x or y.
+    return {name: np.asfortranarray(array)}
+
+
+def _arrays(archive: Mapping[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the arrays of a file, as they were before `_compact`, by name."""
+    for name, array in archive.items():
+        if name.endswith(CHANGES):
+            yield name.removesuffix(CHANGES), np.cumsum(array, axis=0, dtype=array.dtype)
+        else:
+            yield name, np.asarray(array, order="C")
 
 
 def _json(item: Any, name: str, arrays: dict[str, Any]) -> Any:
