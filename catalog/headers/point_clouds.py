@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
@@ -60,6 +61,14 @@ class Cloud:
     """Date when the file was written (not of the survey), or None."""
     has_dates: bool = False
     """Whether the header declares GPS times as standard, so that they are dates and not seconds of a week."""
+    chunk: int = 0
+    """Number of points of the largest chunk of a compressed file, which are decoded together; 0 if there are
+    none."""
+
+    def parts(self, size: int) -> list[range]:
+        """Return ranges of about ``size`` points that can be decoded apart; larger if chunks are larger."""
+        step = size * max(1, math.ceil(self.chunk / size))
+        return [range(first, min(first + step, self.points)) for first in range(0, self.points, step)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +116,8 @@ def inspect(path: Path) -> Cloud:
         If the file is missing, not LAS or LAZ, truncated, or without points.
     """
     with _opened(path) as reader:
-        cloud = _attempt(path, lambda: _cloud(path, reader.header))
+        largest = _attempt(path, lambda: las_header.check(path))
+        cloud = _attempt(path, lambda: _cloud(path, reader.header, largest))
         needed = reader.header.offset_to_point_data + cloud.points * reader.header.point_format.size
         plain = not reader.header.are_points_compressed
     if cloud.points == 0:
@@ -121,7 +131,7 @@ def inspect(path: Path) -> Cloud:
     return cloud
 
 
-def _cloud(path: Path, header: Any) -> Cloud:
+def _cloud(path: Path, header: Any, largest: int) -> Cloud:
     west, south, low = map(float, header.mins)
     east, north, high = map(float, header.maxs)
     bounds = west, south, east, north
@@ -134,6 +144,7 @@ def _cloud(path: Path, header: Any) -> Cloud:
         set(RGB) <= set(header.point_format.dimension_names),
         header.creation_date if header.creation_date and header.creation_date.year > 1 else None,
         _has_dates(header),
+        largest // header.point_format.size,
     )
 
 
@@ -160,7 +171,9 @@ def survey_dates(gps: Floats) -> tuple[datetime, datetime] | None:
     return first, last
 
 
-def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iterator[Chunk]:
+def chunks(
+    path: Path, size: int = CHUNK, drop: Collection[int] = NOISE, points: range | None = None
+) -> Iterator[Chunk]:
     """Yield the points of a cloud, decoded once; withheld points are left out.
 
     Parameters
@@ -171,6 +184,8 @@ def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iter
         Points decoded at a time, at most.
     drop : Collection[int]
         Classes to leave out.
+    points : range, optional
+        Points to decode, in the order of the file; None: all.
 
     Raises
     ------
@@ -179,18 +194,23 @@ def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iter
         damaged if points lie beyond the header's bounds.
     """
     with _opened(path, fields=USED) as reader:
-        header, done = reader.header, 0
+        header = reader.header
+        wanted = range(header.point_count) if points is None else points
+        done = wanted.start
         low, high = np.asarray(header.mins), np.asarray(header.maxs)
         slack = SLACK * (high - low) + 1
         size = max(1, min(size, CHUNK_BYTES // header.point_format.size))
-        while done < header.point_count:
-            points = _attempt(path, lambda: reader.read_points(size), f" after {done:,} points")
-            if not len(points):
+        limits = low - slack, high + slack
+        if done:
+            _attempt(path, lambda: reader.seek(done))
+        while done < wanted.stop:
+            number = min(size, wanted.stop - done)
+            read = _attempt(path, functools.partial(reader.read_points, number), f" after {done:,} points")
+            if not len(read):
                 break
-            done += len(points)
-            limits = low - slack, high + slack
-            yield _attempt(path, functools.partial(_chunk, path, points, limits, drop, _has_dates(header)))
-    if done != header.point_count:
+            done += len(read)
+            yield _attempt(path, functools.partial(_chunk, path, read, limits, drop, _has_dates(header)))
+    if done != wanted.stop:
         raise CatalogError(
             f"{path} is cut short: {done:,} of {header.point_count:,} points; download it again"
         )
@@ -223,11 +243,11 @@ def _opened(path: Path, fields: Collection[str] = ()) -> Any:
     if not _attempt(path, path.is_file):
         missing = "is not a file" if path.exists() else "does not exist"
         raise CatalogError(f"{path} {missing}; give LAS or LAZ files, or folders of them")
-    largest = _attempt(path, lambda: las_header.check(path))
-    # The parallel decoder allocates a complete chunk, which the header may give as 2^32 points.
-    backend = laspy.LazBackend.Lazrs if largest > CHUNK_BYTES else laspy.LazBackend.LazrsParallel
+    _attempt(path, lambda: las_header.check(path))
     selection = {"decompression_selection": _selection(fields)} if fields else {}
-    return _attempt(path, lambda: laspy.open(path, laz_backend=backend, **selection))
+    # The parallel decoder allocates a complete chunk, which the header may give as 2^32 points, and goes to
+    # wrong points of files with chunks of different sizes, as COPC has (laz-rs #62).
+    return _attempt(path, lambda: laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, **selection))
 
 
 def _selection(fields: Collection[str]) -> Any:

@@ -17,11 +17,8 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.output import disk_errors
-from flexroad.pipeline.prepare.point_buckets import (
-    BlockIndex,
-    BucketedPoints,
-    PointBuckets,
-)
+from flexroad.pipeline.prepare.point_buckets import BlockIndex, PointBuckets
+from flexroad.pipeline.prepare.point_reading import BucketedPoints
 from flexroad.pipeline.prepare.raster_writer import GROUND, RasterWriter
 from flexroad.tasks import memory
 from flexroad.tasks.acquire.points.to_rasters import (
@@ -45,6 +42,7 @@ class _PointsJob:
     """The input of a worker call that reads the points of a block."""
 
     buckets: PointBuckets
+    """Those that overlap the block and its rim."""
     grid: Grid
     """Cells of the block."""
     options: Options
@@ -87,7 +85,7 @@ def write_blocks(
     options : Options
         How points become rasters.
     executor : Executor
-        Runs two worker calls per block.
+        Runs two worker calls per block, on workers that are held.
     log : Callable[[str], None]
         Called with a line of progress: the number of blocks.
 
@@ -102,14 +100,13 @@ def write_blocks(
     second = list(_cells_jobs(writer, bucketed, options, first))
     _check_memory(first, second)
     log(f"{count(len(second), 'block')} of {bucketed.buckets.edge:g} m")
-    with executor.held() as held:
-        read = held.map(_read_points, first, _fail)
-        for points_job in track(read, "reading points", len(first), console=Console(stderr=True)):
-            _write_photo(writer, points_job)
-        bucketed.buckets.remove(bucketed.occupied)
-        made = held.map(_make_rasters, second, _fail)
-        for cells_job in track(made, "making rasters", len(second), console=Console(stderr=True)):
-            _write_block(writer, cells_job)
+    read = executor.map(_read_points, first, _fail)
+    for points_job in track(read, "reading points", len(first), console=Console(stderr=True)):
+        _write_photo(writer, points_job)
+    bucketed.buckets.remove()
+    made = executor.map(_make_rasters, second, _fail)
+    for cells_job in track(made, "making rasters", len(second), console=Console(stderr=True)):
+        _write_block(writer, cells_job)
 
 
 def _points_jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Options) -> Iterator[_PointsJob]:
@@ -122,9 +119,9 @@ def _points_jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Option
     for index in buckets.overlapping(wider):
         grid, inner = (_block_grid(part, buckets.edge, index) for part in (wider, whole))
         reach = points_reach_m(options, whole.cell)
-        if grid and not bucketed.occupied.isdisjoint(buckets.overlapping(grid, reach)):
+        if grid and (near := buckets.around(grid, reach)).runs:
             pixels = Grid.covering(inner.crs, inner.bounds, dop_cell) if inner and dop_cell else None
-            yield _PointsJob(buckets, grid, options, pixels, writer.scratch / f"{index[0]}_{index[1]}.npz")
+            yield _PointsJob(near, grid, options, pixels, writer.scratch / f"{index[0]}_{index[1]}.npz")
 
 
 def _cells_jobs(

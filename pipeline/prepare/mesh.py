@@ -21,11 +21,12 @@ from flexroad.pipeline.prepare.output import disk_errors
 from flexroad.pipeline.prepare.point_buckets import (
     PER_METRE,
     RECORD,
-    BlockIndex,
-    BucketedPoints,
     PointBuckets,
+    Run,
+    append,
     block_edge,
 )
+from flexroad.pipeline.prepare.point_reading import BucketedPoints
 from flexroad.pipeline.prepare.raster_writer import GROUND, PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, check_roads
 from flexroad.tasks.acquire.mesh import reference
@@ -127,14 +128,17 @@ def publish_mesh(
     check_disk(out, RECORD.itemsize * points, f"the {points:,.0f} points sampled on {name}", remedy)
     dop_cell = common.dop_cell_m if mesh_options.dop else None
     log(f"{len(mesh.faces):,} faces over {grid.width} x {grid.height} cells in {short(grid.crs)}")
-    with RasterWriter(out, grid, dop_cell, _tags(name, mesh_options, options), frame.vertical) as writer:
+    with (
+        RasterWriter(out, grid, dop_cell, _tags(name, mesh_options, options), frame.vertical) as writer,
+        executor.held() as held,
+    ):
         has_mask = add_roads(writer, common)
         if has_mask:
             writer.tags["REFERENCE"] = (
                 f"DSM on the road mask that ECSRC keeps, DTM elsewhere: {reference.CIRCULAR}"
             )
         write_blocks(
-            writer, _sample_points(writer, mesh, mesh_options, options, common.step_m), options, executor, log
+            writer, _sample_points(writer, mesh, mesh_options, options, common.step_m), options, held, log
         )
         if mesh_options.refine:
             log("refining the terrain")
@@ -149,7 +153,7 @@ def publish_mesh(
             _write_reference(writer)
             dataset = f"{dataset}; {reference.CIRCULAR}"
         published = writer.publish(
-            common.tile_size_m, common.date, dataset, common.min_cover, common.assumed_date
+            common.tile_size_m, common.date, dataset, common.min_cover, common.assumed_date, held
         )
     return published.with_notes(*mesh.notes, *frame.notes)
 
@@ -184,9 +188,8 @@ def _sample_points(
     area = writer.grid.width * writer.grid.height * writer.grid.cell**2
     reach = to_rasters.points_reach_m(options, writer.grid.cell)
     edge = block_edge(mesh_options.density * mesh.area, area, reach, step)
-    buckets, occupied = PointBuckets(writer.scratch / "points", edge), set[BlockIndex]()
+    runs = list[Run]()
     with disk_errors(writer.out):
-        buckets.folder.mkdir()
         for part in sample(mesh, mesh_options.density, mesh_options.seed):
             easting, northing, height = (
                 np.rint(axis * PER_METRE).astype(np.int64)
@@ -194,8 +197,8 @@ def _sample_points(
             )
             records = np.zeros(len(part), RECORD)
             records["height"] = height
-            occupied |= buckets.append(easting, northing, records)
-    return BucketedPoints(buckets, frozenset(occupied), mesh.bounds, (), (), 0)
+            runs += append(writer.scratch / "points", edge, easting, northing, records)
+    return BucketedPoints(PointBuckets.of(edge, runs), mesh.bounds, (), (), 0)
 
 
 def _draw_photo(writer: RasterWriter, mesh: TexturedMesh) -> None:

@@ -20,7 +20,8 @@ from flexroad.pipeline.prepare.blockwise import write_blocks
 from flexroad.pipeline.prepare.limits import check_disk, prepared_grid
 from flexroad.pipeline.prepare.options import PrepareOptions, written
 from flexroad.pipeline.prepare.output import scratch_folder
-from flexroad.pipeline.prepare.point_buckets import RECORD, BucketedPoints, block_edge_of, bucket_points
+from flexroad.pipeline.prepare.point_buckets import RECORD, block_edge_of
+from flexroad.pipeline.prepare.point_reading import BucketedPoints, bucket_points
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, check_roads
 from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES, Options, points_reach_m, tags
@@ -46,8 +47,8 @@ def prepare_points(
 ) -> PreparedDataset:
     """Make the rasters and the catalog of an area from point clouds.
 
-    Every file is decoded once. Memory holds one chunk of a file, or one block per worker, whatever the size
-    of the files and the area. Temporary files take 16 bytes per point.
+    Every file is decoded once. Memory holds one chunk of a file or one block per worker, whatever the size of
+    the files and the area. Temporary files take 16 bytes per point.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def prepare_points(
     options : Options
         How points become rasters; its ``ground`` is replaced by the parameter.
     executor : Executor
-        Runs the blocks.
+        Reads the files, makes the blocks and writes the COGs.
     log : Callable[[str], None]
         Called with lines of progress.
     ground : str
@@ -85,10 +86,11 @@ def prepare_points(
     frame = _frame(clouds, common)
     names = some([str(cloud.path) for cloud in clouds])
     check_disk(out, RECORD.itemsize * sum(cloud.points for cloud in clouds), f"the points of {names}", FEWER)
-    with scratch_folder(out) as folder:
+    with scratch_folder(out) as folder, executor.held() as held:
         possible = ("classes", "filter") if ground == "auto" else (ground,)
         farthest = max(points_reach_m(_with_method(options, method), common.cell_m) for method in possible)
-        bucketed = bucket_points(clouds, frame, folder, block_edge_of(clouds, frame, farthest, step), log)
+        edge = block_edge_of(clouds, frame, farthest, step)
+        bucketed = bucket_points(clouds, frame, folder, edge, held, log)
         method, notes = _ground(clouds, bucketed, options, ground)
         options, dense = _for_density(_with_method(options, method), bucketed)
         colourless = [
@@ -104,11 +106,11 @@ def prepare_points(
         file_tags = _tags(clouds, frame, bucketed, options)
         dop_cell = None if colourless else common.dop_cell_m
         with RasterWriter(out, grid, dop_cell, file_tags, frame.vertical) as writer:
-            write_blocks(writer, bucketed, options, executor, log)
+            write_blocks(writer, bucketed, options, held, log)
             add_roads(writer, common)
             dataset = common.dataset or _name(files)
             published = writer.publish(
-                common.tile_size_m, common.date, dataset, common.min_cover, common.assumed_date
+                common.tile_size_m, common.date, dataset, common.min_cover, common.assumed_date, held
             )
             return published.with_notes(*notes)
 

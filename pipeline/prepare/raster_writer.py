@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from itertools import compress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import numpy as np
 import rasterio
@@ -34,6 +34,7 @@ from flexroad.catalog.text import some
 from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
 from flexroad.catalog.tiling import cut
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor, SerialExecutor
 from flexroad.pipeline.prepare.output import (
     CATALOG,
     LAYER_TAG,
@@ -44,6 +45,7 @@ from flexroad.pipeline.prepare.output import (
 )
 from flexroad.tasks.types import Orthophoto
 
+SERIAL = SerialExecutor()
 PHOTO = "dop"
 GROUND = "ground"
 """Cells with ground points: an intermediate layer, not published."""
@@ -186,6 +188,7 @@ class RasterWriter:
         dataset: str = "",
         min_cover: float = MIN_COVER,
         assumed: datetime | None = None,
+        executor: Executor = SERIAL,
     ) -> PreparedDataset:
         """Convert the rasters to COGs and write the catalog; existing outputs in the folder are replaced.
 
@@ -202,11 +205,13 @@ class RasterWriter:
             Tiles with heights in less than this share (0 to 1) of their cells are left out.
         assumed : datetime, optional
             When the source was written, with a time zone; None: now.
+        executor : Executor
+            Converts each layer by a worker call.
 
         Raises
         ------
         ConfigError
-            If the disk is full, or no tile has enough heights.
+            If the disk is full, a worker dies, or no tile has enough heights.
         CatalogError
             If the roads overlap no tile.
         """
@@ -214,7 +219,11 @@ class RasterWriter:
         for layer in names:
             with self._writing(layer):
                 self._open[layer].close()
-                _to_cog(self.scratch / f"{layer}.tmp.tif", self.scratch / f"{layer}.tif", layer)
+        jobs = [_CogJob(self.scratch / f"{layer}.tmp.tif", layer, self.out) for layer in names]
+        # The largest layers first, so that no worker has one of them at the end.
+        jobs.sort(key=lambda job: -job.source.stat().st_size)
+        for job in executor.map(_to_cog, jobs, _fail):
+            job.source.unlink()
         survey = zoned(date or assumed or datetime.now(UTC))
         tiles, notes = self._tiles(names, tile_size_m, survey, dataset, min_cover)
         tiles = tuple(replace(tile, datetime_assumed=date is None) for tile in tiles)
@@ -292,16 +301,19 @@ class RasterWriter:
             self._open[layer] = raster
         return self._open[layer]
 
-    @contextlib.contextmanager
-    def _writing(self, layer: str) -> Iterator[None]:
-        try:
-            yield
-        except CRSError as error:
-            raise ConfigError(
-                f"cannot write {self.out / layer}.tif: {error}; choose another CRS with --to-crs"
-            ) from error
-        except (OSError, RasterioError) as error:
-            raise write_error(self.out / f"{layer}.tif", error) from error
+    def _writing(self, layer: str) -> contextlib.AbstractContextManager[None]:
+        return _raster_errors(self.out / f"{layer}.tif")
+
+
+@contextlib.contextmanager
+def _raster_errors(where: Path) -> Iterator[None]:
+    """Context manager that turns errors of writing a raster into a `ConfigError` of one line."""
+    try:
+        yield
+    except CRSError as error:
+        raise ConfigError(f"cannot write {where}: {error}; choose another CRS with --to-crs") from error
+    except (OSError, RasterioError) as error:
+        raise write_error(where, error) from error
 
 
 def _profile(layer: str) -> Mapping[str, Any]:
@@ -310,21 +322,36 @@ def _profile(layer: str) -> Mapping[str, Any]:
     return HEIGHT_PROFILE if layer in HEIGHTS else MASK_PROFILE
 
 
-def _to_cog(source: Path, target: Path, layer: str) -> None:
-    smooth = layer in HEIGHTS or layer == PHOTO
-    rasterio.shutil.copy(
-        source,
-        target,
-        driver="COG",
-        compress="deflate",
-        # The default, 6, takes 1.4 times as long; the files are 2% smaller.
-        level=1,
-        predictor="floating_point" if layer in HEIGHTS else "standard",
-        overview_resampling="average" if smooth else "mode",
-        statistics="yes",
-        bigtiff="if_safer",
-    )
-    source.unlink()
+@dataclass(frozen=True)
+class _CogJob:
+    """The input of a worker call that converts a layer."""
+
+    source: Path
+    layer: str
+    out: Path
+    """Output folder, for messages."""
+
+
+def _to_cog(job: _CogJob) -> _CogJob:
+    smooth = job.layer in HEIGHTS or job.layer == PHOTO
+    with _raster_errors(job.out / f"{job.layer}.tif"):
+        rasterio.shutil.copy(
+            job.source,
+            job.source.parent / f"{job.layer}.tif",
+            driver="COG",
+            compress="deflate",
+            # The default, 6, takes 1.4 times as long; the files are 2% smaller.
+            level=1,
+            predictor="floating_point" if job.layer in HEIGHTS else "standard",
+            overview_resampling="average" if smooth else "mode",
+            statistics="yes",
+            bigtiff="if_safer",
+        )
+    return job
+
+
+def _fail(job: _CogJob, reason: str) -> NoReturn:
+    raise ConfigError(f"{job.out / job.layer}.tif: {reason}; use fewer workers")
 
 
 def _window(whole: Grid, part: Grid) -> Window:

@@ -149,7 +149,15 @@ def divided(path: Path, chunk: int, *, version: str, kind: int, streamed: bool =
     [(100, False), (777, False), (50_000, True), (VARIABLE, False), (2**32 - 2, False), (0, False)],
 )
 def test_any_division_into_chunks_is_read(tmp_path, version, kind, chunk, streamed):
-    assert read(divided(tmp_path / "a.laz", chunk, version=version, kind=kind, streamed=streamed)) == N
+    path = divided(tmp_path / "a.laz", chunk, version=version, kind=kind, streamed=streamed)
+    assert read(path) == N
+    (whole,) = chunks(path, drop=())
+    parts = inspect(path).parts(370)
+    assert (len(parts) == 1) == (chunk in (0, 50_000, 2**32 - 2))
+    read_apart = [next(chunks(path, N, drop=(), points=part)) for part in reversed(parts)]
+    for name in ("x", "y", "z"):
+        joined = np.concatenate([getattr(part, name) for part in reversed(read_apart)])
+        np.testing.assert_array_equal(joined, getattr(whole, name))
 
 
 def test_equal_points_take_almost_no_bytes_and_are_read(tmp_path):

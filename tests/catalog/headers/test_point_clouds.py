@@ -46,6 +46,20 @@ def test_chunks_any_size_gives_same_points(tmp_path, suffix, size):
     assert np.array_equal(got[2], colour)
 
 
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_parts_of_any_size_read_apart_give_same_points(tmp_path, suffix):
+    path = write_cloud(tmp_path / f"a.{suffix}", some_points(), np.arange(N) % 30)
+    cloud, whole = inspect(path), joined(path, drop=())
+    for size in (7919, 60_000, 10**6):
+        parts = cloud.parts(size)
+        assert np.array_equal(np.concatenate(parts), np.arange(N))
+        # A compressed chunk of 50,000 points is not decoded for each of its parts.
+        assert size == 10**6 or len(parts[0]) == (size if suffix == "las" else max(size, 7 * 7919))
+        got = [joined(path, size=5000, drop=(), points=part) for part in parts]
+        for k in (0, 1):
+            np.testing.assert_array_equal(np.concatenate([part[k] for part in got]), whole[k])
+
+
 def test_chunks_drop_noise_and_withheld_points(tmp_path):
     kind, withheld = [1, 7, 18, 2, 17], [False, False, False, True, False]
     path = write_cloud(tmp_path / "a.laz", some_points(5), kind, withheld=withheld)

@@ -9,7 +9,7 @@ import pytest
 from flexroad.catalog import CatalogError
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.prepare import blockwise, points
+from flexroad.pipeline.prepare import blockwise, point_reading, points
 from flexroad.pipeline.prepare.limits import check_extent, prepared_grid
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.points import prepare_points
@@ -49,6 +49,16 @@ def test_point_2000_km_away_is_named_with_its_file(tmp_path):
 def test_first_file_with_a_distant_point_names_that_point(tmp_path):
     with pytest.raises(CatalogError, match="a.laz has a point at easting 356009.00 and northing 7699000.00"):
         prepare([cloud(tmp_path / "a.laz", (9, 2e6))], tmp_path / "out")
+
+
+def test_part_of_a_file_far_from_those_before_names_its_farthest_point(tmp_path, monkeypatch):
+    monkeypatch.setattr(point_reading, "CHUNK", 100)
+    place = np.zeros((300, 3))
+    place[200:], place[250] = [0, 2e6, 0], [5, 2.1e6, 0]
+    file = write_cloud(tmp_path / "a.las", SITE + place, 2, CRS)
+    with pytest.raises(CatalogError, match="a.las has a point at easting 356005.00 and northing 7799000.00"):
+        prepare([file], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_few_points_behind_a_gap_are_named_with_their_file(tmp_path):

@@ -4,6 +4,7 @@ import resource
 from datetime import UTC, date, datetime
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 import rasterio
@@ -12,7 +13,7 @@ from flexroad.catalog import Catalog, CatalogError, Grid
 from flexroad.catalog.crs import vertical
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.prepare import point_buckets, points
+from flexroad.pipeline.prepare import point_buckets, point_reading, points
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.tasks.acquire.points.to_rasters import Options, rasterise
@@ -176,6 +177,38 @@ def test_prepare_points_dop_has_colour_of_highest_point(tmp_path):
     assert raster.dtypes[0] == "uint8"
 
 
+@pytest.mark.parametrize(
+    ("colours", "expected"),
+    [
+        ([0, 200, 60_000, 9], [0, 200, 255, 9]),
+        ([0, 60_000, 200, 9], [0, 60_000 >> 8, 0, 0]),
+        ([0, 0, 0, 9], [0, 0, 0, 9]),
+    ],
+)
+def test_first_chunk_with_colours_decides_on_their_bits(tmp_path, monkeypatch, executor, colours, expected):
+    """A chunk of equal colours per column of the orthophoto, west to east."""
+    monkeypatch.setattr(point_reading, "CHUNK", 100)
+    north, column = np.arange(100) / 10, np.arange(4).repeat(100)
+    xyz = np.stack([356_000.5 + column, 5_699_000 + np.tile(north, 4), np.full(400, 50.0)], axis=1)
+    colour = np.repeat(np.array(colours), 100)[:, None].repeat(3, axis=1)
+    file = write_cloud(tmp_path / "a.las", xyz, 2, "EPSG:25832", colour)
+    prepare([file], tmp_path / "out", executor, dop_cell_m=1.0)
+    photo, _ = read(tmp_path / "out", "dop")
+    if any(colours):
+        np.testing.assert_array_equal(photo.data[:, 2], [expected] * 3)
+
+
+def test_points_that_a_dead_worker_has_written_are_written_once(plain, tmp_path, monkeypatch):
+    def twice(self, function, jobs, lost, probe=None):
+        for job in jobs:
+            function(job)
+            yield function(job)
+
+    monkeypatch.setattr(SerialExecutor, "map", twice)
+    prepare(plain[0], tmp_path / "out", ground="filter")
+    check_same(tmp_path / "out", plain[1])
+
+
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plain")
@@ -192,7 +225,7 @@ def check_same(out, expected):
 
 def test_prepare_points_in_many_chunks_and_blocks_gives_the_same_rasters(plain, tmp_path, monkeypatch):
     files, expected = plain
-    monkeypatch.setattr(point_buckets, "CHUNK", 997)
+    monkeypatch.setattr(point_reading, "CHUNK", 997)
     monkeypatch.setattr(point_buckets, "POINTS_PER_BLOCK", 1)
     monkeypatch.setattr(point_buckets, "SHORTEST_EDGE_M", 37.0)
     _, lines = prepare(files, tmp_path / "out", ground="filter")
@@ -239,7 +272,13 @@ def test_prepare_points_in_blocks_gives_the_rasters_of_all_points_at_once(tmp_pa
 
 def test_prepare_points_with_workers_gives_the_same_rasters(plain, tmp_path, monkeypatch, executor):
     monkeypatch.setattr(point_buckets, "POINTS_PER_BLOCK", 1)
-    prepare(plain[0], tmp_path / "out", executor, ground="filter")
+    # A compressed file is divided where its chunks of 50,000 points are, so that it has one part.
+    monkeypatch.setattr(point_reading, "CHUNK", 7000)
+    files = [laspy.read(file) for file in plain[0]]
+    for file in files:
+        file.write(tmp_path / f"{len(file)}.las")
+    _, lines = prepare(sorted(tmp_path.glob("*.las")), tmp_path / "out", executor, ground="filter")
+    assert sum(line.startswith("reading ") for line in lines) == len(files)
     check_same(tmp_path / "out", plain[1])
     names = {path.name for path in (tmp_path / "out").iterdir()}
     rasters = {f"{name}.tif" for name in ("dsm", "dtm", "road_height", "bridges", "dop")}
