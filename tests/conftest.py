@@ -11,7 +11,7 @@ from hypothesis import settings
 
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-from tests import changed, command_line
+from tests import changed, command_line, gpu
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts background jobs with Ctrl-C ignored, and the processes of the tests would inherit that.
@@ -62,8 +62,10 @@ def skip_unchanged(items, files):
 def pytest_terminal_summary(terminalreporter, exitstatus, config):
     if config.option.soak == "record" and not exitstatus:
         skipped = [report.longrepr[2] for report in terminalreporter.stats.get("skipped", [])]
-        # The tests' environment has no dask-kubernetes, which needs a cluster.
-        missed = [reason for reason in skipped if "dask_kubernetes" not in reason]
+        # The tests' environment has no dask-kubernetes, which needs a cluster, and few machines have a GPU.
+        missed = [
+            reason for reason in skipped if "dask_kubernetes" not in reason and gpu.REASON not in reason
+        ]
         if config.option.keyword or config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
             missed.append("only some of the tests ran")
         terminalreporter.write_line(f"not recorded: {missed[0]}" if missed else changed.record())

@@ -135,8 +135,9 @@ class TorchObjective:
         if device == "cpu":
             # At these sizes two threads are slower than one.
             torch.set_num_threads(1)
-        elif not torch.cuda.is_available():
-            raise TaskError(f"no device {device!r} on this machine; set fit.device to cpu")
+        elif (torch.device(device).index or 0) >= (gpus := torch.cuda.device_count()):
+            devices = " or ".join(["cpu", *(f"cuda:{i}" for i in range(gpus))])
+            raise TaskError(f"no device {device!r} on this machine; set fit.device to {devices}")
         m, n = shape
         self.device = device
         self.basis_u = self.tensor(dense(objective.start_u, objective.along_u.T, n))

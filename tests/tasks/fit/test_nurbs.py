@@ -16,6 +16,7 @@ from flexroad.tasks.spline import adam
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import clamped_space
 from flexroad.tasks.types import RoadClusters, TileData
+from tests.gpu import needs_gpu
 
 WEST, NORTH = 295500.0, 5629500.0
 
@@ -353,13 +354,25 @@ def test_fit_impossible_input_raises():
         fitted(row, road, control_points=(4, 4))
 
 
-def test_fit_missing_device_raises():
-    torch = pytest.importorskip("torch")
-    if torch.cuda.is_available():
-        pytest.skip("this machine has the device")
+@pytest.mark.parametrize(
+    ("gpus", "device", "devices"), [(0, "cuda", "cpu"), (1, "cuda:1", "cpu or cuda:0"), (0, "cuda:0", "cpu")]
+)
+def test_fit_missing_device_raises(monkeypatch, gpus, device, devices):
+    monkeypatch.setattr("torch.cuda.device_count", lambda: gpus)
     data, clusters, _ = tile()
-    with pytest.raises(TaskError, match="no device 'cuda' on this machine; set fit.device to cpu"):
-        fitted(data, clusters, engine="torch", device="cuda")
+    with pytest.raises(
+        TaskError, match=f"no device '{device}' on this machine; set fit.device to {devices}$"
+    ):
+        fitted(data, clusters, engine="torch", device=device)
+
+
+@pytest.mark.parametrize("device", ["cuda", "cuda:0"])
+def test_fit_on_gpu_gives_same_surface(device):
+    needs_gpu()
+    data, clusters, _ = tile(noise=0.05)
+    a = fitted(data, clusters, iterations=100)
+    b = fitted(data, clusters, iterations=100, engine="torch", device=device)
+    np.testing.assert_allclose(on_cells(a, data), on_cells(b, data), atol=1e-5)
 
 
 def test_options_inconsistent_or_out_of_bounds_are_refused():
