@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -51,6 +53,15 @@ def missing_extra(error: ImportError) -> TaskError:
     """Return the error to raise when a package of the extra is not installed."""
     package = (error.name or str(error)).split(".")[0]
     return TaskError(f'DINOv2 needs {package}: pip install "flexroad[dinov2]"')
+
+
+@contextmanager
+def gpu_memory() -> Iterator[None]:
+    """Raise a TaskError with the remedy if the GPU has too little memory."""
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise TaskError("the GPU has too little memory; use a smaller batch or fewer workers") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +111,7 @@ class Backbone:
         """
         side = windows.shape[-1] // PATCH
         dtype = torch.float16 if self.device == "cuda" else torch.bfloat16
-        with torch.inference_mode(), torch.autocast(self.device, dtype, enabled=self.half):
+        with gpu_memory(), torch.inference_mode(), torch.autocast(self.device, dtype, enabled=self.half):
             pixels = torch.from_numpy(windows).to(self.device)
             states = self.model(pixel_values=pixels, output_hidden_states=True).hidden_states[-layers:]
             patches = [self.model.layernorm(state)[:, 1 + self.registers :].float() for state in states]
@@ -156,7 +167,9 @@ def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Bac
             f"{folder}: patches of {model.config.patch_size} pixels, not {PATCH}; {_remedy(name)}"
         )
     identity = _identity(model)
-    return Backbone(name, model.eval().requires_grad_(False).to(target), target, half, identity)
+    with gpu_memory():
+        model = model.eval().requires_grad_(False).to(target)
+    return Backbone(name, model, target, half, identity)
 
 
 def _folder(name: str) -> Path:

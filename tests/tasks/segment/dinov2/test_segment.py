@@ -29,6 +29,7 @@ from flexroad.tasks.segment.dinov2.train import (
     best_threshold,
 )
 from flexroad.tasks.types import TileData
+from tests.gpu import needs_gpu
 from tests.make_backbone import save_backbone
 
 WINDOW, GSD = 112, 0.1
@@ -406,6 +407,33 @@ def test_load_backbone_no_gpu_raises(backbones, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(TaskError, match="no device 'cuda'"):
         load_backbone(str(backbones[0]), "cuda")
+
+
+def test_tokens_full_gpu_raises(backbones, monkeypatch):
+    import torch
+
+    def full(**_):
+        raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    backbone = load_backbone(str(backbones[0]), "cpu")
+    monkeypatch.setattr(backbone.model, "forward", full)
+    with pytest.raises(TaskError, match="too little memory; use a smaller batch or fewer workers"):
+        backbone.tokens(np.zeros((1, 3, 28, 28), np.float32), 1)
+
+
+@pytest.mark.parametrize("registers", [0, 4])
+def test_tokens_on_gpu_equal_those_of_the_cpu(backbones, registers):
+    needs_gpu()
+    windows = np.random.default_rng(0).normal(size=(2, 3, WINDOW, WINDOW)).astype(np.float32)
+    gpu, half, cpu = (
+        load_backbone(str(backbones[registers]), *how) for how in (("auto",), ("cuda", True), ("cpu",))
+    )
+    assert (gpu.device, half.device) == ("cuda", "cuda")
+    expected = cpu.tokens(windows, 2)
+    spread = expected.std()
+    assert (gpu.tokens(windows, 2).cpu() - expected).abs().max() < 1e-2 * spread
+    error = (half.tokens(windows, 2).cpu() - expected).abs()
+    assert 0 < error.mean() < 1e-2 * spread
 
 
 def test_import_method_imports_no_heavy_package():
