@@ -36,7 +36,7 @@ from flexroad.tasks.types import Floats
 cv2 = lazy("cv2")
 
 SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
-ON_GPU, ON_CPU = "PatchMatch on the GPU", "semi-global matching on the CPU, as this pycolmap has no CUDA"
+ON_GPU, ON_CPU = "PatchMatch on the GPU", "semi-global matching on the CPU, as pycolmap has no GPU"
 PIXELS_PER_CELL = 4
 """Width of the smallest useful cell, in pixels of the depth maps."""
 POINTS_PER_CELL = 5

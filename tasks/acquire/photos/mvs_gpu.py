@@ -1,6 +1,6 @@
 """Dense stereo on a GPU: COLMAP's PatchMatch and fusion (Schönberger et al., 2016).
 
-Needs a pycolmap built with CUDA; the wheels on PyPI are built without it.
+Needs a GPU and a pycolmap built with CUDA, as the package pycolmap-cuda12.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ class Options(base.Options):
 
 
 def available() -> bool:
-    """Return whether pycolmap was built with CUDA; raises TaskError if it is not installed."""
-    return bool(colmap().has_cuda)
+    """Return whether pycolmap was built with CUDA and finds a GPU; raises TaskError if it is missing."""
+    pycolmap = colmap()
+    return bool(pycolmap.has_cuda) and pycolmap.get_num_cuda_devices() > 0
 
 
 def patchmatch(reconstruction: Reconstruction, work: Path, options: Options) -> Cloud:

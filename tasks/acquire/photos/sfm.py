@@ -3,7 +3,8 @@
 The paper's stage A leaves this to photogrammetry. Here it is COLMAP (Schönberger & Frahm, 2016) by its Python
 binding: SIFT, matching among GNSS neighbours, and incremental mapping with the positions as priors in the
 bundle adjustment. Coordinates are relative to an origin in whole metres, so that float32 files lose no
-precision.
+precision. Features are found and matched on the CPU, also where pycolmap has a GPU: with COLMAP's SIFT for
+GPUs, heights from the synthetic photographs of the tests were 0.09 m off (median), instead of 0.004 m.
 
 Vertical photographs of flat ground do not determine the focal length: a longer one with the ground farther
 below fits them equally well, and scales all heights by the same factor. The focal length of the files is
@@ -125,13 +126,14 @@ def colmap() -> Any:
     Raises
     ------
     TaskError
-        If it is not installed; the message has the command to install it.
+        If it or a library that it needs is not installed; the message has the command to install it.
     """
     try:
         # It logs hundreds of lines of progress; its errors are raised here as TaskError.
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    except ImportError as error:
-        raise TaskError(f"photographs need pycolmap ({error}): {INSTALL}") from error
+    except (ImportError, RuntimeError) as error:
+        # It raises RuntimeError if a shared library is missing, as CUDA's or libSM.so.6.
+        raise TaskError(f"photographs need pycolmap ({error.__cause__ or error}): {INSTALL}") from error
     return pycolmap
 
 
@@ -181,7 +183,7 @@ def _features(database: Path, root: Path, shots: Mapping[str, Shot], options: Op
     for name, shot in shots.items():
         cameras[shot.camera, shot.width, shot.height, shot.focal_px].append(name)
     extraction = pycolmap.FeatureExtractionOptions(
-        max_image_size=options.image_size, num_threads=options.threads or -1, use_gpu=pycolmap.has_cuda
+        max_image_size=options.image_size, num_threads=options.threads or -1
     )
     extraction.sift.max_num_features = options.features
     for (_, width, height, focal), names in cameras.items():
@@ -195,6 +197,7 @@ def _features(database: Path, root: Path, shots: Mapping[str, Shot], options: Op
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
             extraction_options=extraction,
+            device=pycolmap.Device.cpu,
         )
 
 
@@ -215,10 +218,10 @@ def _priors(database: Path, local: Mapping[str, Floats], placed: PlacedPhotos) -
 
 
 def _match(database: Path, count: int, options: Options) -> None:
-    matching = pycolmap.FeatureMatchingOptions(num_threads=options.threads or -1, use_gpu=pycolmap.has_cuda)
+    matching = pycolmap.FeatureMatchingOptions(num_threads=options.threads or -1)
     verifying = pycolmap.TwoViewGeometryOptions()
     verifying.ransac.random_seed = options.seed
-    common = {"matching_options": matching, "verification_options": verifying}
+    common = {"matching_options": matching, "verification_options": verifying, "device": pycolmap.Device.cpu}
     if count <= EXHAUSTIVE:
         pycolmap.match_exhaustive(database, **common)
     else:

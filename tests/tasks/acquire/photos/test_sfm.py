@@ -14,6 +14,7 @@ from flexroad.tasks.acquire.photos.exif import Control, place_photos, read_shot
 from flexroad.tasks.acquire.photos.poisson import poisson, write_ply
 from flexroad.tasks.acquire.photos.sfm import Options, reconstruct
 from tests import make_photos
+from tests.gpu import REASON
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak("photos")]
 
@@ -101,6 +102,27 @@ def test_photo_cloud_has_true_heights_and_normals(reconstruction, cloud):
     assert np.degrees(np.arccos(np.median(cosine))) < 5
 
 
+def test_patchmatch_has_true_heights(reconstruction, tmp_path):
+    if not mvs_gpu.available():
+        pytest.skip(f"{REASON} and pycolmap-cuda12")
+    cloud = mvs_gpu.patchmatch(reconstruction, tmp_path, mvs_gpu.Options())
+    errors = height_errors(cloud.points, reconstruction.origin)
+    assert np.abs(np.median(errors)) < 0.05
+    assert np.quantile(np.abs(errors), 0.95) < 0.15
+    assert np.ptp(cloud.points[:, :2], axis=0).min() > 30
+    # Normals point up, to the cameras.
+    assert np.median(cloud.normals[:, 2]) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("built", "gpus", "expected"), [(False, 1, False), (True, 0, False), (True, 1, True)]
+)
+def test_patchmatch_needs_cuda_and_a_gpu(monkeypatch, built, gpus, expected):
+    monkeypatch.setattr(sfm.colmap(), "has_cuda", built)
+    monkeypatch.setattr("pycolmap.get_num_cuda_devices", lambda: gpus, raising=False)
+    assert mvs_gpu.available() == expected
+
+
 def test_photo_cloud_has_colours_of_the_photographs(reconstruction, cloud, photos):
     texture = make_photos.texture()
     east, north, _ = (cloud.points + reconstruction.origin).T
@@ -177,3 +199,16 @@ def test_reconstruct_without_pycolmap_gives_install_command(placed, tmp_path, mo
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(TaskError, match=r"pip install 'flexroad\[photogrammetry\]'"):
         reconstruct(placed, tmp_path, QUICK)
+
+
+def test_colmap_names_a_missing_library(tmp_path, monkeypatch):
+    # As pycolmap raises it.
+    lines = (
+        "try: raise ImportError('libSM.so.6: no such file')",
+        "except ImportError as e: raise RuntimeError() from e",
+    )
+    (tmp_path / "pycolmap.py").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pycolmap", raising=False)
+    with pytest.raises(TaskError, match=r"photographs need pycolmap \(libSM.so.6: no such file\)"):
+        sfm.colmap()
