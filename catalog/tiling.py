@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import compress
+from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,6 +37,10 @@ CELLS = (1.0, 2.0, 2.5, 5.0)
 """Sizes of the cells of tiles whose DSM is reprojected (m), and these times powers of ten."""
 MAX_TILE_M = 2000
 """Largest size of a tile that is proposed (m)."""
+AT_ONCE = 10_000
+"""Tiles whose neighbourhoods are looked up at a time: as polygons they take many times the memory."""
+RECENT = 2**14
+"""Layers that are kept to be shared: of the last thousands of tiles."""
 
 
 @dataclass(frozen=True)
@@ -84,15 +89,38 @@ class _PlacedFile(NamedTuple):
     """In the tiles' CRS (m)."""
 
 
-class _NearFiles(NamedTuple):
-    """The files of one layer near one tile, in the order given."""
+class _OnTile(NamedTuple):
+    """The files of one layer that overlap one tile by more than `LATTICE_TOLERANCE`, in the order given."""
 
-    files: list[_PlacedFile]
-    """Files within `REACH_M`."""
-    in_core: list[RasterFile]
-    """Files that overlap the tile itself by more than `LATTICE_TOLERANCE`."""
+    files: list[RasterFile]
     shared: NDArray[np.float64]
-    """Intersection of each file in ``in_core`` with the tile, ``(n, 4)``: west, south, east, north (m)."""
+    """Intersection of each file with the tile, ``(n, 4)``: west, south, east, north (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class _NearFiles:
+    """The files of one layer near each tile: all in a few arrays, because objects would take gigabytes."""
+
+    files: Sequence[_PlacedFile]
+    ends: NDArray[np.intp]
+    """End of each tile's entries in the arrays below, after a zero, ``(tiles + 1,)``."""
+    numbers: NDArray[np.int32]
+    """Numbers of the files within `REACH_M`, by tile, in the order given, ``(m,)``."""
+    in_core: NDArray[np.bool_]
+    """Whether the file overlaps the tile itself by more than `LATTICE_TOLERANCE`, ``(m,)``."""
+    shared: NDArray[np.float64]
+    """Intersection of the file with the tile, ``(m, 4)``: west, south, east, north (m)."""
+
+    def near(self, tile: int) -> tuple[int, ...]:
+        """Return the numbers of the files near a tile."""
+        return tuple(self.numbers[self.ends[tile] : self.ends[tile + 1]].tolist())
+
+    def on(self, tile: int) -> _OnTile:
+        """Return the files on a tile."""
+        entries = slice(self.ends[tile], self.ends[tile + 1])
+        core = self.in_core[entries]
+        numbers = self.numbers[entries][core].tolist()
+        return _OnTile([self.files[number].file for number in numbers], self.shared[entries][core])
 
 
 def cut(
@@ -160,29 +188,23 @@ def cut(
     if not any(file.crs == grid_crs for file in dsm):
         notes.append(f"the tiles have cells of {next(iter(grids.values())).cell:g} m")
     near = {name: _near(grids, files) for name, files in placed.items()}
-    for name, by_tile in near.items():
-        if not any(tile.files for tile in by_tile.values()):
+    for name, files in near.items():
+        if not files.numbers.size:
             raise CatalogError(_far(name, placed[name], grids))
     # Of the complete layer, so that all tiles describe it in the same way.
     bare = {name: None if all(p.file.has_crs for p in files) else crs for name, files in placed.items()}
     others = {name: any(not same(p.file.crs, grid_crs) for p in files) for name, files in placed.items()}
     values = dict.fromkeys(MASKS, road_values)
+    layers = [
+        (near[name], _layers(name, files, values.get(name, ()), bare[name], conversion, others[name]))
+        for name, files in placed.items()
+    ]
     tiles = []
-    for tile_id, grid in grids.items():
-        layers, nearby = by_cover(
-            [
-                _converted(
-                    _layer(name, by_tile[tile_id].files, values.get(name, ()), bare[name]),
-                    conversion,
-                    others[name],
-                )
-                for name, by_tile in near.items()
-                if by_tile[tile_id].files
-            ],
-            grid,
-        )
-        survey_date = taken(near["dsm"][tile_id].in_core, date)
-        tiles.append(Tile(tile_id, grid, layers, str(root), *survey_date, dataset=dataset, nearby=nearby))
+    for position, (tile_id, grid) in enumerate(grids.items()):
+        own = [layer(numbers) for files, layer in layers if (numbers := files.near(position))]
+        covering, nearby = by_cover(own, grid)
+        survey_date = taken(near["dsm"].on(position).files, date)
+        tiles.append(Tile(tile_id, grid, covering, str(root), *survey_date, dataset=dataset, nearby=nearby))
     return TilingResult(tuple(tiles), (*notes, *uncovered, *assumed(tiles)), tuple(left_out))
 
 
@@ -257,12 +279,6 @@ def _other_crs(layer: str, files: Sequence[_PlacedFile], crs: str, conversion: C
         )
 
 
-def _converted(layer: Layer, conversion: Conversion, has_others: bool) -> Layer:
-    """Return the layer with what `load` needs for files in another CRS, or of an undeclared unit."""
-    unit = conversion.height_unit if layer.name in HEIGHTS else None
-    return replace(layer, reproject=conversion.reproject and has_others, height_unit=unit)
-
-
 def _cut(dsm: Sequence[_PlacedFile], crs: str, size_m: float) -> dict[str, Grid]:
     """Return the grids of the tiles that the DSM files touch, by id, with the most frequent cell size."""
     cells = Counter(p.file.cell for p in dsm if p.file.crs == crs)
@@ -314,26 +330,25 @@ def _cell_m(placed: _PlacedFile, crs: str) -> float:
     return _nearest_cell(true_m)
 
 
-def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> dict[str, _NearFiles]:
-    """Return the files near each tile, by tile id."""
-    cores = np.array([grid.bounds for grid in grids.values()])
+def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> _NearFiles:
+    """Return the files near each tile, in the order of the tiles."""
+    edges = chain.from_iterable(grid.bounds for grid in grids.values())
+    cores = np.fromiter(edges, np.float64, 4 * len(grids)).reshape(-1, 4)
     extents = np.array([placed.bounds for placed in files])
     tree = shapely.STRtree(shapely.box(*extents.T))
-    tile, file = tree.query(shapely.box(*(cores + REACH_M * np.array([-1, -1, 1, 1])).T))
-    order = np.lexsort((file, tile))
-    tile, file = tile[order], file[order]
+    pairs = []
+    for begin in range(0, len(cores), AT_ONCE):
+        around = cores[begin : begin + AT_ONCE] + REACH_M * np.array([-1, -1, 1, 1])
+        tile, file = tree.query(shapely.box(*around.T))
+        order = np.lexsort((file, tile))
+        pairs.append((tile[order] + begin, file[order].astype(np.int32)))
+    tile, file = (np.concatenate(column) for column in zip(*pairs, strict=True))
     shared = np.hstack(
         [np.maximum(cores[tile, :2], extents[file, :2]), np.minimum(cores[tile, 2:], extents[file, 2:])]
     )
     cell = next(iter(grids.values())).cell
     in_core = (shared[:, 2:] - shared[:, :2]).min(axis=1) > LATTICE_TOLERANCE * cell
-    ends = np.searchsorted(tile, np.arange(len(grids) + 1))
-    near = {}
-    for tile_id, begin, end in zip(grids, ends[:-1], ends[1:], strict=True):
-        nearby, core = [files[k] for k in file[begin:end]], in_core[begin:end]
-        on_tile = [placed.file for placed in compress(nearby, core)]
-        near[tile_id] = _NearFiles(nearby, on_tile, shared[begin:end][core])
-    return near
+    return _NearFiles(files, np.searchsorted(tile, np.arange(len(grids) + 1)), file, in_core, shared)
 
 
 def _far(name: str, files: Sequence[_PlacedFile], grids: Mapping[str, Grid]) -> str:
@@ -346,18 +361,19 @@ def _far(name: str, files: Sequence[_PlacedFile], grids: Mapping[str, Grid]) -> 
 
 
 def _covered(
-    root: Path, grids: Mapping[str, Grid], near: Mapping[str, _NearFiles], min_cover: float, reproject: bool
+    root: Path, grids: Mapping[str, Grid], near: _NearFiles, min_cover: float, reproject: bool
 ) -> tuple[dict[str, Grid], list[str]]:
     """Return the tiles of which the DSM covers at least ``min_cover``, and notes on the others."""
     kept, thin, empty, risky = dict[str, Grid](), list[str](), list[str](), list[str]()
-    for tile_id, grid in grids.items():
-        cover = _cover(root, grid, near[tile_id], min_cover, reproject)
+    for position, (tile_id, grid) in enumerate(grids.items()):
+        dsm = near.on(position)
+        cover = _cover(root, grid, dsm, min_cover, reproject)
         if cover >= max(min_cover, 1e-9):
             kept[tile_id] = grid
             risky += [tile_id] if min_cover and cover < MIN_COVER else []
         elif cover:
             thin.append(tile_id)
-        elif near[tile_id].in_core:
+        elif dsm.files:
             empty.append(tile_id)
     note = (
         f"left out {count(len(thin), 'tile')} with a DSM height in less than {min_cover:.0%} of the cells "
@@ -374,15 +390,15 @@ def _covered(
     return kept, [note] * bool(thin) + [void] * bool(empty) + [below] * bool(risky)
 
 
-def _cover(root: Path, grid: Grid, near: _NearFiles, min_cover: float, reproject: bool) -> float:
+def _cover(root: Path, grid: Grid, dsm: _OnTile, min_cover: float, reproject: bool) -> float:
     """Return the share of a tile that the DSM covers: by heights, or by the extents of the files."""
-    by_extents = _area(near.shared) / (grid.width * grid.cell) ** 2
-    others = [file for file in near.in_core if not same(file.crs, grid.crs)]
+    by_extents = _area(dsm.shared) / (grid.width * grid.cell) ** 2
+    others = [file for file in dsm.files if not same(file.crs, grid.crs)]
     if not min_cover or by_extents < min_cover or (others and not reproject):
         return by_extents
     # What a VRT names was checked when the files were found.
-    bare = next((file.crs for file in near.in_core if not file.has_crs), None)
-    by_heights = height_share(grid, [root / file.name for file in near.in_core], crs=bare)
+    bare = next((file.crs for file in dsm.files if not file.has_crs), None)
+    by_heights = height_share(grid, [root / file.name for file in dsm.files], crs=bare)
     return by_extents if by_heights is None else by_heights
 
 
@@ -391,9 +407,28 @@ def _area(boxes: NDArray[np.float64]) -> float:
     return float(shapely.union_all(shapely.box(*boxes.T)).area)
 
 
-def _layer(name: str, files: Sequence[_PlacedFile], values: tuple[int, ...], crs: str | None) -> Layer:
-    names, extents = tuple(placed.file.name for placed in files), tuple(placed.bounds for placed in files)
-    return Layer(name, names, values, crs, extents)
+def _layers(
+    name: str,
+    files: Sequence[_PlacedFile],
+    values: tuple[int, ...],
+    crs: str | None,
+    conversion: Conversion,
+    has_others: bool,
+) -> Callable[[tuple[int, ...]], Layer]:
+    """Return the function that makes a layer of files given by their numbers; neighbouring tiles share it.
+
+    ``has_others`` is whether files of the layer are in another CRS than the tiles.
+    """
+    unit = conversion.height_unit if name in HEIGHTS else None
+    reproject = conversion.reproject and has_others
+
+    @lru_cache(RECENT)
+    def layer(numbers: tuple[int, ...]) -> Layer:
+        names = tuple(files[number].file.name for number in numbers)
+        extents = tuple(files[number].bounds for number in numbers)
+        return Layer(name, names, values, crs, extents, reproject, height_unit=unit)
+
+    return layer
 
 
 def taken(dsm: Sequence[RasterFile], date: datetime | None) -> tuple[datetime, bool]:

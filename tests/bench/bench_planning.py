@@ -2,8 +2,8 @@
 
 The tiles are those of `production`, with borders, 250 m wide with cells of 5 m, on four layers of rasters in
 sheets of 1 km. Only the first tile is computed. The others get its stored results, moved to their places,
-and its row, and their markers are without products: writing and reading of meshes is not measured. Everything
-is written by the program's own writers. CPU time counts, not the time on the wall.
+and its row, and their markers are without products: writing and reading of meshes is not measured. CPU time
+counts, not the time on the wall.
 
 Usage: ``python tests/bench/bench_planning.py [TILES] [--only COMMAND ...]``
 """
@@ -11,14 +11,16 @@ Usage: ``python tests/bench/bench_planning.py [TILES] [--only COMMAND ...]``
 from __future__ import annotations
 
 import argparse
+import hashlib
+import io
 import json
 import math
 import os
 import subprocess
 import sys
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +36,12 @@ from flexroad.pipeline.execute.executor import Probe
 from flexroad.pipeline.graph.graph import Node
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.checked_json import loads
+from flexroad.pipeline.store.codec import HEADER
 from flexroad.pipeline.store.database import NAME as DATABASE
 from flexroad.pipeline.store.records import DONE, from_item
 from flexroad.pipeline.worker.tile import TileJob, TileResult, marker_stat
+from flexroad.tasks.io.archive import LEVEL, npz
 from flexroad.tasks.synthetic import SceneOptions, make_scene
 
 TILES = 1000
@@ -47,6 +50,8 @@ CORNER = 300_000, 5_700_000
 """South-west corner of the survey."""
 CONFIG = "extends: production\nfit: {spacing_m: 15}\n"
 LAYERS = ("dsm", "dtm", "road_mask", "dop")
+STORED = ("segment", "ecsrc", "fit", "evaluate", "assess")
+"""Stages whose results each tile has in the store; meshes of the few tiles with pictures are made again."""
 POINTS = 1000
 """Number of points of the query, all over the survey."""
 WRITTEN = ["--config", "config.yaml", "--catalog", "catalog.parquet", "--out"]
@@ -135,14 +140,18 @@ def write(path: Path, values: NDArray[Any], west: float, north: float) -> None:
 
 
 class Copied:
-    """An executor that gives each tile the results of one that was computed, moved to its place."""
+    """An executor that gives each tile the results of one that was computed, moved to its place.
+
+    Only what the commands read of all tiles is stored: no meshes, and nothing of borders. The arrays of a
+    result are compressed once, because only the header names the place.
+    """
 
     def __init__(self, run: Run, tile_id: str) -> None:
         graph = run.graph(next(tile for tile in run.catalog.tiles if tile.id == tile_id))
-        self.grid, self.store = graph.tile.grid, ArtefactStore(run.store)
+        self.grid, self.store = graph.tile.grid, run.store
         self.item = loads((run.folder(tile_id).path / DONE).read_bytes())
-        nodes = (graph.nodes[name] for name in graph.variants["flexroad"].values())
-        self.stored = {node.stage: (node, self.store.get(node)) for node in nodes if node.stored}
+        nodes = (graph.nodes[graph.variants["flexroad"][stage]] for stage in STORED)
+        self.stored = {node.stage: separated(path(self.store, node).read_bytes()) for node in nodes}
 
     def map(
         self,
@@ -154,8 +163,10 @@ class Copied:
         for job in jobs:
             graph = job.graph
             east, north = graph.tile.grid.west - self.grid.west, graph.tile.grid.north - self.grid.north
-            for stage in self.stored:
-                self.copy(graph.nodes[graph.variants["flexroad"][stage]], east, north)
+            for stage, (arrays, header) in self.stored.items():
+                file = path(self.store, graph.nodes[graph.variants["flexroad"][stage]])
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_bytes(joined(arrays, moved(header, east, north)))
             name = graph.tile.id
             item, rows = self.item | {"id": name, "assets": {}}, self.item["properties"]["flexroad:rows"]
             item["properties"] = self.item["properties"] | {
@@ -167,39 +178,40 @@ class Copied:
             job.folder.finish(item, {})
             yield TileResult(from_item(item, marker_stat(job.folder, "done")), "done")
 
-    def copy(self, node: Node, east: float, north: float) -> None:
-        """Store the result of a stage for another tile; one without a place is linked."""
-        old, result = self.stored[node.stage]
-        assert result is not None
-        value = moved(result.value, east, north)
-        if value is not result.value:
-            self.store.put(node, value, result.seconds, result.notes)
-            return
-        path, first = (
-            self.store.root / node.stage / name[:2] / f"{name}.npz"
-            for name in (node.fingerprint, old.fingerprint)
-        )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            path.hardlink_to(first)
-        except OSError:
-            # A file has at most 65,000 names on many disks.
-            self.store.put(node, value, result.seconds, result.notes)
-            self.stored[node.stage] = node, result
+
+def path(store: Path, node: Node) -> Path:
+    """Return the file of a stage's result."""
+    return store / node.stage / node.fingerprint[:2] / f"{node.fingerprint}.npz"
 
 
-def moved(value: Any, east: float, north: float) -> Any:
-    """Return a result moved (m); the same object if it has no place."""
-    if isinstance(value, Grid):
-        return replace(value, west=value.west + east, north=value.north + north)
-    changed: dict[str, Any] = {}
-    for field in fields(value):
-        old = getattr(value, field.name)
-        if field.name in ("bounds", "origin"):
-            changed[field.name] = tuple(number + (east, north)[axis % 2] for axis, number in enumerate(old))
-        elif is_dataclass(old):
-            changed[field.name] = moved(old, east, north)
-    return replace(value, **changed) if changed else value
+def separated(stored: bytes) -> tuple[bytes, Any]:
+    """Return the archive of a result's arrays, and its header."""
+    with np.load(io.BytesIO(stored)) as archive:
+        arrays = dict(archive)
+    header = json.loads(arrays.pop(HEADER).tobytes())
+    return npz(arrays), header
+
+
+def joined(arrays: bytes, header: Any) -> bytes:
+    """Return a result as the store writes it, from an archive of arrays and a header."""
+    buffer = io.BytesIO(arrays)
+    archive = zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED, compresslevel=LEVEL)
+    with archive, archive.open(f"{HEADER}.npy", "w") as entry:
+        np.lib.format.write_array(entry, np.frombuffer(json.dumps(header).encode(), np.uint8))
+    payload = buffer.getvalue()
+    return payload + hashlib.sha256(payload).digest()
+
+
+def moved(header: Any, east: float, north: float) -> Any:
+    """Return a part of a header with all places in it moved (m)."""
+    shifts = {"west": east, "north": north}
+    if not isinstance(header, dict):
+        return header
+    changed = {name: moved(value, east, north) for name, value in header.items()}
+    changed |= {name: header[name] + shift for name, shift in shifts.items() if name in header}
+    for name in changed.keys() & {"bounds", "origin"}:
+        changed[name] = [number + (east, north)[axis % 2] for axis, number in enumerate(header[name])]
+    return changed
 
 
 def measure(folder: Path, words: list[str]) -> None:
