@@ -113,9 +113,9 @@ def check_tiles(config: Config, catalog: Catalog) -> None:
     size_m = max(grid.cell * max(grid.shape) for grid in (tile.grid for tile in tiles))
     _check_acting(joined, size_m)
     _check_spacing(joined, {tile.grid.cell for tile in tiles})
-    lattices = [_lattice(tile.grid) for tile in tiles]
-    if len(set(lattices)) <= 1:
+    if len({_lattice(tile.grid) for tile in tiles}) <= 1:
         return
+    lattices = [_lattice(tile.grid) for tile in tiles]
     boxes = shapely.box(*np.array([tile.grid.bounds for tile in tiles]).T)
     first, second = shapely.STRtree(boxes).query(boxes, predicate="intersects")
     for a, b in zip(first, second, strict=True):

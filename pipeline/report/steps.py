@@ -7,7 +7,7 @@ Other fits know nothing of the neighbours.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -22,7 +22,7 @@ from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untra
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 Results = dict[str, dict[str, tuple[str, str]]]
-"""Finished tile -> exported variant -> fingerprints of its surface and of its road mask: not graphs, of which
+"""Exported variant -> finished tile -> fingerprints of its surface and of its road mask: not graphs, of which
 thousands would be large."""
 
 
@@ -30,8 +30,9 @@ def add_results(results: Results, status: TileStatus) -> None:
     """Add the results of a tile if it is finished."""
     if status.done:
         graph = status.graph
-        exported = ((variant, graph.variants[variant]) for variant in graph.export.variants)
-        results[graph.tile.id] = {name: (stages["fit"], stages["segment"]) for name, stages in exported}
+        for variant in graph.export.variants:
+            stages = graph.variants[variant]
+            results.setdefault(variant, {})[graph.tile.id] = stages["fit"], stages["segment"]
 
 
 def find_results(run: Run, tiles: Iterable[Tile]) -> Results:
@@ -87,7 +88,9 @@ def edge_steps(
     rows = [
         row
         for variant in run.config.export.variants
-        for row in _rows(run, track(pairs, "comparing neighbours", len(pairs)), results, variant)
+        for row in _rows(
+            run, track(pairs, "comparing neighbours", len(pairs)), results.get(variant, {}), variant
+        )
     ]
     table = pd.DataFrame(rows, columns=COLUMNS)
     check = [_checked(run, str(variant), part) for variant, part in table.groupby("variant", sort=False)]
@@ -114,22 +117,27 @@ def _checked(run: Run, variant: str, edges: pd.DataFrame) -> tuple[str, int, flo
 
 
 def _pairs(tiles: Sequence[Tile], every: int) -> Iterator[tuple[Tile, Tile]]:
-    corners = {_corner(tile.grid, tile.grid.west, tile.grid.south): tile for tile in tiles}
-    for tile in tiles[::every]:
-        grid = tile.grid
-        for east, north in ((grid.east, grid.south), (grid.west, grid.north)):
-            if other := corners.get(_corner(grid, east, north)):
-                yield tile, other
+    beside = [
+        (tile, _corner(tile.grid, east, north))
+        for tile in tiles[::every]
+        for east, north in ((tile.grid.east, tile.grid.south), (tile.grid.west, tile.grid.north))
+    ]
+    wanted = {corner for _, corner in beside}
+    corners = ((_corner(tile.grid, tile.grid.west, tile.grid.south), tile) for tile in tiles)
+    found = {corner: tile for corner, tile in corners if corner in wanted}
+    for tile, corner in beside:
+        if other := found.get(corner):
+            yield tile, other
 
 
 def _rows(
-    run: Run, pairs: Iterable[tuple[Tile, Tile]], done: Results, variant: str
+    run: Run, pairs: Iterable[tuple[Tile, Tile]], done: Mapping[str, tuple[str, str]], variant: str
 ) -> Iterator[tuple[str, str, str, float, float, float, float]]:
     place = RunPlace.of(run)
 
     @lru_cache(KEPT)
     def results(tile_id: str) -> tuple[Surface, RoadMask] | None:
-        return place.stored(*done[tile_id][variant])
+        return place.stored(*done[tile_id])
 
     for tile, other in pairs:
         if tile.id not in done or other.id not in done:

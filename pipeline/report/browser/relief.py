@@ -67,10 +67,10 @@ def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = unt
     side = min(max(math.isqrt(PIXELS // len(tiles)), SIDE_PX[0]), SIDE_PX[1])
     columns = math.isqrt(len(tiles) - 1) + 1
     picture = np.zeros((side * math.ceil(len(tiles) / columns), side * columns, 2), np.uint8)
-    place, variant = RunPlace.of(run), run.config.export.variants[0]
+    place, stored = RunPlace.of(run), results.get(run.config.export.variants[0], {})
     places: dict[str, int] = {}
     for tile in track(tiles, "drawing the map", len(tiles)):
-        if tile.id not in results or not (found := place.stored(*results[tile.id][variant])):
+        if tile.id not in stored or not (found := place.stored(*stored[tile.id])):
             continue
         row, column = divmod(len(places), columns)
         square = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]

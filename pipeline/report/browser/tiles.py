@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -109,8 +110,9 @@ def tile_table(tiles: Sequence[Tile], content: Content) -> TileTable:
     """Return the tiles of a run with their figures."""
     known = Counter(tile.grid.crs for tile in tiles if not tile.fault)
     crs = known.most_common(1)[0][0] if known else ""
-    rows = content.rows[content.rows.variant == content.variant].drop_duplicates("tile_id", keep="last")
-    frame = rows.set_index("tile_id").reindex([tile.id for tile in tiles])
+    of_variant = content.rows.variant == content.variant
+    last = of_variant & ~content.rows.tile_id.where(of_variant).duplicated(keep="last")
+    frame = content.rows[last].set_index("tile_id").reindex([tile.id for tile in tiles])
     done = np.array([content.states.get(tile.id) in ("done", "cached") for tile in tiles], bool)
     frame.loc[~done, [*LABELS, "flags"]] = np.nan
     states = [
@@ -128,6 +130,8 @@ def _state(state: str, flags: Any) -> str:
 
 
 def _bounds(tiles: Sequence[Tile], crs: str) -> NDArray[np.float64]:
+    # To make a transformer takes as long as to use it a thousand times.
+    transformer = cache(lambda other: pyproj.Transformer.from_crs(other, crs, always_xy=True))
     bounds = np.full((len(tiles), 4), np.nan)
     for i, tile in enumerate(tiles):
         if tile.fault:
@@ -135,8 +139,7 @@ def _bounds(tiles: Sequence[Tile], crs: str) -> NDArray[np.float64]:
         bounds[i] = tile.grid.bounds
         if tile.grid.crs != crs:
             try:
-                other = pyproj.Transformer.from_crs(tile.grid.crs, crs, always_xy=True)
-                bounds[i] = other.transform_bounds(*tile.grid.bounds)
+                bounds[i] = transformer(tile.grid.crs).transform_bounds(*tile.grid.bounds)
             except pyproj.exceptions.ProjError:
                 bounds[i] = np.nan
     bounds[~np.isfinite(bounds).all(axis=1)] = np.nan
@@ -156,7 +159,7 @@ def numeric_columns(table: TileTable) -> dict[str, tuple[str, str, pd.Series]]:
 def map_data(
     table: TileTable, failed: Mapping[str, str], more: Mapping[str, tuple[str, str, pd.Series]]
 ) -> dict[str, Any]:
-    """Return the tiles for the page's script.
+    """Return the tiles for the page's script: for `as_script`, which writes the arrays of figures.
 
     Parameters
     ----------
@@ -175,7 +178,7 @@ def map_data(
             "key": key,
             "label": label,
             "unit": unit,
-            "values": [_rounded(value) for value in values],
+            "values": values.to_numpy(),
             # A difference has a neutral colour for zero, whatever its values are.
             "signed": key in more,
         }
@@ -189,10 +192,7 @@ def map_data(
         "crs": table.crs,
         "bounds": [west, south, east, north],
         "ids": [printable(tile.id) for tile in table.tiles],
-        "boxes": [
-            None if math.isnan(box[0]) else [round(float(value), 2) for value in box - [west, south] * 2]
-            for box in table.bounds
-        ],
+        "boxes": table.bounds - [west, south] * 2,
         "stateNames": STATES,
         "states": [list(STATES).index(state) for state in table.states],
         "flagNames": flag_names,
@@ -216,14 +216,25 @@ def errors(content: Content) -> dict[str, str]:
 
 
 def as_script(data: Any) -> str:
-    """Return data as JSON that is safe inside of ``<script>``: no character of it can begin a tag."""
-    text = json.dumps(data, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    """Return data as JSON that is safe inside of ``<script>``: no character of it can begin a tag.
+
+    Arrays of figures, ``(n,)``, have `DIGITS` digits, those of boxes, ``(n, 4)``, centimetres.
+    """
+    # One array at a time: as objects, the numbers of all tiles take gigabytes.
+    text = json.dumps(data, ensure_ascii=True, allow_nan=False, separators=(",", ":"), default=_listed)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def short(value: float) -> str:
     """Return a number with three digits, or as a whole one."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def _listed(values: NDArray[np.float64]) -> list[Any]:
+    """Return an array as `as_script` writes it; NaN becomes null."""
+    if values.ndim == 1:
+        return [_rounded(value) for value in values.tolist()]
+    return [None if math.isnan(row[0]) else [round(edge, 2) for edge in row] for row in values.tolist()]
 
 
 def _rounded(value: float) -> float | int | None:

@@ -132,7 +132,7 @@ def test_figures_of_tiles_that_are_not_done_are_left_out(run):
     table = tile_table(run.catalog.tiles, content)
     assert table.states == ("fine", "pending", "no-road", "failed")
     assert np.isnan(table.frame.error_estimate_m["b"])
-    data = map_data(table, errors(content), {})
+    data = json.loads(as_script(map_data(table, errors(content), {})))
     assert data["states"] == [0, 4, 2, 3]
     assert data["errors"] == {"3": ERROR}
     assert data["boxes"][1] == [250, 0, 500, 250]

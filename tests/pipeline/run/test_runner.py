@@ -487,8 +487,8 @@ def test_report_checks_every_tile_once(finished, monkeypatch):
 def test_relief_has_tiles_with_results_in_the_store(finished):
     first, second, *others = finished.catalog.tiles
     results = find_results(finished, [first, second])
-    assert set(results) == {first.id, second.id}
-    (surface,) = finished.store.glob(f"fit/*/{results[first.id]['flexroad'][0]}.npz")
+    assert set(results["flexroad"]) == {first.id, second.id}
+    (surface,) = finished.store.glob(f"fit/*/{results['flexroad'][first.id][0]}.npz")
     surface.unlink()
     assert list(relief(finished, finished.catalog.tiles, results).places) == [second.id]
     assert relief(finished, others, results) is None
