@@ -21,7 +21,7 @@ from flexroad.catalog import crs, ids
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.text import printable, shown
-from flexroad.catalog.tile import LAYERS, Layer, Tile, by_cover, faulty
+from flexroad.catalog.tile import LAYERS, RECENT, Layer, Tile, by_cover, faulty
 from flexroad.catalog.to_metres import HEIGHT_UNITS
 from flexroad.catalog.trust import AllowedFolders
 
@@ -41,8 +41,6 @@ MAX_LABEL = 200
 WORDS = {dict: "not an object", list: "not a list", bool: "neither true nor false"}
 """What a value of another type is."""
 PROPERTIES = "properties."
-RECENT = 2**14
-"""Layers and dates that are kept to be shared: of the last thousands of tiles."""
 T = TypeVar("T", Layer, datetime)
 
 

@@ -28,6 +28,8 @@ BORDER_LAYERS = ("dsm", "dtm", "road_height", "dop", "road_mask", "roads")
 
 REACH_M = 200.0
 """A tile's layers list the files within this distance of it (m): for halos and for ground along borders."""
+RECENT = 2**14
+"""Layers and dates that are kept to be shared: of the last thousands of tiles."""
 TOUCH_M = 0.001
 """Files that overlap ground by no more than this (m) only touch it."""
 

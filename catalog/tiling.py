@@ -28,7 +28,7 @@ from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.rasters import RasterFile, require_metric, skip, zoned
 from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.text import count, some
-from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, Layer, Tile, by_cover
+from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, RECENT, Layer, Tile, by_cover
 
 MASKS = ("road_mask", "reference_road")
 MAX_CELL_RATIO = 50
@@ -39,8 +39,6 @@ MAX_TILE_M = 2000
 """Largest size of a tile that is proposed (m)."""
 AT_ONCE = 10_000
 """Tiles whose neighbourhoods are looked up at a time: as polygons they take many times the memory."""
-RECENT = 2**14
-"""Layers that are kept to be shared: of the last thousands of tiles."""
 
 
 @dataclass(frozen=True)

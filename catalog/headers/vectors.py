@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.crs import bounds_in, transformer
@@ -21,7 +22,7 @@ from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import access_reason, count, reason
-from flexroad.catalog.tile import REACH_M, Layer, Tile
+from flexroad.catalog.tile import REACH_M, RECENT, Layer, Tile
 
 pyogrio = lazy("pyogrio")
 
@@ -180,23 +181,53 @@ def with_roads(
     """
     if not files:
         return tuple(tiles), []
-    systems = {tile.grid.crs for tile in tiles}
-    extents = {target: np.array([_extent(file, target) for file in files]) for target in systems}
-    near = np.array([_near(tile, extents[tile.grid.crs]) for tile in tiles])
+    extents = {
+        target: np.array([_extent(file, target) for file in files])
+        for target in {tile.grid.crs for tile in tiles}
+    }
+    # As a tree: in a state there are as many files as tiles.
+    trees = {target: shapely.STRtree(_boxes(bounds)) for target, bounds in extents.items()}
+    near = [
+        np.sort(trees[tile.grid.crs].query(shapely.box(*tile.grid.buffered(REACH_M).bounds)))
+        for tile in tiles
+    ]
+    reached = np.bincount(np.concatenate(near), minlength=len(files))
     far = [
         f"--roads {file.path} {_far(file, tiles)}"
-        for number, file in enumerate(files)
-        if not near[:, number].any()
+        for file, number in zip(files, reached, strict=True)
+        if not number
     ]
     if len(far) == len(files):
         raise CatalogError(far[0])
     # A CRS is that of the complete layer, so that all tiles describe the layer in the same way.
     bare = None if all(file.has_crs for file in files) else crs
-    with_layer = tuple(
-        _with_layer(tile, list(compress(files, chosen)), extents[tile.grid.crs][chosen], bare)
-        for tile, chosen in zip(tiles, near, strict=True)
+
+    @lru_cache(RECENT)
+    def layer(numbers: tuple[int, ...], target: str, root: Path) -> Layer:
+        """Return the layer of files given by their numbers; neighbouring tiles share it."""
+        chosen = [files[number] for number in numbers]
+        names = tuple(
+            file.path.relative_to(root).as_posix() if file.path.is_relative_to(root) else str(file.path)
+            for file in chosen
+        )
+        bounds = tuple(map(tuple, extents[target][list(numbers)].tolist()))
+        return Layer("roads", names, crs=bare, extents=bounds, sublayer=chosen[0].sublayer)
+
+    with_layer = (
+        replace(tile, layers=(*tile.layers, layer(tuple(numbers.tolist()), tile.grid.crs, Path(tile.root))))
+        if numbers.size
+        else tile
+        for tile, numbers in zip(tiles, near, strict=True)
     )
-    return with_layer, [f"skipped {line}" for line in far]
+    return tuple(with_layer), [f"skipped {line}" for line in far]
+
+
+def _boxes(extents: NDArray[np.float64]) -> NDArray[np.object_]:
+    """Return extents, ``(n, 4)``, as polygons, None where a file reaches nothing."""
+    boxes: NDArray[np.object_] = np.full(len(extents), None, object)
+    known = np.isfinite(extents).all(axis=1)
+    boxes[known] = shapely.box(*extents[known].T)
+    return boxes
 
 
 def _far(file: VectorFile, tiles: Sequence[Tile]) -> str:
@@ -225,26 +256,3 @@ def _placed(crs: str, target: str, bounds: Bounds) -> Bounds:
     west, south, east, north = bounds
     corners = transformer(crs, target).transform((west, east, west, east), (south, south, north, north))
     return EVERYWHERE if np.isfinite(corners).all(axis=0).any() else NOWHERE
-
-
-def _near(tile: Tile, extents: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which extents, ``(n, 4)``, are within `REACH_M` of a tile, ``(n,)``."""
-    west, south, east, north = tile.grid.buffered(REACH_M).bounds
-    on_columns = (extents[:, 0] <= east) & (extents[:, 2] >= west)
-    near: NDArray[np.bool_] = on_columns & (extents[:, 1] <= north) & (extents[:, 3] >= south)
-    return near
-
-
-def _with_layer(
-    tile: Tile, files: Sequence[VectorFile], extents: NDArray[np.float64], crs: str | None
-) -> Tile:
-    if not files:
-        return tile
-    root = Path(tile.root)
-    names = tuple(
-        file.path.relative_to(root).as_posix() if file.path.is_relative_to(root) else str(file.path)
-        for file in files
-    )
-    bounds = tuple(map(tuple, extents.tolist()))
-    roads = Layer("roads", names, crs=crs, extents=bounds, sublayer=files[0].sublayer)
-    return replace(tile, layers=(*tile.layers, roads))
