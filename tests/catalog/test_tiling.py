@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from flexroad.catalog import Catalog, CatalogError
+from flexroad.catalog import Catalog, CatalogError, tiling
+from flexroad.catalog.grid import overlap
 from flexroad.catalog.sources.rasters import index
+from flexroad.catalog.tile import REACH_M
 from flexroad.catalog.tiling import Conversion
 from flexroad.pipeline.check.catalog import expected_failures
 from flexroad.pipeline.config.loading import load_config
@@ -204,3 +206,19 @@ def test_raster_layer_elsewhere_is_named_with_both_places(tmp_path):
     assert "road_mask reaches no tile: mask.tif lies at 32295500 " in str(error.value)
     assert "in EPSG:25832, the tiles at 295500 " in str(error.value)
     assert str(error.value).endswith("the number of a zone: declare EPSG:4647")
+
+
+def test_tiles_list_the_files_within_reach_whatever_number_is_looked_up_at_a_time(tmp_path, monkeypatch):
+    corners = [(700_000 + 300 * column, 5_700_000 + 300 * row) for row in range(3) for column in range(3)]
+    sheets = {}
+    for west, south in corners:
+        write(tmp_path / f"{west}_{south}.tif", np.full((300, 300), 100, np.float32), west, south + 300)
+        sheets[f"{west}_{south}.tif"] = (west, south, west + 300, south + 300)
+    result = index(tmp_path, {"dsm": "*.tif"}, min_cover=0)
+    assert len(result.tiles) == 16
+    for tile in result.tiles:
+        # Overlap by more than a negative width is a distance below that.
+        near = [name for name, extent in sheets.items() if overlap(extent, tile.grid.bounds, -REACH_M - 1e-6)]
+        assert sorted(tile.layer("dsm").files) == sorted(near)
+    monkeypatch.setattr(tiling, "AT_ONCE", 3)
+    assert index(tmp_path, {"dsm": "*.tif"}, min_cover=0) == result

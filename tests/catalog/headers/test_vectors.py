@@ -7,8 +7,9 @@ import pytest
 from shapely import LineString, box
 
 from flexroad.catalog import Catalog, CatalogError
-from flexroad.catalog.headers.vectors import layers
+from flexroad.catalog.headers.vectors import MARGIN_M, VectorFile, layers, with_roads
 from flexroad.catalog.sources import nrw, rasters
+from flexroad.catalog.tile import REACH_M
 from flexroad.tasks.io.vectors import Query, read_near
 from tests.make_rasters import write
 from tests.make_roads import in_cp1252, write_osm
@@ -209,3 +210,32 @@ def test_roads_without_a_place_in_the_tiles_crs_are_not_listed_by_every_tile(sur
         CatalogError, match="reaches no tile; .* 33500000 5600000 33500100 5600000 in EPSG:25833"
     ):
         indexed(survey, "r.gpkg")
+
+
+def test_tiles_list_exactly_the_files_within_reach_in_their_order(survey):
+    tiles = rasters.index(survey, {"dsm": "dsm.tif", "dtm": "dtm.tif"}).tiles
+    rng = np.random.default_rng(3)
+    corners = rng.uniform((294_900, 5_629_000), (296_800, 5_630_500), (40, 2))
+    extents = [(x, y, x + 20.0, y + 30.0) for x, y in corners.tolist()]
+    files = [
+        VectorFile(survey / f"{k}.gpkg", True, ((tiles[0].grid.crs, extent),))
+        for k, extent in enumerate(extents)
+    ]
+    files.append(VectorFile(survey / "anywhere.osm", True, None))
+    files.append(VectorFile(survey / "nothing.gpkg", True, ()))
+    with_layer, lines = with_roads(tiles, files, None)
+    reach, listed = REACH_M + MARGIN_M, set()
+    for tile in with_layer:
+        west, south, east, north = tile.grid.bounds
+        near = [
+            f"{k}.gpkg"
+            for k, (left, bottom, right, top) in enumerate(extents)
+            if left <= east + reach
+            and right >= west - reach
+            and bottom <= north + reach
+            and top >= south - reach
+        ]
+        assert tile.layer("roads").files == (*near, "anywhere.osm")
+        listed.update(near)
+    assert 0 < len(listed) < 40
+    assert len(lines) == 41 - len(listed)

@@ -2,9 +2,11 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import pyproj
 import pytest
 
 from flexroad.catalog import Catalog
@@ -139,6 +141,20 @@ def test_figures_of_tiles_that_are_not_done_are_left_out(run):
     values = {column["key"]: column.get("values") for column in data["columns"]}
     assert values["error_estimate_m"] == [0.02, None, 0.01, None]
     assert "nearest_road_m" not in values
+
+
+def test_tiles_in_another_crs_are_placed_by_one_transformer(run, monkeypatch):
+    content = made_content(run, ROWS)
+    first, *others = run.catalog.tiles
+    far = [replace(tile, grid=replace(tile.grid, crs="EPSG:25833")) for tile in others[1:]]
+    to_crs = pyproj.Transformer.from_crs("EPSG:25833", first.grid.crs, always_xy=True)
+    expected = [to_crs.transform_bounds(*tile.grid.bounds) for tile in far]
+    made = []
+    monkeypatch.setattr(pyproj.Transformer, "from_crs", lambda *crs, **how: made.append((crs, how)) or to_crs)
+    table = tile_table([first, others[0], *far], content)
+    np.testing.assert_array_equal(table.bounds[2:], expected)
+    np.testing.assert_array_equal(table.bounds[0], first.grid.bounds)
+    assert made == [(("EPSG:25833", first.grid.crs), {"always_xy": True})]
 
 
 def test_ranking_takes_the_road_error_without_estimates_and_nothing_without_figures(run):
