@@ -7,7 +7,7 @@ of the tiles alone, so that all tiles around it describe it in the same way.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -61,6 +61,15 @@ class Border:
             return (rows, slice(col - 1, col)), (rows, slice(col, col + 1))
         cols = slice(col, col + width) if self.kind == "east" else slice(col - 1, col + 1)
         return (slice(row - 1, row), cols), (slice(row, row + 1), cols)
+
+    def strip(self, reach: int) -> tuple[tuple[slice, slice], Border]:
+        """Return (row, col) slices of `sides` and of the cells up to ``reach`` from them, and the border there."""
+        (rows, cols), (last_rows, last_cols) = self.sides
+        window = (
+            slice(max(rows.start - reach, 0), min(last_rows.stop + reach, self.grid.height)),
+            slice(max(cols.start - reach, 0), min(last_cols.stop + reach, self.grid.width)),
+        )
+        return window, replace(self, grid=self.grid.part(*window))
 
     def along(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the values of the cells on both sides of an edge, ``(2, n)``, ordered from its start.

@@ -8,13 +8,14 @@ Adam optimises the heights and weights of a fixed grid of control points under t
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from flexroad.tasks.options import Options as BaseOptions
-from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
+from flexroad.tasks.roads.dtm_validity import valid_dtm
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline import adam
 from flexroad.tasks.spline.moving import WEIGHTS, MovingNurbs, moving
@@ -103,7 +104,8 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
         If there are fewer cells with a height than control points, if neither the DTM nor the road has a
         height to start from, or if the device is not available.
     """
-    data = without_invalid_dtm(with_road_heights(data, clusters), clusters)
+    data = with_road_heights(data, clusters)
+    data = replace(data, dtm=valid_dtm(data, clusters))
     space = space_of(data, options)
     start, datum = start_heights(data.dsm, data.dtm, clusters.mask, space, options.terrain)
     loss = objective_of(data, clusters.mask, space, datum, options)

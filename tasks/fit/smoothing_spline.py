@@ -12,6 +12,7 @@ neighbours have one surface, although no tile waits for another (docs/mosaic.md)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -25,7 +26,7 @@ from flexroad.tasks.levels.seen import level_data, level_road
 from flexroad.tasks.meshing.road_outline import crossings
 from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.roads.distances import distances
-from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
+from flexroad.tasks.roads.dtm_validity import ground_to_fit, valid_dtm
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.frame import Corner, Edge, Frame, rounded
 from flexroad.tasks.spline.irls import HuberObjective, minimise
@@ -144,7 +145,7 @@ def _spline(data: TileData, clusters: RoadClusters, options: Options, frame: Fra
     n, m = lattice.intervals
     shape = m + options.degree, n + options.degree
     if clusters.level is None:
-        check_cells(_ground(fitted, clusters)[rows, cols], (shape[1], shape[0]))
+        check_cells(ground_to_fit(fitted, clusters, (rows, cols)), (shape[1], shape[0]))
     held = frame.control(shape) if frame else np.full(shape, np.nan)
     problem = _problem(fitted, clusters, lattice, (rows.stop, cols.start), (0, n), (0, m), held, options)
     z = _with_held(held, _minimum_of(problem, options) + problem.datum)
@@ -312,23 +313,20 @@ def _precise(options: Options) -> Options:
     return options.model_copy(update={"stop_tolerance": tolerance})
 
 
-def _ground(data: TileData, clusters: RoadClusters) -> Floats:
-    """Return the heights to fit, ``(H, W)``, m: the DSM's on the road, the valid DTM's elsewhere."""
-    return np.where(clusters.mask, data.dsm, without_invalid_dtm(data, clusters).dtm)
-
-
 def _lines(data: TileData, clusters: RoadClusters, border: Border, lattice: Lattice) -> tuple[int, int]:
     """Return the number of intervals up to which a corner or edge is fitted, along easting and northing."""
-    missing, cell = np.isnan(_ground(data, clusters)), data.grid.cell
-    if not missing.all():
-        needed, along = BEYOND_DATA_M, np.zeros_like(missing)
-        for side in border.sides:
+    cell = data.grid.cell
+    for lines in map(lattice.lines_within, REACHES_M):
+        reach_m = min(np.multiply(lines, lattice.unit_m))
+        # Ground outside the strip is too far away for this distance.
+        window, strip = border.strip(max(math.ceil((reach_m - BEYOND_DATA_M) / cell), 0) + 1)
+        missing = np.isnan(ground_to_fit(data, clusters, window))
+        along = np.zeros_like(missing)
+        for side in strip.sides:
             along[side] = missing[side]
-        if along.any():
-            needed += float(distances(along, ~missing).max()) * cell
-        for lines in map(lattice.lines_within, REACHES_M):
-            if min(np.multiply(lines, lattice.unit_m)) >= needed:
-                return lines
+        farthest = float(distances(along, ~missing).max(initial=0.0))
+        if reach_m >= BEYOND_DATA_M + farthest * cell:
+            return lines
     return lattice.lines_over((border.cell[1] - 0.5) * cell)
 
 
@@ -352,8 +350,7 @@ def _problem(
 ) -> _Problem:  # fmt: skip
     """Return the loss over the cells in a part of the lattice."""
     space, window = lattice.part(data.grid.shape, start, u, v)
-    dsm, road = data.dsm[window], clusters.mask[window]
-    dtm = without_invalid_dtm(data, clusters).dtm[window]
+    dsm, road, dtm = data.dsm[window], clusters.labels[window] > 0, valid_dtm(data, clusters, window)
     ground = np.where(road, dsm, dtm)
     if np.isnan(ground).all():
         # Of a corner or edge: tiles that bridge it must still hold the same points.

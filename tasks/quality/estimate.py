@@ -18,7 +18,7 @@ from flexroad.tasks.levels.joints import TUBE_M
 from flexroad.tasks.levels.seen import hidden, level_data, off_ground, with_approaches
 from flexroad.tasks.quality.support import Support, support
 from flexroad.tasks.roads.distances import distances, filled
-from flexroad.tasks.roads.dtm_validity import AGREE_M, rise, without_invalid_dtm
+from flexroad.tasks.roads.dtm_validity import AGREE_M, ground_to_fit, rise
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, Surface, TileData
@@ -196,7 +196,7 @@ def compare(
     smooth = height - surface.steps if isinstance(surface, SteppedSurface) else height
     off_dsm, off_dtm = height - fitted.dsm[window], height - data.dtm[window]
     spread = scatter((fitted.dsm - data.dtm)[window], kept, data.core.cell)
-    residual = height - _heights(fitted, clusters)[window]
+    residual = height - ground_to_fit(fitted, clusters, window)
     residual[classes == Support.NONE] = np.nan
     estimate = error_estimate(residual, off_dtm, spread, kept, on_road, data.core.cell, only_road)
     inferred = classes == Support.INFERRED
@@ -233,8 +233,4 @@ def heights_fitted(data: TileData, clusters: RoadClusters) -> Floats:
 
     They are those of `with_road_heights` on kept road cells, else the valid DTM.
     """
-    return _heights(with_road_heights(data, clusters), clusters)
-
-
-def _heights(fitted: TileData, clusters: RoadClusters) -> Floats:
-    return np.where(clusters.mask, fitted.dsm, without_invalid_dtm(fitted, clusters).dtm)
+    return ground_to_fit(with_road_heights(data, clusters), clusters)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.meshing.parts import middles
-from flexroad.tasks.roads.dtm_validity import AGREE_M, without_invalid_dtm
+from flexroad.tasks.roads.dtm_validity import AGREE_M, valid_dtm
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
 
@@ -47,7 +47,7 @@ def support(
     agree_m : float
         Largest difference between DSM and DTM of the same ground (m).
     """
-    has_dtm = np.isfinite(without_invalid_dtm(data, clusters).dtm)
+    has_dtm = np.isfinite(valid_dtm(data, clusters))
     agreed = has_dtm & (np.abs(data.dsm - data.dtm) <= agree_m)
     classes = np.where(has_dtm & ~clusters.mask, Support.DTM, Support.INFERRED).astype(np.uint8)
     classes[np.where(clusters.mask, np.isfinite(data.dsm), agreed)] = Support.MEASURED

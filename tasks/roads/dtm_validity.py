@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +27,10 @@ CREST_M = 100.0
 
 THIN_M2 = 0.2
 """Cells whose variance in some direction is below this (m2) lie on a line and define no plane."""
+
+ALL = slice(None)
+Window = tuple[slice, slice]
+"""(row, col) slices."""
 
 
 def invalid_dtm(data: TileData, road: RoadMask, kept: Bools) -> Bools:
@@ -60,11 +62,16 @@ def rise(away: Floats) -> Floats:
     return away**2 / (2 * CREST_M)
 
 
-def without_invalid_dtm(data: TileData, clusters: RoadClusters) -> TileData:
-    """Return the data with NaN for the invalid DTM, so that neither the loss nor the start uses it."""
+def valid_dtm(data: TileData, clusters: RoadClusters, window: Window = (ALL, ALL)) -> Floats:
+    """Return the DTM in a window with NaN where it is invalid, so that neither loss nor start uses it."""
     if clusters.dtm_invalid is None:
-        return data
-    return replace(data, dtm=np.where(clusters.dtm_invalid, np.nan, data.dtm))
+        return data.dtm[window]
+    return np.where(clusters.dtm_invalid[window], np.nan, data.dtm[window])
+
+
+def ground_to_fit(data: TileData, clusters: RoadClusters, window: Window = (ALL, ALL)) -> Floats:
+    """Return the heights to fit in a window, m: the DSM's on the road, the valid DTM's elsewhere."""
+    return np.where(clusters.labels[window] > 0, data.dsm[window], valid_dtm(data, clusters, window))
 
 
 def extrapolated_plane(

@@ -296,26 +296,15 @@ def border_steps(
     if clusters.beside is None or np.isnan(spline.A).any():
         return {}
     # As much ground as decides on the steps of the cells beside the edge.
-    reach = math.ceil(KERB_M / data.grid.cell) + 1
-    (rows, cols), (last_rows, last_cols) = border.sides
-    strip = (
-        _widened(rows, last_rows, reach, data.grid.height),
-        _widened(cols, last_cols, reach, data.grid.width),
-    )
-    grid, heights = data.grid.part(*strip), ground_heights(data, clusters)
-    part = TileData(data.tile_id, grid, grid, heights.dsm[strip], heights.dtm[strip])
-    beside = ground_beside(part, RoadClusters(grid, clusters.labels[strip], None, clusters.beside[strip]))
-    if beside is None:
-        return {}
-    steps, has_step = np.zeros((2, *data.grid.shape))
-    steps[strip], has_step[strip] = with_steps(beside, spline, grid).steps, beside.cells
-    both = border.along(has_step).all(axis=0)
-    mean = np.where(both, border.along(steps).sum(axis=0) / 2, 0.0)
+    window, strip = border.strip(math.ceil(KERB_M / data.grid.cell) + 1)
+    grid, heights = strip.grid, ground_heights(data, clusters)
+    part = TileData(data.tile_id, grid, grid, heights.dsm[window], heights.dtm[window])
+    own = RoadClusters(grid, clusters.labels[window], None, clusters.beside[window])
+    both = strip.along(own.beside).all(axis=0)
+    beside = ground_beside(part, own) if both.any() else None
+    steps = with_steps(beside, spline, grid).steps.astype(np.float64) if beside else np.zeros(grid.shape)
+    mean = np.where(both, strip.along(steps).sum(axis=0) / 2, 0.0)
     return {"steps": rounded(mean), "road_m": border.along(_to_road(road, border)).min(axis=0)}
-
-
-def _widened(first: slice, last: slice, reach: int, count: int) -> slice:
-    return slice(max(first.start - reach, 0), min(last.stop + reach, count))
 
 
 def _to_road(road: RoadMask, border: Border) -> Floats:

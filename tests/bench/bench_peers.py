@@ -24,7 +24,7 @@ from flexroad.tasks import load, sample
 from flexroad.tasks.fit.raster import RasterSurface
 from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.options import stage_function
-from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
+from flexroad.tasks.roads.dtm_validity import ground_to_fit
 from flexroad.tasks.types import Floats, RoadClusters, RoadMask, Surface, TileData
 from tests.bench.gis_peers import installed
 from tests.bench.timing import cpu_s, one_cpu_s, one_thread
@@ -86,7 +86,7 @@ def made_case() -> Case:
         data = load.load(tile, chain["load"])
         road = stage_function("segment", chain["segment"])(data, chain["segment"])
         clusters = stage_function("ecsrc", chain["ecsrc"])(data, road, chain["ecsrc"])
-    ground = np.where(clusters.mask, data.dsm, without_invalid_dtm(data, clusters).dtm)
+    ground = ground_to_fit(data, clusters)
     return Case(data, road, clusters, ground[data.grid.window(data.core)])
 
 

@@ -14,7 +14,7 @@ from flexroad.tasks.roads.dtm_validity import (
     REACH_M,
     extrapolated_plane,
     invalid_dtm,
-    without_invalid_dtm,
+    valid_dtm,
 )
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 from tests.crossing import SOUTH, WEST, Crossing
@@ -62,8 +62,8 @@ def test_support_invalid_dtm_is_inferred():
     crown = STREET & (COL > 20) & (COL < 30)
     data, clusters = tile(dsm=RAMP + 6 * crown), kept(STREET & ~crown, crown)
     assert (support(data, street(), clusters)[crown] == Support.INFERRED).all()
-    np.testing.assert_array_equal(np.isnan(without_invalid_dtm(data, clusters).dtm), crown)
-    assert without_invalid_dtm(data, kept(STREET)) is data
+    np.testing.assert_array_equal(np.isnan(valid_dtm(data, clusters)), crown)
+    assert valid_dtm(data, kept(STREET)).base is data.dtm
 
 
 def test_of_faces_uses_cell_under_centroid():
