@@ -230,7 +230,10 @@ def _edges(members: Bools) -> Bools:
     for r in range(1, rows - 1):
         for c in range(1, cols - 1):
             if members[r, c]:
-                edges[r, c] = not members[r - 1 : r + 2, c - 1 : c + 2].all()
+                inside = True
+                for row in (r - 1, r, r + 1):
+                    inside = inside and members[row, c - 1] and members[row, c] and members[row, c + 1]
+                edges[r, c] = not inside
     return edges
 
 
@@ -242,11 +245,17 @@ def _join_neighbours(roots: Roots, members: Bools) -> None:
         for c in range(cols):
             if not members[r, c]:
                 continue
-            if c + 1 < cols and members[r, c + 1]:
-                unite(roots, r * cols + c, r * cols + c + 1)
-            for col in range(max(c - 1, 0), min(c + 2, cols)):
-                if r + 1 < rows and members[r + 1, col]:
-                    unite(roots, r * cols + c, (r + 1) * cols + col)
+            i = r * cols + c
+            if r > 0 and members[r - 1, c]:
+                # The others are neighbours of this one, so they are united with it already.
+                unite(roots, i, i - cols)
+                continue
+            if c > 0 and members[r, c - 1]:
+                unite(roots, i, i - 1)
+            elif r > 0 and c > 0 and members[r - 1, c - 1]:
+                unite(roots, i, i - cols - 1)
+            if r > 0 and c + 1 < cols and members[r - 1, c + 1]:
+                unite(roots, i, i - cols + 1)
 
 
 @compiled()

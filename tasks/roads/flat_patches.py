@@ -53,12 +53,16 @@ def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float
     reach = max(1, math.floor((PATCH_M / cell - 1) / 2 + 1e-9))
     slopes, smooth = _planes(heights, points, reach, roughness_m**2)
     around = max(1, math.floor(STREET_M / cell + 1e-9))
-    return Patches(*_along_street(slopes, smooth, around, (bend * cell) ** 2), reach)
+    centres = _along_street(slopes, smooth, around, (bend * cell) ** 2)
+    return Patches(centres, slopes, reach)
 
 
 @compiled()
 def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return slopes along rows and columns (m per cell), ``(H, W, 2)``, and the centres of smooth patches."""
+    """Return the slopes of smooth patches along rows and columns (m per cell), and their centres.
+
+    Slopes are ``(H, W, 2)``, 0 elsewhere.
+    """
     rows, cols = heights.shape
     slopes, smooth = np.zeros((rows, cols, 2)), np.zeros((rows, cols), np.bool_)
     side = 2 * reach + 1
@@ -76,37 +80,42 @@ def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple
                 if not whole:
                     break
             if whole:
-                slopes[r, c, 0], slopes[r, c, 1] = rz / spread, cz / spread
                 square = zz - z * z / n - (rz * rz + cz * cz) / spread
                 smooth[r, c] = square <= largest * (n - 3)
+                if smooth[r, c]:
+                    slopes[r, c, 0], slopes[r, c, 1] = rz / spread, cz / spread
     return slopes, smooth
 
 
 @compiled()
-def _along_street(slopes: Floats, smooth: Bools, around: int, largest: float) -> tuple[Bools, Floats]:
-    """Return the smooth patches with the street's slope, ``(H, W)``, and that slope, ``(H, W, 2)``.
+def _along_street(slopes: Floats, smooth: Bools, around: int, largest: float) -> Bools:
+    """Return the smooth patches with the street's slope, ``(H, W)``; write that slope over theirs.
 
     The street's slope is the mean of the smooth patches ``around`` a patch. The square of the difference to
     it is at most ``largest``.
     """
     rows, cols = smooth.shape
-    trend, beside, centres = np.zeros((rows, cols, 2)), np.zeros((rows, cols, 3)), smooth.copy()
-    # First the sums of 1 and both slopes over columns, then the sums of these over rows.
-    for r in range(rows):
-        for c in range(cols):
-            if smooth[r, c]:
+    side, centres = 2 * around + 1, smooth.copy()
+    # The sums of 1 and both slopes over columns, of the rows around the one whose sums over rows follow.
+    beside = np.zeros((side, cols, 3))
+    for last in range(rows + around):
+        sums = beside[last % side]
+        sums[:] = 0.0
+        for c in range(cols if last < rows else 0):
+            if smooth[last, c]:
                 for j in range(max(c - around, 0), min(c + around + 1, cols)):
-                    beside[r, j, 0] += 1
-                    beside[r, j, 1] += slopes[r, c, 0]
-                    beside[r, j, 2] += slopes[r, c, 1]
-    for r in range(rows):
-        for c in range(cols):
+                    sums[j, 0] += 1
+                    sums[j, 1] += slopes[last, c, 0]
+                    sums[j, 2] += slopes[last, c, 1]
+        r = last - around
+        for c in range(cols if r >= 0 else 0):
             if smooth[r, c]:
                 n, down, across = 0.0, 0.0, 0.0
-                for i in range(max(r - around, 0), min(r + around + 1, rows)):
-                    n, down, across = n + beside[i, c, 0], down + beside[i, c, 1], across + beside[i, c, 2]
+                for i in range(max(r - around, 0), min(last + 1, rows)):
+                    of_row = beside[i % side, c]
+                    n, down, across = n + of_row[0], down + of_row[1], across + of_row[2]
                 down, across = down / n, across / n
-                trend[r, c, 0], trend[r, c, 1] = down, across
                 bend = (slopes[r, c, 0] - down) ** 2 + (slopes[r, c, 1] - across) ** 2
+                slopes[r, c, 0], slopes[r, c, 1] = down, across
                 centres[r, c] = bend <= largest
-    return centres, trend
+    return centres
