@@ -63,7 +63,7 @@ class Border:
         return (slice(row - 1, row), cols), (slice(row, row + 1), cols)
 
     def strip(self, reach: int) -> tuple[tuple[slice, slice], Border]:
-        """Return (row, col) slices of `sides` and of the cells up to ``reach`` from them, and the border there."""
+        """Return the (row, col) slices of `sides` and cells up to ``reach`` away, and the border there."""
         (rows, cols), (last_rows, last_cols) = self.sides
         window = (
             slice(max(rows.start - reach, 0), min(last_rows.stop + reach, self.grid.height)),

@@ -21,6 +21,7 @@ from flexroad.tasks.roads.union_find import (
     find,
     forward_offsets,
     init,
+    largest_of,
     least_cells,
 )
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
@@ -71,11 +72,8 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     heights = np.ascontiguousarray(data.dsm)
     _join(heights, roots, points, forward_offsets(1.5), options.theta_z_m)
     # Of any two clusters one is not the largest, so no search starts in the largest, which has most points.
-    largest = np.bincount(compress(roots)[points.ravel()], minlength=1).argmax()
-    starts, far = (
-        points & (roots.reshape(points.shape) != largest),
-        forward_offsets(options.theta_xy_m / cell),
-    )
+    starts = points & (roots.reshape(points.shape) != largest_of(compress(roots)))
+    far = forward_offsets(options.theta_xy_m / cell)
     _join(heights, roots, starts, np.concatenate([far, -far]), options.theta_z_m)
     least = least_cells(options.min_area_m2, cell)
     labels = clean(points, compress(roots).reshape(points.shape), least, options.keep_largest)

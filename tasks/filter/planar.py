@@ -13,7 +13,6 @@ import math
 from typing import Literal
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -28,6 +27,7 @@ from flexroad.tasks.roads.union_find import (
     clean,
     compress,
     init,
+    largest_of,
     least_cells,
     members_of,
     unite,
@@ -138,8 +138,9 @@ def _clusters_of(data: TileData, road: RoadMask, options: Options) -> RoadCluste
     ground = _on_ground(data, clusters, options)
     reach = max(1, math.floor(REACH_M / cell + 1e-9))
     consistency = ground_consistency(data.dsm, data.dtm, ground, points & ~ground, reach, theta)
-    level = np.abs(data.dsm - data.dtm) <= theta
-    kept = ground | (consistency == CONSISTENT) | (points & ~ground & (consistency == NO_NEIGHBOURS) & level)
+    kept = ground | (consistency == CONSISTENT)
+    alone = points & ~ground & (consistency == NO_NEIGHBOURS)
+    kept[alone] = np.abs(data.dsm[alone] - data.dtm[alone]) <= theta
     labels = _labels(data.dsm, kept, patches, cell, options)
     dtm_invalid = invalid_dtm(data, road, labels > 0)
     if options.verge_m == 0:
@@ -156,8 +157,11 @@ def _verge(mask: Bools, kept: Bools, cell: float, width_m: float) -> Bools:
     """
     if not kept.any():
         return np.zeros_like(mask)
-    parts, count = scipy.ndimage.label(mask, np.ones((3, 3)))
-    street = np.zeros(count + 1, np.bool_)
+    parts = init(mask)
+    _join_neighbours(parts, mask)
+    parts = compress(parts).reshape(mask.shape)
+    # The last element is that of the cells in no part.
+    street = np.zeros(mask.size + 1, np.bool_)
     street[parts[kept]] = True
     return ~mask & within(street[parts], cell, width_m)
 
@@ -177,7 +181,7 @@ def _on_ground(data: TileData, clusters: NDArray[np.int32], options: Options) ->
     """Return the cells of clusters that are on the ground or large for their height, ``(H, W)``."""
     clustered = clusters >= 0
     member, size = members_of(clusters[clustered], clusters.size)
-    height = np.abs(data.dsm - data.dtm)[clustered]
+    height = np.abs(data.dsm[clustered] - data.dtm[clustered])
     accepted = np.bincount(member, height <= options.theta_z_m, len(size)) >= GROUND_SHARE * size
     raised = ~accepted
     above = raised[member]
@@ -216,8 +220,7 @@ def _merged(members: Bools, gap: float, heights: Floats, slope: Floats, theta: f
     _join_neighbours(forest, members)
     # Of any two sets one is not the largest, so no search starts in the largest, which has most cells.
     edges = _edges(members)
-    largest = np.bincount(compress(forest)[members.ravel()], minlength=1).argmax()
-    others = edges & (forest.reshape(members.shape) != largest)
+    others = edges & (forest.reshape(members.shape) != largest_of(compress(forest)))
     _join_across(forest, others, edges, gap, heights, slope, theta)
     return compress(forest).reshape(members.shape)
 

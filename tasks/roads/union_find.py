@@ -62,6 +62,19 @@ def compress(roots: Roots) -> Roots:
     return roots
 
 
+@compiled()
+def largest_of(roots: Roots) -> int:
+    """Return the root of the largest cluster of a compressed forest, of equal ones the first; 0 if none."""
+    sizes, largest = np.zeros(roots.size, np.int32), 0
+    for root in roots:
+        if root >= 0:
+            sizes[root] += 1
+    for root in range(roots.size):
+        if sizes[root] > sizes[largest]:
+            largest = root
+    return largest
+
+
 def members_of(roots: NDArray[np.int32], cells: int) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     """Return the number of each cell's cluster, in ascending order of roots, and the cells of each cluster.
 
