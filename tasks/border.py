@@ -22,9 +22,10 @@ from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.load import READS, load_border
 from flexroad.tasks.load import Options as LoadOptions
 from flexroad.tasks.options import Options, stage_function, stage_module
+from flexroad.tasks.roads.dtm_validity import Slices
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
-from flexroad.tasks.types import RoadMask, TileData
+from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 AROUND_M = 100.0
 """Distance from a corner or edge up to which the filter sees the ground (m): it judges a road by the size of
@@ -83,8 +84,10 @@ class BorderStages:
             The rasters around it, from `load_border`.
         """
         road = self._segmented(data)
-        clusters = stage_function("ecsrc", self.ecsrc)(data, road, self.ecsrc)
         module: Any = stage_module(self.fit)
+        clusters = self._filtered(data, road, module.near(border, self.fit))
+        if not module.is_near(data, clusters, border, self.fit):
+            clusters = self._filtered(data, road, None)
         if border.kind == "corner":
             corner: Corner = module.corner(data, road, clusters, border, self.fit)
             return corner
@@ -98,6 +101,16 @@ class BorderStages:
             ends = [parts[end] for end in ENDS[number - 4]] if number >= 4 else []
             parts.append(self.part(border, _cut(data, border.grid), ends))
         return Frame(*parts)
+
+    def _filtered(self, data: TileData, road: RoadMask, near: Slices | None) -> RoadClusters:
+        """Return the filtered roads; what only the fit needs may be there near the border alone."""
+        of_part = getattr(stage_module(self.ecsrc), "ecsrc_near", None)
+        clusters: RoadClusters = (
+            of_part(data, road, self.ecsrc, near)
+            if of_part and near
+            else stage_function("ecsrc", self.ecsrc)(data, road, self.ecsrc)
+        )
+        return clusters
 
     def _segmented(self, data: TileData) -> RoadMask:
         try:

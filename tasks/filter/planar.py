@@ -20,7 +20,7 @@ from flexroad.tasks import options as base
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.levels.seen import level_clusters
 from flexroad.tasks.roads.distances import columns_of, within
-from flexroad.tasks.roads.dtm_validity import invalid_dtm
+from flexroad.tasks.roads.dtm_validity import Slices, invalid_dtm
 from flexroad.tasks.roads.flat_patches import Patches, flat_patches
 from flexroad.tasks.roads.union_find import (
     Roots,
@@ -117,19 +117,32 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
         height either (under a car on a bridge it is the valley's), and the verge. ``beside`` are the cells
         of the verge and those up to `BEYOND_M` from it. With levels, it is once for each of them.
     """
+    return ecsrc_near(data, road, options, (slice(0, data.grid.height), slice(0, data.grid.width)))
+
+
+def ecsrc_near(data: TileData, road: RoadMask, options: Options, near: Slices) -> RoadClusters:
+    """Return the result of `ecsrc` with ``dtm_invalid`` and ``beside`` in a part of the raster alone.
+
+    Elsewhere they may be False. Labels are complete: clusters are judged by all their cells.
+
+    Parameters
+    ----------
+    near : tuple of slice
+        (row, col) slices of that part; they have a start and a stop.
+    """
     if road.levels:
 
         def of_level(seen: TileData, road: RoadMask, other: bool) -> RoadClusters:
             # A deck that is named needs no area.
             return _clusters_of(
-                seen, road, options.model_copy(update={"raised_m2_per_m": 0.0} if other else {})
+                seen, road, options.model_copy(update={"raised_m2_per_m": 0.0} if other else {}), near
             )
 
         return level_clusters(data, road, of_level, options.verge_m, BEYOND_M)
-    return _clusters_of(data, road, options)
+    return _clusters_of(data, road, options, near)
 
 
-def _clusters_of(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
+def _clusters_of(data: TileData, road: RoadMask, options: Options, near: Slices) -> RoadClusters:
     """Return the clusters of one level."""
     cell, theta = data.grid.cell, options.theta_z_m
     points = road.mask & np.isfinite(data.dsm)
@@ -142,28 +155,27 @@ def _clusters_of(data: TileData, road: RoadMask, options: Options) -> RoadCluste
     alone = points & ~ground & (consistency == NO_NEIGHBOURS)
     kept[alone] = np.abs(data.dsm[alone] - data.dtm[alone]) <= theta
     labels = _labels(data.dsm, kept, patches, cell, options)
-    dtm_invalid = invalid_dtm(data, road, labels > 0)
+    dtm_invalid = invalid_dtm(data, road, labels > 0, near)
     if options.verge_m == 0:
         return RoadClusters(data.grid, labels, dtm_invalid)
-    verge = _verge(road.mask, labels > 0, cell, options.verge_m)
-    beside = ~road.mask & within(verge, cell, BEYOND_M)
-    return RoadClusters(data.grid, labels, dtm_invalid | verge, beside)
+    reach = math.ceil((options.verge_m + BEYOND_M) / cell) + 1
+    around = tuple(slice(max(part.start - reach, 0), part.stop + reach) for part in near)
+    mask, beside = road.mask[around], np.zeros_like(dtm_invalid)
+    verge = ~mask & within(_streets(road.mask, labels > 0)[around], cell, options.verge_m)
+    dtm_invalid[around] |= verge
+    beside[around] = ~mask & within(verge, cell, BEYOND_M)
+    return RoadClusters(data.grid, labels, dtm_invalid, beside)
 
 
-def _verge(mask: Bools, kept: Bools, cell: float, width_m: float) -> Bools:
-    """Return the cells beside the streets at most ``width_m`` away, ``(H, W)``.
-
-    A street is a connected part of the mask with at least one kept cell, including its dropped cells.
-    """
-    if not kept.any():
-        return np.zeros_like(mask)
+def _streets(mask: Bools, kept: Bools) -> Bools:
+    """Return the streets, ``(H, W)``: the connected parts of the mask with a kept cell, complete."""
     parts = init(mask)
     _join_neighbours(parts, mask)
     parts = compress(parts).reshape(mask.shape)
     # The last element is that of the cells in no part.
     street = np.zeros(mask.size + 1, np.bool_)
     street[parts[kept]] = True
-    return ~mask & within(street[parts], cell, width_m)
+    return street[parts]
 
 
 def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArray[np.int32]:

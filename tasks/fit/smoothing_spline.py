@@ -26,7 +26,7 @@ from flexroad.tasks.levels.seen import level_data, level_road
 from flexroad.tasks.meshing.road_outline import crossings
 from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.roads.distances import distances
-from flexroad.tasks.roads.dtm_validity import ground_to_fit, valid_dtm
+from flexroad.tasks.roads.dtm_validity import Slices, ground_to_fit, valid_dtm
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.frame import Corner, Edge, Frame, rounded
 from flexroad.tasks.spline.irls import HuberObjective, minimise
@@ -160,6 +160,23 @@ def _with_held(held: Floats, z: Floats) -> Floats:
 def acting_m(options: Options) -> float:
     """Return the distance (m) beyond which no control point of a corner or edge acts."""
     return options.degree * options.spacing_m
+
+
+def near(border: Border, options: Options) -> Slices:
+    """Return the cells that the fit of a corner or edge uses, if no ground is missing there."""
+    lattice = _lattice(border.tile, border.grid.cell, options)
+    reach_m = max(np.multiply(lattice.lines_within(REACHES_M[0]), lattice.unit_m))
+    return border.strip(math.ceil(reach_m / border.grid.cell) + 1)[0]
+
+
+def is_near(data: TileData, clusters: RoadClusters, border: Border, options: Options) -> bool:
+    """Return whether that fit uses the cells of `near` alone; the parameters are as of `corner`."""
+    lattice = _lattice(border.tile, border.grid.cell, options)
+    nearest = lattice.lines_within(REACHES_M[0])
+    levels = [clusters, *(of_level for _, of_level in _near(clusters, border))]
+    return all(
+        _lines(level_data(data, clusters, own.number), own, border, lattice) == nearest for own in levels
+    )
 
 
 def corner(

@@ -28,12 +28,12 @@ CREST_M = 100.0
 THIN_M2 = 0.2
 """Cells whose variance in some direction is below this (m2) lie on a line and define no plane."""
 
-ALL = slice(None)
-Window = tuple[slice, slice]
-"""(row, col) slices."""
+Slices = tuple[slice, slice]
+"""(row, col) slices of a part of a raster."""
+EVERYWHERE: Slices = (slice(None), slice(None))
 
 
-def invalid_dtm(data: TileData, road: RoadMask, kept: Bools) -> Bools:
+def invalid_dtm(data: TileData, road: RoadMask, kept: Bools, near: Slices = EVERYWHERE) -> Bools:
     """Return the road cells dropped by the filter whose DTM does not continue the road, ``(H, W)``.
 
     The expected height is that of the plane through the kept cells around. The DTM may differ from it by
@@ -46,10 +46,13 @@ def invalid_dtm(data: TileData, road: RoadMask, kept: Bools) -> Bools:
         DSM and DTM, m.
     kept : (H, W) array of bool
         The filtered mask.
+    near : tuple of slice
+        The part of the raster in which the DTM is checked.
     """
     kept = kept & np.isfinite(data.dsm)
-    checked = road.mask & ~kept & np.isfinite(data.dtm)
-    invalid = np.zeros_like(checked)
+    checked: Bools = np.zeros(kept.shape, np.bool_)
+    invalid: Bools = np.zeros(kept.shape, np.bool_)
+    checked[near] = road.mask[near] & ~kept[near] & np.isfinite(data.dtm[near])
     if checked.any() and kept.any():
         expected, scatter, away = extrapolated_plane(data.dsm, kept, checked, data.grid.cell)
         off = np.abs(data.dtm[checked] - expected)
@@ -62,14 +65,15 @@ def rise(away: Floats) -> Floats:
     return away**2 / (2 * CREST_M)
 
 
-def valid_dtm(data: TileData, clusters: RoadClusters, window: Window = (ALL, ALL)) -> Floats:
+def valid_dtm(data: TileData, clusters: RoadClusters, window: Slices = EVERYWHERE) -> Floats:
     """Return the DTM in a window with NaN where it is invalid, so that neither loss nor start uses it."""
     if clusters.dtm_invalid is None:
-        return data.dtm[window]
+        dtm: Floats = data.dtm[window]
+        return dtm
     return np.where(clusters.dtm_invalid[window], np.nan, data.dtm[window])
 
 
-def ground_to_fit(data: TileData, clusters: RoadClusters, window: Window = (ALL, ALL)) -> Floats:
+def ground_to_fit(data: TileData, clusters: RoadClusters, window: Slices = EVERYWHERE) -> Floats:
     """Return the heights to fit in a window, m: the DSM's on the road, the valid DTM's elsewhere."""
     return np.where(clusters.labels[window] > 0, data.dsm[window], valid_dtm(data, clusters, window))
 

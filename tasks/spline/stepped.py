@@ -300,7 +300,7 @@ def border_steps(
     grid, heights = strip.grid, ground_heights(data, clusters)
     part = TileData(data.tile_id, grid, grid, heights.dsm[window], heights.dtm[window])
     own = RoadClusters(grid, clusters.labels[window], None, clusters.beside[window])
-    both = strip.along(own.beside).all(axis=0)
+    both = border.along(clusters.beside).all(axis=0)
     beside = ground_beside(part, own) if both.any() else None
     steps = with_steps(beside, spline, grid).steps.astype(np.float64) if beside else np.zeros(grid.shape)
     mean = np.where(both, strip.along(steps).sum(axis=0) / 2, 0.0)
