@@ -74,3 +74,25 @@ def test_along_edges_has_cells_of_both_sides_from_the_start():
         else:
             np.testing.assert_allclose(y, [here.northings[::-1]] * 2)
             np.testing.assert_allclose(x[:, 0] - border.start[0], [-0.5, 0.5])
+
+
+@pytest.mark.parametrize("number", range(8))
+@pytest.mark.parametrize("reach", [0, 3, 29])
+def test_strip_is_cells_beside_border(number, reach):
+    border = border_of(tile(0, 0), 30)[number]
+    (rows, cols), strip = border.strip(reach)
+    east, north = np.meshgrid(border.grid.eastings, border.grid.northings)
+    away = []
+    for side in border.sides:
+        beyond = [(at[side].min() - at, at - at[side].max()) for at in (east, north)]
+        away.append(np.max([*beyond[0], *beyond[1]], axis=0))
+    assert np.minimum(*away)[rows, cols].max() == reach
+    assert (np.minimum(*away) <= reach).sum() == strip.grid.width * strip.grid.height
+    assert border.grid.part(rows, cols) == strip.grid
+    cells = np.arange(border.grid.width * border.grid.height).reshape(border.grid.shape)
+    np.testing.assert_array_equal(strip.along(cells[rows, cols]), border.along(cells))
+
+
+def test_strip_ends_with_grid():
+    border = border_of(tile(0, 0), 30)[4]
+    assert border.strip(100)[1] == border

@@ -16,6 +16,7 @@ from flexroad.tasks.filter.planar import (
     VERSION,
     Options,
     ecsrc,
+    ecsrc_near,
     ground_consistency,
 )
 from flexroad.tasks.synthetic import gerod, make_scene
@@ -212,6 +213,21 @@ def test_verge_on_level_ground_equals_cells_near_kept_parts(seed, verge, cell):
     verge_exists = result.dtm_invalid.any()
     beyond = scipy.ndimage.distance_transform_edt(~result.dtm_invalid) * cell if verge_exists else np.inf
     np.testing.assert_array_equal(result.beside, ~mask & (beyond <= BEYOND_M))
+
+
+@given(st.integers(0, 10_000), st.tuples(*[st.integers(0, 45)] * 4), st.sampled_from([0, 4, 12]))
+@settings(max_examples=20)
+def test_part_of_result_equals_complete_result(seed, cut, verge):
+    mask, dsm, dtm = random_crossing(seed)
+    part = slice(cut[0], 90 - cut[1] + 1), slice(cut[2], 90 - cut[3] + 1)
+    grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 90, 90)
+    data, road = TileData("t", grid, grid, dsm, dtm), RoadMask(grid, grid, mask, np.zeros_like(mask))
+    options = Options(verge_m=verge)
+    complete, near = ecsrc(data, road, options), ecsrc_near(data, road, options, part)
+    np.testing.assert_array_equal(near.labels, complete.labels)
+    np.testing.assert_array_equal(near.dtm_invalid[part], complete.dtm_invalid[part])
+    if verge:
+        np.testing.assert_array_equal(near.beside[part], complete.beside[part])
 
 
 def scattered_blocks(seed, shape=(30, 44)):

@@ -1,17 +1,22 @@
 """Surfaces of tiles from shared corners and edges, against one fit of all tiles together."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 
 import numpy as np
 import pytest
+import scipy
 
 from flexroad.catalog.borders import border_of
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.border import ENDS
+from flexroad.pipeline.store import codec
+from flexroad.tasks import load
+from flexroad.tasks.border import ENDS, BorderStages
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
+from flexroad.tasks.quality.estimate import heights_fitted
 from flexroad.tasks.roads.extent import beyond_extent
+from flexroad.tasks.segment import mask
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import basis_matrix, uniform_knots
 from flexroad.tasks.synthetic import make_scene
@@ -186,6 +191,54 @@ def test_viaduct_across_border_is_kept():
     for east in (deck[deck <= 500250], deck[deck >= 500250]):
         tile = surfaces[0 if east[0] < 500250 else 1, 0]
         assert np.abs(tile.height(east, np.full(east.size, 5600125.0)) - 200).max() < 0.1
+
+
+def with_random_voids(world, seed):
+    """Return the world with round voids of 2 to 60 m radius, in the DTM or in both models."""
+    rng = np.random.default_rng(seed)
+    east, north = np.meshgrid(world.grid.eastings - 500000, world.grid.northings - 5600000)
+    void = np.zeros(world.grid.shape, bool)
+    for x, y, radius in rng.uniform((0, 0, 2), (500, 500, 60), (12, 3)):
+        void |= np.hypot(east - x, north - y) < radius
+    dtm = np.where(void, np.nan, world.dtm)
+    return replace(world, dtm=dtm, dsm=np.where(void, np.nan, world.dsm) if seed % 2 else world.dsm)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_reach_equals_distance_to_farthest_ground(seed):
+    world = with_random_voids(made_world("urban"), seed)
+    lattice = smoothing_spline._lattice((250, 250), 1.0, OPTIONS)
+    reaches = set()
+    for border in border_of(Grid("EPSG:25832", 500000, 5600500, 1.0, 250, 250), AROUND_M):
+        data = part(world, border.grid, border.grid)
+        clusters = filtered(data)[1]
+        missing = np.isnan(heights_fitted(data, clusters))
+        away = border.along(scipy.ndimage.distance_transform_edt(missing)).max()
+        enough = [lines for lines in (7, 14, 28) if lines * 250 / 70 >= 15 + away]
+        lines = smoothing_spline._lines(data, clusters, border, lattice)
+        assert lines == 2 * (min(enough, default=28),)
+        reaches.add(lines)
+    assert len(reaches) > 1
+
+
+def test_part_with_dtm_checked_near_border_equals_that_of_complete_filter(monkeypatch):
+    chain = {
+        "load": load.Options(halo_m=50),
+        "segment": mask.Options(),
+        "ecsrc": FILTER,
+        "fit": OPTIONS,
+    }
+    stages, tile = BorderStages.of(chain), Grid("EPSG:25832", 500000, 5600500, 1.0, 250, 250)
+    worlds = [made_world("urban"), with_random_voids(made_world("urban"), 1)]
+    near = [stages.frame(world, tile) for world in worlds]
+    monkeypatch.setattr(
+        BorderStages, "_filtered", lambda _, data, road, near: planar.ecsrc(data, road, FILTER)
+    )
+    for world, frame in zip(worlds, near, strict=True):
+        complete = stages.frame(world, tile)
+        for field in fields(Frame):
+            parts = (getattr(result, field.name) for result in (frame, complete))
+            assert len({codec.encode(result, {}) for result in parts}) == 1
 
 
 def test_border_without_ground_is_left_free():
