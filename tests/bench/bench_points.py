@@ -104,10 +104,7 @@ def compare(
     # The first round compiles code, or loads compiled code; it is not counted.
     for number in range(rounds + 1):
         for name, root in checkouts.items():
-            out = folder / f"out-{name}"
-            shutil.rmtree(out, ignore_errors=True)
-            words = f"prepare points {file} -o {out} --ground {method} --workers {workers} --date 2020-01-01"
-            cost = run([COMMAND, *words.split()], root)
+            cost = prepare(file, folder / f"out-{name}", method, workers, root)
             if number:
                 costs[name].append(cost)
     for name, measured in costs.items():
@@ -122,6 +119,13 @@ def compare(
         )
     if len(checkouts) > 1:
         print(f"  rasters: {difference(*(folder / f'out-{name}' for name in checkouts))}", flush=True)
+
+
+def prepare(file: Path, out: Path, method: str, workers: int = 1, root: Path = HERE) -> Cost:
+    """Run the command from one file into a new folder."""
+    shutil.rmtree(out, ignore_errors=True)
+    words = f"prepare points {file} -o {out} --ground {method} --workers {workers} --date 2020-01-01"
+    return run([COMMAND, *words.split()], root)
 
 
 def run(words: list[str], root: Path) -> Cost:

@@ -25,7 +25,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks import load
 from flexroad.tasks.options import stage_function
-from tests.bench import bench_simulated, bench_tile, measure_stages
+from tests.bench import bench_points, bench_simulated, bench_tile, measure_stages
 from tests.bench.timing import Peak, cpu_s, one_cpu_s, one_thread, peak
 
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "speed.md"
@@ -33,6 +33,9 @@ PLOT = PAGE.parents[1] / "images" / "speed.webp"
 STATE = 550_000
 """Tiles of 250 m of one German state (34,100 km2)."""
 CORES = 16
+TILE_M = 250
+SCANS = (1_000_000, 4_000_000)
+"""Points of the two scans whose difference is the time of a point."""
 SPACINGS_M = (12.5, 8.0, 5.0, 3.6, 2.5)
 """Distances of control points in the plot."""
 NUMBERS = (1, 2, 4, 8)
@@ -63,7 +66,8 @@ def main() -> None:
         draw(curves(Path(scratch)))
         (Path(scratch) / "simulated").mkdir()
         sent = bench_simulated.simulated(Path(scratch) / "simulated", options.simulated)
-    parts = {"stages": stages(rows, top, options), "state": state(rows, sent)}
+        scan = {method: points_ms(Path(scratch), method) for method in bench_points.METHODS}
+    parts = {"stages": stages(rows, top, options), "state": state(rows, sent, scan)}
     text = PAGE.read_text()
     for name, part in parts.items():
         text = replaced(text, name, part)
@@ -93,8 +97,14 @@ def stages(rows: list[bench_tile.Row], top: Peak, options: argparse.Namespace) -
     return "\n".join([*lines, ""])
 
 
-def state(rows: list[bench_tile.Row], sent: dict[str, Any]) -> str:
-    """Return the estimate for a state as Markdown: sums of measured parts."""
+def state(rows: list[bench_tile.Row], sent: dict[str, Any], scan: dict[str, float]) -> str:
+    """Return the estimate for a state as Markdown: sums of measured parts.
+
+    Parameters
+    ----------
+    scan : dict
+        CPU time of `points_ms` by ground method.
+    """
     tile_ms = next(row.ms for row in rows if (row.config, row.stage) == ("production", "tile of a mosaic"))
     worker_ms, client_ms = (1000 * sent["per_tile"][name] for name in ("worker_s", "client_s"))
     parts = {
@@ -103,13 +113,32 @@ def state(rows: list[bench_tile.Row], sent: dict[str, Any]) -> str:
         "client and scheduler, per tile": client_ms,
     }
     total_ms = sum(parts.values())
+    points = {f"points to rasters, ground by {method}": ms for method, ms in scan.items()}
     lines = ["| part | CPU ms a tile | core hours for the state |", "|---|---:|---:|"]
     lines += [f"| {name} | {ms:.1f} | {hours(ms):.1f} |" for name, ms in parts.items()]
     lines += [
-        f"| **one core** | {total_ms:.1f} | **{hours(total_ms):.0f} h** |",
+        f"| **one core, from rasters to meshes** | {total_ms:.1f} | **{hours(total_ms):.0f} h** |",
         f"| **a node of {CORES} cores**: one core, divided | | **{hours(total_ms) / CORES:.1f} h** |",
     ]
+    lines += [f"| {name} | {ms:.1f} | {hours(ms):.1f} |" for name, ms in points.items()]
+    lines += [
+        f"| **one core, from points ({method}) to meshes** | {total_ms + ms:.1f} "
+        f"| **{hours(total_ms + ms):.0f} h** |"
+        for method, ms in scan.items()
+    ]
     return "\n".join([*lines, ""])
+
+
+def points_ms(folder: Path, method: str) -> float:
+    """Return the CPU time from points to rasters of one tile's ground (ms), without the start of the command.
+
+    It is the difference of two synthetic scans of different size: a state is made in a few large commands.
+    """
+    costs = []
+    for n in SCANS:
+        file = bench_points.synthetic(folder / "scan.laz", n)
+        costs.append(min(bench_points.prepare(file, folder / "out", method).cpu_s for _ in range(2)))
+    return 1000 * (costs[1] - costs[0]) / (SCANS[1] - SCANS[0]) * bench_points.PER_M2 * TILE_M**2
 
 
 def hours(ms: float) -> float:
