@@ -36,13 +36,26 @@ class Compiled(Generic[P, R]):
 
     @cached_property
     def dispatcher(self) -> Any:
-        """The function as numba's dispatcher."""
-        # numba needs dispatchers, not Compiled objects, under the names of the functions that this one calls.
-        names = self.function.__globals__
-        for name in self.function.__code__.co_names:
-            if isinstance(names.get(name), Compiled):
-                names[name] = names[name].dispatcher
-        return numba.njit(cache=True, error_model=self.error_model, fastmath=self.fastmath)(self.function)
+        """The function as numba's dispatcher, for calls from Python."""
+        return self._dispatcher(cache=True)
+
+    @cached_property
+    def inner(self) -> Any:
+        """The function as numba's dispatcher, for calls from compiled functions.
+
+        The code of the caller contains this function, so it needs neither a cache nor a wrapper for Python.
+        """
+        return self._dispatcher(no_cpython_wrapper=True)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What numba asks for when it compiles a function that calls this one."""
+        return self.inner._numba_type_
+
+    def _dispatcher(self, **options: bool) -> Any:
+        return numba.njit(
+            no_cfunc_wrapper=True, error_model=self.error_model, fastmath=self.fastmath, **options
+        )(self.function)
 
 
 def compiled(

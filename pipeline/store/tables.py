@@ -162,7 +162,8 @@ def _table(rows: Sequence[MetricsRow], schema: Any) -> Any:
         pyarrow.json.ReadOptions(use_threads=False, block_size=len(lines) + 1),
         pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
     )
-    return table.cast(schema)
+    # The columns have these types already, and a cast would import pyarrow.compute.
+    return table.replace_schema_metadata(schema.metadata)
 
 
 def metrics_frame(rows: Sequence[MetricsRow]) -> pd.DataFrame:

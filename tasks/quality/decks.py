@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import shapely
-from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects, label
 
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
@@ -64,13 +64,13 @@ def likely_decks(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> list[Deck
     """
     points = road & np.isfinite(dsm)
     patches = flat_patches(dsm, points, grid.cell, ROUGHNESS_M, BEND)
-    flat = binary_dilation(patches.centres, np.ones((2 * patches.reach + 1,) * 2)) & points
+    flat = scipy.ndimage.binary_dilation(patches.centres, np.ones((2 * patches.reach + 1,) * 2)) & points
     rise = dsm - dtm
     street = flat & (np.abs(rise) <= STREET_M)
-    parts, number = label(flat & (rise > RISE_M), EVERY_WAY)
+    parts, number = scipy.ndimage.label(flat & (rise > RISE_M), EVERY_WAY)
     sizes = np.bincount(parts.ravel(), minlength=number + 1) * grid.cell**2
     decks = []
-    for k, box in enumerate(find_objects(parts), 1):
+    for k, box in enumerate(scipy.ndimage.find_objects(parts), 1):
         if sizes[k] >= AREA_M2:
             # Only what is near matters: a tile may have millions of cells.
             around = _grown(box, math.ceil(END_M / grid.cell) + 1, road.shape)
@@ -91,10 +91,11 @@ def _grown(box: tuple[slice, ...], cells: int, shape: tuple[int, ...]) -> tuple[
 
 def _ends(own: Bools, street: Bools, dsm: Floats, cell: float) -> int:
     """Return the number of streets of the same height within `END_M` of some cells."""
-    away, nearest = distance_transform_edt(~own, sampling=cell, return_indices=True)
+    away, nearest = scipy.ndimage.distance_transform_edt(~own, sampling=cell, return_indices=True)
     off = np.abs(dsm - dsm[tuple(nearest)])
     level = street & (away <= END_M) & (off <= STEP_M + GRADE * away)
-    places, _ = label(binary_dilation(level, iterations=max(1, round(GAP_M / cell))))
+    grown = scipy.ndimage.binary_dilation(level, iterations=max(1, round(GAP_M / cell)))
+    places, _ = scipy.ndimage.label(grown)
     sizes = np.bincount(places[level], minlength=1) * cell**2
     return int((sizes[1:] >= END_M2).sum())
 

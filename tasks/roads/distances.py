@@ -44,7 +44,8 @@ def filled(values: Floats, wanted: Bools | None = None) -> Floats:
 def within(mask: Bools, cell: float, reach_m: float) -> Bools:
     """Return the cells whose centre lies within ``reach_m`` of that of a cell of the mask, ``(H, W)``."""
     # A quotient like 0.3 / 0.1 is a little below 3.
-    return _within(mask, reach_m / cell + 1e-9)
+    # One layout in memory is enough: every other one is compiled, too.
+    return _within(np.ascontiguousarray(mask), reach_m / cell + 1e-9)
 
 
 @compiled()
