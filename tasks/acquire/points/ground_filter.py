@@ -120,19 +120,20 @@ def _ground(
     for b in range(rows * cols):
         if start[b] < start[b + 1]:
             floor[b] = z[start[b]]
+    floor_of_row = _floor_of_row(floor, shape, math.ceil(radius / side) + 1)
     candidates = np.empty((2 * math.ceil(radius / side) + 3) ** 2, np.int64)
     for b in range(rows * cols):
         if not asked[start[b] : start[b + 1]].any():
             continue
         # Comparing with one low point near by rejects most points that are not ground.
-        low = start[_lowest(floor, shape, side, b, radius, slope)]
+        low = start[_lowest(floor, floor_of_row, shape, side, b, radius, slope)]
         top = -np.inf
         for p in range(start[b], start[b + 1]):
             out[p] = asked[p] and not _over(x, y, z, p, low, low + 1, radius, slope, tolerance, 0.0)
             if out[p]:
                 top = z[p]
         # The remaining points are compared with all buckets low enough to reject the highest of them.
-        count = _low_buckets(floor, shape, side, b, radius, slope, tolerance, top, candidates)
+        count = _low_buckets(floor, floor_of_row, shape, side, b, radius, slope, tolerance, top, candidates)
         for p in range(start[b], start[b + 1]):
             for k in range(count):
                 if not out[p]:
@@ -170,12 +171,34 @@ def _over(
 
 
 @compiled()
-def _lowest(floor: Floats, shape: tuple[int, int], side: float, b: int, radius: float, slope: float) -> int:
+def _floor_of_row(floor: Floats, shape: tuple[int, int], reach: int) -> Floats:
+    """Return the lowest floor of up to ``reach`` buckets on both sides in the row of each bucket."""
+    rows, cols = shape
+    lowest = np.full(rows * cols, np.inf)
+    for r in range(rows):
+        for c in range(cols):
+            for near in range(max(c - reach, 0), min(c + reach + 1, cols)):
+                lowest[r * cols + c] = min(lowest[r * cols + c], floor[r * cols + near])
+    return lowest
+
+
+@compiled()
+def _lowest(
+    floor: Floats,
+    floor_of_row: Floats,
+    shape: tuple[int, int],
+    side: float,
+    b: int,
+    radius: float,
+    slope: float,
+) -> int:
     """Return the bucket that allows the lowest ground at bucket b, by the distance of their centres."""
     row, col = divmod(b, shape[1])
     reach = int(radius / side)
     best, lowest = b, floor[b]
     for r in range(max(row - reach, 0), min(row + reach + 1, shape[0])):
+        if floor_of_row[r * shape[1] + col] + slope * side * abs(r - row) >= lowest:
+            continue
         across = int(math.sqrt(reach**2 - (r - row) ** 2))
         for c in range(max(col - across, 0), min(col + across + 1, shape[1])):
             limit = floor[r * shape[1] + c]
@@ -190,6 +213,7 @@ def _lowest(floor: Floats, shape: tuple[int, int], side: float, b: int, radius: 
 @compiled()
 def _low_buckets(
     floor: Floats,
+    floor_of_row: Floats,
     shape: tuple[int, int],
     side: float,
     b: int,
@@ -210,6 +234,8 @@ def _low_buckets(
     count = 0
     for r in range(first_row, end_row):
         away = _gap(south, south + side, r, side)
+        if top - floor_of_row[r * shape[1] + col] <= slope * away + tolerance:
+            continue
         for c in range(first_col, end_col):
             drop = top - floor[r * shape[1] + c]
             if drop <= slope * away + tolerance:

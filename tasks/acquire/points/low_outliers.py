@@ -79,11 +79,14 @@ def without_low_outliers(
     if valid.size == 0:
         nothing = np.zeros(0)
         return Buckets(nothing, nothing, nothing, valid, np.zeros(2, np.int64), (1, 1), radius_m)
-    points = Buckets.of(easting[valid], northing[valid], height[valid], radius_m)
+    is_part = valid.size < height.size
+    if is_part:
+        easting, northing, height = easting[valid], northing[valid], height[valid]
+    points = Buckets.of(easting, northing, height, radius_m)
     if options.low_m is not None:
         low = _low_outliers(*points.arrays, options.low_radius_m, options.low_m, options.low_companions)
         points = points.without(low)
-    return replace(points, order=valid[points.order])
+    return replace(points, order=valid[points.order]) if is_part else points
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,10 +191,10 @@ def _low_outliers(
             end = min(end, start[b] + companions + 1)
         for p in range(start[b], end):
             # The count includes the point itself.
-            as_low = _count(x, y, z, start, shape, side, radius, p, step, companions + 2)
+            as_low = _count(x, y, z, start, shape, side, radius, b, p, step, companions + 2)
             if as_low <= companions + 1:
                 enough = (OUTNUMBERED + 1) * as_low
-                out[p] = _count(x, y, z, start, shape, side, radius, p, np.inf, enough) == enough
+                out[p] = _count(x, y, z, start, shape, side, radius, b, p, np.inf, enough) == enough
     return out
 
 
@@ -204,21 +207,44 @@ def _count(
     shape: tuple[int, int],
     side: float,
     radius: float,
+    own: int,
     p: int,
     step: float,
     enough: int,
 ) -> int:
     """Count the points near p, itself included, at most ``step`` above it; stop at ``enough``."""
-    count = 0
+    # Most points have enough companions in their own bucket.
+    count = _count_in(x, y, z, start[own], start[own + 1], radius, p, step, enough)
     first_col, end_col = span(x[p], radius, side, shape[1])
     first_row, end_row = span(y[p], radius, side, shape[0])
     for row in range(first_row, end_row):
         for b in range(row * shape[1] + first_col, row * shape[1] + end_col):
-            for q in range(start[b], start[b + 1]):
-                if z[q] - z[p] > step:
-                    break
-                if math.sqrt((x[q] - x[p]) ** 2 + (y[q] - y[p]) ** 2) <= radius:
-                    count += 1
-                    if count == enough:
-                        return count
+            if count == enough:
+                return count
+            if b != own:
+                count += _count_in(x, y, z, start[b], start[b + 1], radius, p, step, enough - count)
+    return count
+
+
+@compiled()
+def _count_in(
+    x: Floats,
+    y: Floats,
+    z: Floats,
+    first: int,
+    end: int,
+    radius: float,
+    p: int,
+    step: float,
+    enough: int,
+) -> int:
+    """Count as `_count` does, among points ``first`` to ``end - 1``, which are sorted by height."""
+    count = 0
+    for q in range(first, end):
+        if z[q] - z[p] > step:
+            break
+        if math.sqrt((x[q] - x[p]) ** 2 + (y[q] - y[p]) ** 2) <= radius:
+            count += 1
+            if count == enough:
+                break
     return count
