@@ -1,5 +1,6 @@
 """The container file has the versions, threads and user of the project, and all files that it needs."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -55,3 +56,27 @@ def test_container_context_is_enough_to_build_the_wheel(tmp_path):
     files += (ROOT / "configs").glob("*.yaml")
     files += filter(Path.is_file, (ROOT / "viewer" / "dist").rglob("*"))
     assert {f"flexroad/{path.relative_to(ROOT)}" for path in files} <= set(names)
+
+
+@pytest.mark.slow
+def test_container_compiles_what_a_run_of_another_user_needs(tmp_path):
+    """The step of the container file, with other folders; the user's home folder and survey are others."""
+    compiled, tile, home = tmp_path / "compiled", tmp_path / "tile", tmp_path / "home"
+    (folder,) = re.findall(r"NUMBA_CACHE_DIR=(\S+)", CONTAINER)
+    (step,) = re.findall(r"^RUN (export HOME=.*?)^USER", CONTAINER, re.MULTILINE | re.DOTALL)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(compiled)}
+    environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), environment["PATH"]])
+
+    def shell(commands, **variables):
+        subprocess.run(["sh", "-ec", commands], check=True, capture_output=True, env=environment | variables)
+
+    shell(step.replace("/tmp/tile", str(tile)).replace(folder, str(compiled)))
+    kernels = {path: path.stat().st_mtime_ns for path in compiled.rglob("*") if path.is_file()}
+    assert kernels
+    assert not tile.exists()
+    assert all(path.stat().st_mode & 0o006 == 0o006 for path in kernels)
+    survey = "flexroad catalog synthetic --tiles 2 --tile-size 100 --seed 7 -o survey"
+    run = "flexroad run --catalog survey/catalog.parquet --out run"
+    home.mkdir()
+    shell(f"cd {home}; {survey}; {run}", HOME=str(home))
+    assert {path: path.stat().st_mtime_ns for path in compiled.rglob("*") if path.is_file()} == kernels
