@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import struct
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from isal import isal_zlib
 from numpy.typing import NDArray
 
 from flexroad.catalog.crs import compound
@@ -36,16 +33,7 @@ HILLSHADE = {"type": "hillshade", "azimuth": "315", "angle": "45", "zfactor": "1
 RENDERER = {"band": "1", "opacity": "1", "alphaBand": "-1"}
 """Attributes of QGIS's renderers of rasters."""
 LEVEL = 4
-"""Level of GDAL's deflate, 1 to 9: above it, heights get 2% smaller in up to twice the time."""
-ISAL_LEVEL = 1
-"""Level of ISA-L's deflate, 0 to 3: at 0 files are a sixth larger, above 1 no smaller."""
-ENTRY = "<2H2L"
-"""An entry of a TIFF directory: tag, type, number of values, and the value or the place of several."""
-TILE_OFFSETS, TILE_BYTE_COUNTS, TIE_POINT = 324, 325, 33922
-"""TIFF's tags of the places and sizes of blocks, and GeoTIFF's of a cell and its coordinates."""
-LONG = 4
-"""TIFF's type of 32-bit integers."""
-SIZE_BYTES, DOUBLE_BYTES = 4, 8
+"""Level of deflate, 1 to 9: above it, heights get 2% smaller in up to twice the time."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +99,7 @@ def encode_height(height: Floats, grid: Grid, vertical: str | None = None) -> by
         If the array does not have the grid's shape.
     """
     crs = compound(grid.crs, vertical) if vertical else grid.crs
-    return _encode(height.astype(np.float32), grid, crs, HEIGHT)
+    return _encode(height.astype(np.float32), grid, crs, HEIGHT, predictor=3, overview_resampling="average")
 
 
 def encode_mask(road: Bools, grid: Grid) -> bytes:
@@ -122,7 +110,8 @@ def encode_mask(road: Bools, grid: Grid) -> bytes:
     TaskError
         If the array does not have the grid's shape.
     """
-    return _encode(road.astype(np.uint8), grid, grid.crs, ROAD)
+    values = road.astype(np.uint8)
+    return _encode(values, grid, grid.crs, ROAD, overview_resampling="mode")
 
 
 def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
@@ -133,7 +122,7 @@ def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
     TaskError
         If the array does not have the grid's shape.
     """
-    return _encode(support, grid, grid.crs, SUPPORT)
+    return _encode(support, grid, grid.crs, SUPPORT, overview_resampling="mode")
 
 
 def encode_style(band: Band) -> bytes:
@@ -160,73 +149,9 @@ def encode_style(band: Band) -> bytes:
     return STYLE_DOCTYPE + text + b"\n"
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """A raster of one block as GDAL writes it, without the block."""
-
-    head: bytes
-    """All that comes before the block: the header and the directory, which refers to the block."""
-    offset: int
-    """Where the directory's entry for the offset of the block is (bytes)."""
-    count: int
-    """Where its entry for the size of the block is (bytes)."""
-    corner: int
-    """Where easting and northing of the north-west corner are (bytes)."""
-
-    def of(self, block: bytes, corner: tuple[float, float]) -> bytes:
-        """Return the raster with a compressed block, at a place."""
-        head = bytearray(self.head)
-        struct.pack_into(ENTRY, head, self.offset, TILE_OFFSETS, LONG, 1, len(head) + SIZE_BYTES)
-        struct.pack_into(ENTRY, head, self.count, TILE_BYTE_COUNTS, LONG, 1, len(block))
-        struct.pack_into("<2d", head, self.corner, *corner)
-        # GDAL's layout of a COG: before a block its size, after it its last four bytes again.
-        return b"".join([head, struct.pack("<L", len(block)), block, block[-4:]])
-
-
-def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band) -> bytes:
+def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: Any) -> bytes:
     if values.shape != grid.shape:
         raise TaskError(f"{band.name} of {values.shape} cells does not fit a grid of {grid.shape}")
-    if max(grid.shape) > BLOCK:
-        return _written(values, grid, crs, band)
-    # The rasters of a run differ in corner and cells alone: GDAL takes longer for the rest than for these.
-    frame = _frame(replace(grid, west=1.0, north=1.0), crs, band)
-    block = np.pad(values, [(0, _block(grid) - size) for size in grid.shape], mode="edge")
-    if not band.classes:
-        block = _predicted(block)
-    return frame.of(isal_zlib.compress(block, ISAL_LEVEL), (grid.west, grid.north))
-
-
-@lru_cache(maxsize=256)
-def _frame(grid: Grid, crs: str, band: Band) -> _Frame:
-    """Return the frame of a raster that is one block."""
-    encoded = _written(np.ones(grid.shape, band.dtype), grid, crs, band)
-    (directory,) = struct.unpack_from("<L", encoded, 4)
-    (count,) = struct.unpack_from("<H", encoded, directory)
-    places = [directory + 2 + struct.calcsize(ENTRY) * number for number in range(count)]
-    entries = [struct.unpack_from(ENTRY, encoded, place) for place in places]
-    values = {tag: value for tag, _, _, value in entries}
-    place = {tag: start for (tag, *_), start in zip(entries, places, strict=True)}
-    return _Frame(
-        head=encoded[: values[TILE_OFFSETS] - SIZE_BYTES],
-        offset=place[TILE_OFFSETS],
-        count=place[TILE_BYTE_COUNTS],
-        # A tie point has column, row and layer of a cell, then its easting, northing and height.
-        corner=values[TIE_POINT] + 3 * DOUBLE_BYTES,
-    )
-
-
-def _predicted(block: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return TIFF's floating-point predictor: in each row the highest bytes of all cells, then the next ones.
-
-    Each byte is the difference from the one before it.
-    """
-    height, width = block.shape
-    rows = block.astype(">f4").view(np.uint8).reshape(height, width, 4).transpose(0, 2, 1)
-    return np.diff(rows.reshape(height, 4 * width), axis=1, prepend=np.zeros((height, 1), np.uint8))
-
-
-def _written(values: NDArray[Any], grid: Grid, crs: str, band: Band) -> bytes:
-    """Return a raster as GDAL writes it, with overviews if it has several blocks."""
     profile = {
         "driver": "COG",
         "dtype": band.dtype,
@@ -239,11 +164,9 @@ def _written(values: NDArray[Any], grid: Grid, crs: str, band: Band) -> bytes:
         "level": LEVEL,
         "nodata": band.nodata,
         "blocksize": _block(grid),
-        "overview_resampling": "mode" if band.classes else "average",
-        "predictor": "NO" if band.classes else "FLOATING_POINT",
     }
     with rasterio.io.MemoryFile() as file:
-        with file.open(**profile) as raster:
+        with file.open(**profile, **options) as raster:
             raster.write(values, 1)
             describe(raster, 1, band)
         encoded: bytes = file.read()
