@@ -11,7 +11,9 @@ submodule at once.
 
 from __future__ import annotations
 
+import gc
 import importlib
+from types import ModuleType
 from typing import Any
 
 
@@ -32,13 +34,13 @@ class LazyModule:
         # Tools that look through the names of a file ask for these; an answer is not worth an import.
         if name.startswith("__") and name != "__version__":
             raise AttributeError(f"{name!r} does not import module {self._name!r}")
-        module = importlib.import_module(self._name)
+        module = _imported(self._name)
         try:
             return getattr(module, name)
         except AttributeError as error:
             submodule = f"{module.__name__}.{name}"
             try:
-                return importlib.import_module(submodule)
+                return _imported(submodule)
             except ModuleNotFoundError as missing:
                 if missing.name != submodule:
                     raise
@@ -52,6 +54,17 @@ class LazyModule:
 
     def __reduce__(self) -> tuple[type[LazyModule], tuple[str]]:
         return LazyModule, (self._name,)
+
+
+def _imported(name: str) -> ModuleType:
+    """Import a module without garbage collections: nearly all objects that it makes stay."""
+    if not gc.isenabled():
+        return importlib.import_module(name)
+    gc.disable()
+    try:
+        return importlib.import_module(name)
+    finally:
+        gc.enable()
 
 
 def lazy(name: str) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import gc
 import importlib
 import importlib.metadata
 import os
@@ -78,9 +77,6 @@ app = typer.Typer(
 def main() -> None:
     """Run the command line; a user error is printed as one line, with exit code 2."""
     limits.raise_open_files()
-    # Imports and numba make many objects that stay: the default of 700 looks through them for an eighth of a
-    # short command's time.
-    gc.set_threshold(50_000, 20)
     # Before GDAL and PROJ are loaded; workers inherit the environment.
     if line := drop_foreign():
         echo(f"warning: {line}", err=True)

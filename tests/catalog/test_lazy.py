@@ -1,5 +1,6 @@
 """Libraries are imported at their first use."""
 
+import gc
 import pickle
 import subprocess
 import sys
@@ -56,3 +57,14 @@ def test_pickled_library_is_imported_where_it_is_used():
 
 def test_tools_that_look_for_marks_do_not_import():
     assert not hasattr(lazy("no_such_library"), "__wrapped__")
+
+
+def test_garbage_is_not_collected_during_an_import(tmp_path, monkeypatch):
+    (tmp_path / "asking.py").write_text("import gc; enabled = gc.isenabled()")
+    (tmp_path / "failing.py").write_text("raise OSError")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert not lazy("asking").enabled
+    assert gc.isenabled()
+    with pytest.raises(OSError):  # noqa: PT011 (any)
+        _ = lazy("failing").name
+    assert gc.isenabled()
