@@ -21,6 +21,8 @@ def contained(where: Location, home: Location) -> Location:
     ------
     OSError
         If it is, or lies behind, a link that leads out of the folder; names the location.
+    ValueError
+        If the location has a null byte.
     """
     if isinstance(where, Path) and not _is_direct(str(where), str(home)):
         target = os.path.realpath(where)
@@ -66,6 +68,8 @@ def _is_direct(where: str, home: str) -> bool:
     return (
         where.startswith(start)
         and ".." not in parts
+        # `os.path.islink` returns False for it.
+        and "\0" not in where
         and not any(os.path.islink(start + folder) for folder in folders)  # noqa: PTH114 (Path is slow)
     )
 

@@ -41,3 +41,9 @@ def test_contained_takes_what_is_below_the_folder_with_all_links_resolved(home):
             assert contained(path, home) == path
             taken += 1
     assert len(paths) / 4 < taken < len(paths)
+
+
+def test_contained_null_byte_raises_as_for_any_path(home):
+    for path in (home / "a" / "b\0", home / ".." / "\0"):
+        with pytest.raises(ValueError, match="null byte"):
+            contained(path, home)
