@@ -135,10 +135,11 @@ def rest(artefacts: int) -> Work:
 @contextmanager
 def counted_fits() -> Iterator[list[FitSize]]:
     """Collect the sizes of the fits in a block; for one thread."""
-    from flexroad.tasks.spline import adam, irls
+    from flexroad.tasks.fit import smoothing_spline
+    from flexroad.tasks.spline import adam
 
     fits: list[FitSize] = []
-    convex, descent = irls.minimise, adam.minimise
+    convex, descent = smoothing_spline.minimise, adam.minimise
 
     def by_steps(loss: Any, start: Any, *rest: Any, **options: Any) -> Any:
         solution = convex(loss, start, *rest, **options)
@@ -150,8 +151,8 @@ def counted_fits() -> Iterator[list[FitSize]]:
         fits.append(FitSize(loss.target.shape, start.shape[1:], len(losses), 2))
         return best, losses
 
-    irls.minimise, adam.minimise = by_steps, by_adam
+    smoothing_spline.minimise, adam.minimise = by_steps, by_adam
     try:
         yield fits
     finally:
-        irls.minimise, adam.minimise = convex, descent
+        smoothing_spline.minimise, adam.minimise = convex, descent
