@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import sys
 from types import ModuleType
 from typing import Any
 
@@ -58,7 +59,7 @@ class LazyModule:
 
 def _imported(name: str) -> ModuleType:
     """Import a module without garbage collections: nearly all objects that it makes stay."""
-    if not gc.isenabled():
+    if name in sys.modules or not gc.isenabled():
         return importlib.import_module(name)
     gc.disable()
     try:
