@@ -115,8 +115,8 @@ def inspect(path: Path) -> Cloud:
     CatalogError
         If the file is missing, not LAS or LAZ, truncated, or without points.
     """
+    largest = _checked(path)
     with _opened(path) as reader:
-        largest = _attempt(path, lambda: las_header.check(path))
         cloud = _attempt(path, lambda: _cloud(path, reader.header, largest))
         needed = reader.header.offset_to_point_data + cloud.points * reader.header.point_format.size
         plain = not reader.header.are_points_compressed
@@ -193,6 +193,7 @@ def chunks(
         If the file is missing, unreadable, truncated or damaged. LAZ has no checksum: a file is taken as
         damaged if points lie beyond the header's bounds.
     """
+    _checked(path)
     with _opened(path, fields=USED) as reader:
         header = reader.header
         wanted = range(header.point_count) if points is None else points
@@ -238,12 +239,16 @@ def _chunk(
     return Chunk(x[kept], y[kept], z[kept], kind[kept], colour, None if gps is None else gps[kept])
 
 
-def _opened(path: Path, fields: Collection[str] = ()) -> Any:
-    """Open a cloud; of compressed points only some fields are decoded, all if none are named."""
+def _checked(path: Path) -> int:
+    """Check that a file is there and its header; return the size of its largest chunk (bytes)."""
     if not _attempt(path, path.is_file):
         missing = "is not a file" if path.exists() else "does not exist"
         raise CatalogError(f"{path} {missing}; give LAS or LAZ files, or folders of them")
-    _attempt(path, lambda: las_header.check(path))
+    return _attempt(path, lambda: las_header.check(path))
+
+
+def _opened(path: Path, fields: Collection[str] = ()) -> Any:
+    """Open a checked cloud; of compressed points only some fields are decoded, all if none are named."""
     selection = {"decompression_selection": _selection(fields)} if fields else {}
     # The parallel decoder allocates a complete chunk, which the header may give as 2^32 points, and goes to
     # wrong points of files with chunks of different sizes, as COPC has (laz-rs #62).
