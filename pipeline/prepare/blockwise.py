@@ -119,7 +119,7 @@ def _points_jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Option
     for index in buckets.overlapping(wider):
         grid, inner = (_block_grid(part, buckets.edge, index) for part in (wider, whole))
         reach = points_reach_m(options, whole.cell)
-        if grid and (near := buckets.around(grid, reach)).runs:
+        if grid and (near := buckets.around(grid, reach)).parts:
             pixels = Grid.covering(inner.crs, inner.bounds, dop_cell) if inner and dop_cell else None
             yield _PointsJob(near, grid, options, pixels, writer.scratch / f"{index[0]}_{index[1]}.npz")
 

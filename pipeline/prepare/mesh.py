@@ -21,8 +21,8 @@ from flexroad.pipeline.prepare.output import disk_errors
 from flexroad.pipeline.prepare.point_buckets import (
     PER_METRE,
     RECORD,
+    BlockPart,
     PointBuckets,
-    Run,
     append,
     block_edge,
 )
@@ -188,7 +188,7 @@ def _sample_points(
     area = writer.grid.width * writer.grid.height * writer.grid.cell**2
     reach = to_rasters.points_reach_m(options, writer.grid.cell)
     edge = block_edge(mesh_options.density * mesh.area, area, reach, step)
-    runs = list[Run]()
+    block_parts = list[BlockPart]()
     with disk_errors(writer.out):
         for part in sample(mesh, mesh_options.density, mesh_options.seed):
             easting, northing, height = (
@@ -197,8 +197,8 @@ def _sample_points(
             )
             records = np.zeros(len(part), RECORD)
             records["height"] = height
-            runs += append(writer.scratch / "points", edge, easting, northing, records)
-    return BucketedPoints(PointBuckets.of(edge, runs), mesh.bounds, (), (), 0)
+            block_parts += append(writer.scratch / "points", edge, easting, northing, records)
+    return BucketedPoints(PointBuckets.of(edge, block_parts), mesh.bounds, (), (), 0)
 
 
 def _draw_photo(writer: RasterWriter, mesh: TexturedMesh) -> None:

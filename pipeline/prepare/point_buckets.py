@@ -65,7 +65,7 @@ def block_edge(points: float, area: float, reach_m: float, step: float) -> float
 
 
 @dataclass(frozen=True)
-class Run:
+class BlockPart:
     """Points of one block that lie side by side in a file."""
 
     block: BlockIndex
@@ -87,25 +87,25 @@ class PointBuckets:
 
     edge: float
     """Edge of a block (m)."""
-    runs: Mapping[BlockIndex, Sequence[Run]] = field(default_factory=dict)
+    parts: Mapping[BlockIndex, Sequence[BlockPart]] = field(default_factory=dict)
     """Where the points of each block are; blocks without points are left out."""
 
     @classmethod
-    def of(cls, edge: float, runs: Iterable[Run]) -> PointBuckets:
-        """Return the buckets with the points of some runs."""
-        by_block: dict[BlockIndex, list[Run]] = {}
-        for run in runs:
-            by_block.setdefault(run.block, []).append(run)
+    def of(cls, edge: float, parts: Iterable[BlockPart]) -> PointBuckets:
+        """Return the buckets with the points of some parts."""
+        by_block: dict[BlockIndex, list[BlockPart]] = {}
+        for part in parts:
+            by_block.setdefault(part.block, []).append(part)
         return cls(edge, by_block)
 
     def around(self, grid: Grid, reach_m: float) -> PointBuckets:
         """Return only the blocks that overlap a grid and a rim around it: a worker needs no others."""
         near = self.overlapping(grid, reach_m)
-        return PointBuckets(self.edge, {index: self.runs[index] for index in near if index in self.runs})
+        return PointBuckets(self.edge, {index: self.parts[index] for index in near if index in self.parts})
 
     def remove(self) -> None:
         """Remove all files."""
-        for path in {run.path for runs in self.runs.values() for run in runs}:
+        for path in {part.path for parts in self.parts.values() for part in parts}:
             path.unlink()
 
     def share(self, index: BlockIndex, bounds: Bounds) -> float:
@@ -117,12 +117,12 @@ class PointBuckets:
 
     def first_point(self, index: BlockIndex) -> tuple[float, float]:
         """Return easting and northing (m) of a point of a block."""
-        ((east, north, *_),), (x, y) = self.runs[index][0].read(1), _corner(index, self.edge)
+        ((east, north, *_),), (x, y) = self.parts[index][0].read(1), _corner(index, self.edge)
         return (int(east) + x) / PER_METRE, (int(north) + y) / PER_METRE
 
     def count(self, index: BlockIndex) -> int:
         """Return the number of points of a block."""
-        return sum(run.count for run in self.runs.get(index, ()))
+        return sum(part.count for part in self.parts.get(index, ()))
 
     def overlapping(self, grid: Grid, reach_m: float = 0) -> list[BlockIndex]:
         """Return the blocks that overlap a grid and a rim around it, with or without points."""
@@ -138,8 +138,8 @@ class PointBuckets:
         keys, rest = [np.zeros(0, np.int64)], [np.zeros((0, 2), np.int32)]
         for index in self.overlapping(grid, reach_m):
             x, y = _corner(index, self.edge)
-            for run in self.runs.get(index, ()):
-                inside = _inside(run.read(), west - x, south - y, east - x, north - y)
+            for part in self.parts.get(index, ()):
+                inside = _inside(part.read(), west - x, south - y, east - x, north - y)
                 keys.append(inside[0])
                 rest.append(inside[1])
         plan, words = np.concatenate(keys), np.concatenate(rest)
@@ -147,7 +147,9 @@ class PointBuckets:
         return Points(*columns[:4], colour=columns[4] if with_colours else None)
 
 
-def append(path: Path, edge: float, east: Integers, north: Integers, records: NDArray[np.void]) -> list[Run]:
+def append(
+    path: Path, edge: float, east: Integers, north: Integers, records: NDArray[np.void]
+) -> list[BlockPart]:
     """Add points, ``(n,)``, with coordinates in stored units, to a file; return where they are."""
     side = edge * PER_METRE
     west, south = math.floor(east.min() / side), math.ceil(north.min() / side) - 1
@@ -157,14 +159,14 @@ def append(path: Path, edge: float, east: Integers, north: Integers, records: ND
     order = np.argsort(block.astype(np.min_scalar_type(int(block.max()))), kind="stable")
     ends = np.flatnonzero(np.diff(block[order])) + 1
     words = records.view("<i4").reshape(-1, WORDS)
-    runs = []
+    parts = []
     with path.open("ab") as file:
         for members in np.split(order, ends):
             row, col = divmod(int(block[members[0]]), width)
             index = west + col, south + row
-            runs.append(Run(index, path, file.tell() // RECORD.itemsize, members.size))
+            parts.append(BlockPart(index, path, file.tell() // RECORD.itemsize, members.size))
             file.write(_relative(words, east, north, members, *_corner(index, edge)).tobytes())
-    return runs
+    return parts
 
 
 def _corner(index: BlockIndex, edge: float) -> tuple[int, int]:

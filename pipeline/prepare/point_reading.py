@@ -26,9 +26,9 @@ from flexroad.pipeline.prepare.point_buckets import (
     RECORD,
     WORDS,
     BlockIndex,
+    BlockPart,
     Integers,
     PointBuckets,
-    Run,
     Words,
     append,
 )
@@ -60,7 +60,7 @@ class BucketedPoints:
     @property
     def occupied(self) -> frozenset[BlockIndex]:
         """The blocks with points."""
-        return frozenset(self.buckets.runs)
+        return frozenset(self.buckets.parts)
 
     @property
     def points(self) -> int:
@@ -90,7 +90,7 @@ class _Part:
     """What a job has read."""
 
     job: _Job
-    runs: list[Run]
+    block_parts: list[BlockPart]
     outermost: Integers
     """Easting and northing of the western-, southern-, eastern- and northernmost point, ``(2, 4)``, in stored
     units; ``(2, 0)`` without points."""
@@ -138,7 +138,7 @@ def bucket_points(
     bounds: Bounds | None = None
     for part in executor.map(_read, _jobs(clouds, frame, folder, edge, log), _fail):
         parts.append(part)
-        if part.runs:
+        if part.block_parts:
             plan = part.outermost / PER_METRE
             check_extent(str(part.job.cloud.path), plan, bounds)
             bounds = _joined(plan, bounds)
@@ -150,7 +150,7 @@ def bucket_points(
         pass
     dates = [_span(part.dates for part in of_file) for of_file in of_files]
     return BucketedPoints(
-        PointBuckets.of(edge, (run for part in parts for run in part.runs)),
+        PointBuckets.of(edge, (own for part in parts for own in part.block_parts)),
         bounds,
         tuple(np.sum([part.kinds for part in of_file], axis=0) for of_file in of_files),
         tuple(any(part.shift is not None for part in of_file) for of_file in of_files),
@@ -194,7 +194,7 @@ def _span(dates: Iterable[Dates | None]) -> Dates | None:
 
 def _read(job: _Job) -> _Part:
     path, shift = job.cloud.path, job.shift
-    runs, outermost = list[Run](), np.zeros((2, 0), np.int64)
+    block_parts, outermost = list[BlockPart](), np.zeros((2, 0), np.int64)
     kinds, out_of_range, dates = np.zeros(256, np.int64), 0, list[Dates | None]()
     with disk_errors(job.target.parent.parent):
         # A worker that died may have written a part of it.
@@ -214,8 +214,8 @@ def _read(job: _Job) -> _Part:
         outermost = _outermost(np.concatenate([outermost, plan], axis=1))
         kinds += np.bincount(records["kind"], minlength=256)
         with disk_errors(job.target.parent.parent):
-            runs += append(job.target, job.edge, plan[0], plan[1], records)
-    return _Part(job, runs, outermost, kinds, out_of_range, _span(dates), shift)
+            block_parts += append(job.target, job.edge, plan[0], plan[1], records)
+    return _Part(job, block_parts, outermost, kinds, out_of_range, _span(dates), shift)
 
 
 def _outermost(plan: Integers) -> Integers:
