@@ -71,8 +71,8 @@ def peak_mb() -> float:
 
 def _reset_peak() -> None:
     # Only Linux can reset the peak.
-    with contextlib.suppress(OSError), (PROC / "clear_refs").open("wb", buffering=0) as file:
-        file.write(b"5")
+    with contextlib.suppress(OSError):
+        (PROC / "clear_refs").write_text("5")
 
 
 class StageError(Exception):
