@@ -41,7 +41,7 @@ from flexroad.pipeline.store.codec import HEADER
 from flexroad.pipeline.store.database import NAME as DATABASE
 from flexroad.pipeline.store.records import DONE, from_item
 from flexroad.pipeline.worker.tile import TileJob, TileResult, marker_stat
-from flexroad.tasks.io.archive import LEVEL, npz
+from flexroad.tasks.io.archive import npz
 from flexroad.tasks.synthetic import SceneOptions, make_scene
 
 TILES = 1000
@@ -195,7 +195,7 @@ def separated(stored: bytes) -> tuple[bytes, Any]:
 def joined(arrays: bytes, header: Any) -> bytes:
     """Return a result as the store writes it, from an archive of arrays and a header."""
     buffer = io.BytesIO(arrays)
-    archive = zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED, compresslevel=LEVEL)
+    archive = zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED)
     with archive, archive.open(f"{HEADER}.npy", "w") as entry:
         np.lib.format.write_array(entry, np.frombuffer(json.dumps(header).encode(), np.uint8))
     payload = buffer.getvalue()
