@@ -5,8 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from tests import changed
 from tests.changed import AREAS, EVERYWHERE, ROOT, changed_files, is_due
-from tests.conftest import skip_unchanged
+from tests.conftest import pytest_terminal_summary, skip_unchanged
 
 TEST = "tests/pipeline/run/test_kill.py"
 
@@ -80,6 +81,22 @@ def test_only_soak_tests_of_unchanged_areas_are_skipped():
     items = [Item(area=area, skipped=False) for area in ("runs", "pages", None)]
     skip_unchanged(items, ["viewer/page.js"])
     assert [item.skipped for item in items] == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("status", "process", "recorded"),
+    [(0, {}, True), (1, {}, False), (0, {"workerinput": {}}, False)],
+    ids=["passed", "failed", "parallel process"],
+)
+def test_commit_is_recorded_once_if_all_processes_passed(monkeypatch, status, process, recorded):
+    lines, calls = [], []
+    monkeypatch.setattr(changed, "record", lambda: calls.append(1) or "recorded")
+    terminal = SimpleNamespace(stats={}, write_line=lines.append)
+    options = SimpleNamespace(soak="record", keyword="")
+    config = SimpleNamespace(option=options, args_source=pytest.Config.ArgsSource.TESTPATHS, **process)
+    pytest_terminal_summary(terminal, status, config)
+    assert lines == ["recorded"] * recorded
+    assert len(calls) == recorded
 
 
 def test_areas_name_what_exists():
