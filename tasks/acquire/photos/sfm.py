@@ -126,14 +126,20 @@ def colmap() -> Any:
     Raises
     ------
     TaskError
-        If it or a library that it needs is not installed; the message has the command to install it.
+        If it or a library that it needs is not installed; the message says what to install.
     """
     try:
         # It logs hundreds of lines of progress; its errors are raised here as TaskError.
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    except (ImportError, RuntimeError) as error:
-        # It raises RuntimeError if a shared library is missing, as CUDA's or libSM.so.6.
-        raise TaskError(f"photographs need pycolmap ({error.__cause__ or error}): {INSTALL}") from error
+    except ImportError as error:
+        raise TaskError(f"photographs need pycolmap: {INSTALL}") from error
+    except RuntimeError as error:
+        # As pycolmap-cuda12 without CUDA's libraries or libSM.so.6.
+        reason = error.__cause__ or error
+        raise TaskError(
+            f"pycolmap cannot be loaded ({reason}); install the library that is missing, "
+            "as by apt-get install libsm6 for libSM.so.6"
+        ) from error
     return pycolmap
 
 

@@ -210,5 +210,5 @@ def test_colmap_names_a_missing_library(tmp_path, monkeypatch):
     (tmp_path / "pycolmap.py").write_text("\n".join(lines))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pycolmap", raising=False)
-    with pytest.raises(TaskError, match=r"photographs need pycolmap \(libSM.so.6: no such file\)"):
+    with pytest.raises(TaskError, match=r"\(libSM.so.6: no such file\); install the library"):
         sfm.colmap()
