@@ -34,6 +34,7 @@ from flexroad.tasks.export.glb import Texture
 from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.meshing.aerial import Aerial
+from flexroad.tasks.metrics.mesh_distance import FIGURES
 
 Image = lazy("PIL.Image")
 
@@ -131,9 +132,10 @@ class Source:
     @property
     def mesh_distances(self) -> dict[str, float]:
         """The largest distances of the meshes from their surfaces (m), by column of metrics.parquet."""
-        tiles = [snapshot.mesh_distances for snapshot in self.snapshots]
-        names = dict.fromkeys(name for tile in tiles for name in tile)
-        return {name: max(tile[name] for tile in tiles if name in tile) for name in names}
+        known = np.fmax.reduce([snapshot.distances for snapshot in self.snapshots])
+        return {
+            name: value for name, value in zip(FIGURES, known.tolist(), strict=True) if np.isfinite(value)
+        }
 
     @property
     def place(self) -> Georeference:

@@ -7,7 +7,8 @@ is kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import blake2b
@@ -30,6 +31,7 @@ from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import DONE, MarkerStat, distances_of, from_item
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
+from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.places import Place, places
@@ -46,6 +48,7 @@ from flexroad.tasks.types import (
 
 ESTIMATES = 32
 """Number of tiles of which a process keeps the error estimates (0.6 MB each)."""
+NO_DISTANCES = (math.nan,) * len(FIGURES)
 COMPUTED_AGAIN = "it was computed again while it was exported; export again"
 
 
@@ -68,29 +71,55 @@ def open_variant(
     return run, variant
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A tile as it was when its state was checked."""
+    """A tile as it was when its state was checked; small, since an export has one of each of its tiles."""
 
     fingerprint: str
     """Fingerprint of all requested results."""
-    nodes: dict[str, str]
-    """Fingerprint of each stage of the variant whose results are read."""
+    stages: tuple[str, ...]
+    """The stages of the variant whose results are read; tiles share them."""
+    digests: bytes
+    """Their fingerprints, one after the other (`nodes`)."""
     marker: MarkerStat | None
     """Name, size and version of its marker; None if it had none."""
     files: bytes = b""
     """Hash of the sizes and times of all its files (`FileStates`); empty if they are not to be compared."""
-    mesh_distances: dict[str, float] = field(default_factory=dict)
-    """Distances of its mesh from its surface (m) by column; empty if it is of an older version."""
+    distances: tuple[float, ...] = NO_DISTANCES
+    """Distances of its mesh from its surface (m) in the order of `FIGURES`; NaN where it has none."""
 
     @classmethod
     def of(cls, status: TileStatus, variant: str, files: bytes = b"") -> Snapshot:
         """Return that of a tile whose state has just been checked."""
         graph, record = status.graph, status.last_record
+        nodes = _kept(graph.variants[variant])
         if record is None:
-            return cls(graph.fingerprint, graph.variants[variant], None, files)
+            return cls(graph.fingerprint, *nodes, None, files)
         own = next((distances_of(row) for row in record.rows if row["variant"] == variant), {})
-        return cls(graph.fingerprint, graph.variants[variant], record.marker, files, own)
+        distances = tuple(own.get(name, math.nan) for name in FIGURES)
+        return cls(graph.fingerprint, *nodes, record.marker, files, distances)
+
+    @property
+    def nodes(self) -> dict[str, str]:
+        """Fingerprint of each stage."""
+        size = len(self.digests) // len(self.stages)
+        parts = (self.digests[start : start + size].hex() for start in range(0, len(self.digests), size))
+        return dict(zip(self.stages, parts, strict=True))
+
+    def in_variant(self, nodes: Mapping[str, str]) -> Snapshot:
+        """Return that of another variant, by the fingerprints of its stages."""
+        stages, digests = _kept(nodes)
+        return replace(self, stages=stages, digests=digests)
+
+
+def _kept(nodes: Mapping[str, str]) -> tuple[tuple[str, ...], bytes]:
+    """Return stages, of which there is one tuple for all tiles, and the bytes of their fingerprints."""
+    return _shared(tuple(nodes)), bytes.fromhex("".join(nodes.values()))
+
+
+@lru_cache(maxsize=16)
+def _shared(stages: tuple[str, ...]) -> tuple[str, ...]:
+    return stages
 
 
 class FileStates:
@@ -211,7 +240,7 @@ class FinishedTile:
 
     def in_variant(self, variant: str) -> FinishedTile:
         """Return the tile in another variant; what both have in common is read or computed once."""
-        snapshot = replace(self.snapshot, nodes=self.graph.variants[variant])
+        snapshot = self.snapshot.in_variant(self.graph.variants[variant])
         return replace(self, variant=variant, snapshot=snapshot, evaluator=self._evaluator)
 
     @property

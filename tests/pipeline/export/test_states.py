@@ -2,6 +2,7 @@
 
 import os
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
@@ -39,6 +40,14 @@ def test_results_are_those_of_the_tile_graph(made_city):
     for tile in select(made_city.path).finished():
         assert tile.graph.variants["flexroad"] == tile.snapshot.nodes
         assert tile.graph.fingerprint == tile.snapshot.fingerprint
+
+
+def test_mesh_distances_are_the_largest_of_the_tiles_that_have_them(made_city):
+    chosen = select(made_city.path, made_city.done)
+    nan = float("nan")
+    pairs = zip(chosen.snapshots, [(0.01, nan, nan, nan), (0.02, 0.5, nan, nan)], strict=True)
+    few = replace(chosen, snapshots=tuple(replace(one, distances=values) for one, values in pairs))
+    assert few.mesh_distances == {"mesh_p95_road_m": 0.02, "mesh_max_road_m": 0.5}
 
 
 def test_tile_whose_source_changed_is_no_longer_finished(own_city):
