@@ -8,7 +8,7 @@ is kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import blake2b
@@ -24,6 +24,7 @@ from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.storage.paths import Location, parse_location, read, stat
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing, product_layers
+from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Folders, TileStatus, peek_statuses
 from flexroad.pipeline.store import checked_json
@@ -49,6 +50,7 @@ from flexroad.tasks.types import (
 ESTIMATES = 32
 """Number of tiles of which a process keeps the error estimates (0.6 MB each)."""
 NO_DISTANCES = (math.nan,) * len(FIGURES)
+"""Distances of a mesh that has none, or is of an older version (m)."""
 COMPUTED_AGAIN = "it was computed again while it was exported; export again"
 
 
@@ -77,10 +79,8 @@ class Snapshot:
 
     fingerprint: str
     """Fingerprint of all requested results."""
-    stages: tuple[str, ...]
-    """The stages of the variant whose results are read; tiles share them."""
     digests: bytes
-    """Their fingerprints, one after the other (`nodes`)."""
+    """Fingerprints of the stages of the variant whose results are read, one after the other (`nodes`)."""
     marker: MarkerStat | None
     """Name, size and version of its marker; None if it had none."""
     files: bytes = b""
@@ -92,34 +92,22 @@ class Snapshot:
     def of(cls, status: TileStatus, variant: str, files: bytes = b"") -> Snapshot:
         """Return that of a tile whose state has just been checked."""
         graph, record = status.graph, status.last_record
-        nodes = _kept(graph.variants[variant])
+        digests = _digests(graph, variant)
         if record is None:
-            return cls(graph.fingerprint, *nodes, None, files)
+            return cls(graph.fingerprint, digests, None, files)
         own = next((distances_of(row) for row in record.rows if row["variant"] == variant), {})
         distances = tuple(own.get(name, math.nan) for name in FIGURES)
-        return cls(graph.fingerprint, *nodes, record.marker, files, distances)
+        return cls(graph.fingerprint, digests, record.marker, files, distances)
 
     @property
     def nodes(self) -> dict[str, str]:
         """Fingerprint of each stage."""
-        size = len(self.digests) // len(self.stages)
-        parts = (self.digests[start : start + size].hex() for start in range(0, len(self.digests), size))
-        return dict(zip(self.stages, parts, strict=True))
-
-    def in_variant(self, nodes: Mapping[str, str]) -> Snapshot:
-        """Return that of another variant, by the fingerprints of its stages."""
-        stages, digests = _kept(nodes)
-        return replace(self, stages=stages, digests=digests)
+        names, size = self.digests.hex(), 2 * len(self.digests) // len(STAGE_NAMES)
+        return {stage: names[size * i : size * (i + 1)] for i, stage in enumerate(STAGE_NAMES)}
 
 
-def _kept(nodes: Mapping[str, str]) -> tuple[tuple[str, ...], bytes]:
-    """Return stages, of which there is one tuple for all tiles, and the bytes of their fingerprints."""
-    return _shared(tuple(nodes)), bytes.fromhex("".join(nodes.values()))
-
-
-@lru_cache(maxsize=16)
-def _shared(stages: tuple[str, ...]) -> tuple[str, ...]:
-    return stages
+def _digests(graph: TileGraph, variant: str) -> bytes:
+    return bytes.fromhex("".join(node.fingerprint for node in graph.chain(variant)))
 
 
 class FileStates:
@@ -240,7 +228,7 @@ class FinishedTile:
 
     def in_variant(self, variant: str) -> FinishedTile:
         """Return the tile in another variant; what both have in common is read or computed once."""
-        snapshot = self.snapshot.in_variant(self.graph.variants[variant])
+        snapshot = replace(self.snapshot, digests=_digests(self.graph, variant))
         return replace(self, variant=variant, snapshot=snapshot, evaluator=self._evaluator)
 
     @property
