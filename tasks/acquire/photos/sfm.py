@@ -132,7 +132,7 @@ def colmap() -> Any:
         # It logs hundreds of lines of progress; its errors are raised here as TaskError.
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     except ImportError as error:
-        raise TaskError(f"photographs need pycolmap: {INSTALL}") from error
+        raise TaskError(f"photographs need pycolmap ({error}): {INSTALL}") from error
     except RuntimeError as error:
         # As pycolmap-cuda12 without CUDA's libraries or libSM.so.6.
         reason = error.__cause__ or error
