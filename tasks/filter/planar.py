@@ -34,7 +34,7 @@ from flexroad.tasks.roads.union_find import (
 )
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
-VERSION = 3
+VERSION = 4
 
 REACH_M = 4.0
 """Distance up to which a cell is compared with ground cells around it (m)."""
@@ -146,13 +146,16 @@ def _clusters_of(data: TileData, road: RoadMask, options: Options, near: Slices)
     """Return the clusters of one level."""
     cell, theta = data.grid.cell, options.theta_z_m
     points = road.mask & np.isfinite(data.dsm)
-    patches = flat_patches(data.dsm, points, cell, options.roughness_m, options.bend)
+    patches = flat_patches(data.dsm, points, cell, options.roughness_m, options.bend, data.dtm, theta)
     clusters = _clusters(data.dsm, patches, options.theta_xy_m / cell, theta)
     ground = _on_ground(data, clusters, options)
     reach = max(1, math.floor(REACH_M / cell + 1e-9))
-    consistency = ground_consistency(data.dsm, data.dtm, ground, points & ~ground, reach, theta)
+    # The plane of a foot goes on up the object's side.
+    climbing = patches.climbs & (np.abs(data.dsm - data.dtm) > theta)
+    others = points & ~ground & ~climbing
+    consistency = ground_consistency(data.dsm, data.dtm, ground, others, reach, theta)
     kept = ground | (consistency == CONSISTENT)
-    alone = points & ~ground & (consistency == NO_NEIGHBOURS)
+    alone = others & (consistency == NO_NEIGHBOURS)
     kept[alone] = np.abs(data.dsm[alone] - data.dtm[alone]) <= theta
     labels = _labels(data.dsm, kept, patches, cell, options)
     dtm_invalid = invalid_dtm(data, road, labels > 0, near)

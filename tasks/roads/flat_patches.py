@@ -15,6 +15,8 @@ PATCH_M = 3.0
 """Side of a patch (m); at least three cells."""
 STREET_M = 5.0
 """Half side of the square around a patch over which the street's slope is averaged (m)."""
+CLIMB = 0.15
+"""Steepest road off the ground (m per m): ramps are built with up to 15%, and heaps lie at 50% and more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +29,19 @@ class Patches:
     """Slope of the street along rows and columns at each centre, ``(H, W, 2)``, m per cell; 0 elsewhere."""
     reach: int
     """Number of cells from a centre to the edge of its patch."""
+    climbs: Bools
+    """Centres of the patches that were left out because they climb an object, ``(H, W)``."""
 
 
-def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float, bend: float) -> Patches:
+def flat_patches(
+    heights: Floats,
+    points: Bools,
+    cell: float,
+    roughness_m: float,
+    bend: float,
+    ground: Floats | None = None,
+    off_m: float = 0.0,
+) -> Patches:
     """Find the flat patches.
 
     A patch is flat if the residuals to its least-squares plane have a root mean square (over the degrees of
@@ -49,12 +61,22 @@ def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float
         Largest root mean square of a patch's residuals (m).
     bend : float
         Largest difference of slope (m per m).
+    ground : (H, W) array, optional
+        Terrain model (m), NaN where unknown. A patch with a cell more than ``off_m`` above or below it is
+        left out if its slope, and its slope relative to the terrain's, exceed `CLIMB`: it climbs an object.
+    off_m : float
+        Height difference to the ground (m).
     """
     reach = max(1, math.floor((PATCH_M / cell - 1) / 2 + 1e-9))
     slopes, smooth = _planes(heights, points, reach, roughness_m**2)
+    climbs = np.zeros_like(smooth)
+    if ground is not None:
+        climbs = _climbs(slopes, smooth, heights, ground, reach, off_m, (CLIMB * cell) ** 2)
+        smooth &= ~climbs
+        slopes[climbs] = 0.0
     around = max(1, math.floor(STREET_M / cell + 1e-9))
     centres = _along_street(slopes, smooth, around, (bend * cell) ** 2)
-    return Patches(centres, slopes, reach)
+    return Patches(centres, slopes, reach, climbs)
 
 
 @compiled()
@@ -85,6 +107,33 @@ def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple
                 if smooth[r, c]:
                     slopes[r, c, 0], slopes[r, c, 1] = rz / spread, cz / spread
     return slopes, smooth
+
+
+@compiled()
+def _climbs(
+    slopes: Floats, smooth: Bools, heights: Floats, ground: Floats, reach: int, off: float, largest: float
+) -> Bools:
+    """Return the smooth patches with a cell off the ground that are steep, in themselves and relative to it.
+
+    A flat deck is steep relative to the bank below it, and a street in a hill is steep in itself.
+    """
+    rows, cols = smooth.shape
+    spread = (2 * reach + 1) ** 2 * (reach * (reach + 1) / 3)
+    climbs = np.zeros((rows, cols), np.bool_)
+    for r in range(rows):
+        for c in range(cols):
+            down, across = slopes[r, c, 0], slopes[r, c, 1]
+            if not smooth[r, c] or down * down + across * across <= largest:
+                continue
+            away = False
+            for i in range(-reach, reach + 1):
+                for j in range(-reach, reach + 1):
+                    under = ground[r + i, c + j]
+                    away = away or abs(heights[r + i, c + j] - under) > off
+                    down, across = down - i * under / spread, across - j * under / spread
+            # False where the ground is unknown.
+            climbs[r, c] = away and down * down + across * across > largest
+    return climbs
 
 
 @compiled()

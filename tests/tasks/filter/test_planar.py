@@ -42,11 +42,11 @@ def clusters(mask, dsm, dtm, options=Options(), cell=1.0):  # noqa: B008 (frozen
     return ecsrc(data, RoadMask(grid, grid, mask, np.zeros_like(mask)), options)
 
 
-def street(slope=(0.0, 0.0), shape=(40, 120), seed=0):
+def street(slope=(0.0, 0.0), shape=(40, 120), seed=0, noise_m=NOISE_M):
     """Return mask, DSM with noise and DTM of a street 8 m wide along the middle rows."""
     row, col = np.indices(shape)
     ground = 150 + slope[0] * row + slope[1] * col
-    noise = NOISE_M * np.random.default_rng(seed).standard_normal(shape)
+    noise = noise_m * np.random.default_rng(seed).standard_normal(shape)
     return np.abs(row - shape[0] // 2) < 4, ground + noise, ground
 
 
@@ -145,6 +145,48 @@ def test_planar_roof_is_dropped_and_long_viaduct_kept():
     assert result[mask & (dsm < 152)].all()
     high, dsm, dtm = street(shape=(40, 200))
     np.testing.assert_array_equal(kept(high, dsm, dtm - 8), high)
+
+
+@pytest.mark.parametrize("shape", ["cone", "flat top", "half cosine"])
+@pytest.mark.parametrize("side", [0.35, 0.5, 0.8])
+def test_planar_heap_on_car_park_is_dropped_but_for_its_foot(shape, side):
+    """A heap of 6 m is as smooth as a road. Its foot ends where it is steeper than 15%."""
+    _, dsm, dtm = street(shape=(120, 120), noise_m=0.03)
+    away = np.hypot(*(np.indices(dsm.shape) - 59.7))
+    up, foot = np.clip(6 - side * (away - 6 * (shape == "flat top")), 0, 6), 0.0
+    if shape == "half cosine":
+        turn = np.clip(side / 3 * away, 0, np.pi)
+        up, foot = 3 * (1 + np.cos(turn)), 3 * (1 - np.cos(np.arcsin(0.15 / side)))
+    result = kept(np.ones_like(dsm, bool), dsm + up, dtm)
+    assert up[result].max() < foot + 0.5
+    assert result[up < 0.05].all()
+
+
+@pytest.mark.parametrize("slope", [0, 0.05])
+def test_planar_tent_is_dropped(slope):
+    _, dsm, dtm = street((0, slope), (60, 90))
+    up = np.clip(6 - 0.5 * np.hypot(*((np.indices(dsm.shape).T - [30, 45]) * [1, 0.5]).T), 0, None)
+    result = kept(np.ones_like(dsm, bool), dsm + up, dtm)
+    assert not result[up > 0.7].any()
+    assert result[up < 0.05].all()
+
+
+@pytest.mark.parametrize("grade", [0.06, 0.1, 0.14])
+@pytest.mark.parametrize("dtm_has_ramps", [True, False])
+def test_planar_deck_on_ramps_is_kept(grade, dtm_has_ramps):
+    mask, dsm, dtm = street(shape=(40, 280))
+    away = np.abs(np.arange(280) - 139.5)
+    rise = np.broadcast_to(np.clip(6 - grade * np.clip(away - 25, 0, None), 0, None), dsm.shape)
+    dtm = dtm + np.where(dtm_has_ramps & (away > 35), rise, 0)
+    np.testing.assert_array_equal(kept(mask, dsm + rise, dtm), mask)
+
+
+@pytest.mark.parametrize("grade", [0.0, 0.1, 0.25])
+def test_planar_street_with_dtm_too_low_is_kept(grade):
+    """Neither a steep street with a DTM that is too low, nor a level deck above steep banks, is an object."""
+    mask, dsm, dtm = street((0, grade))
+    dtm[:, 40:70] -= 1.0
+    np.testing.assert_array_equal(kept(mask, dsm, dtm), mask)
 
 
 def test_planar_wrong_dtm_keeps_street():
@@ -310,7 +352,7 @@ def test_planar_benchmark_tile_reaches_precision_and_recall(under):
 def test_planar_output_is_pinned_to_version():
     labels = clusters(*random_crossing(7)).labels
     digest = hashlib.sha256(labels.tobytes()).hexdigest()[:16]
-    assert (VERSION, np.bincount(labels.ravel()).tolist(), digest) == (3, [7164, 936], "bb5fe3cd9d3c165b")
+    assert (VERSION, np.bincount(labels.ravel()).tolist(), digest) == (4, [7164, 936], "bb5fe3cd9d3c165b")
 
 
 def test_options_out_of_bounds_are_refused():
