@@ -18,7 +18,7 @@ HEAD = """# Options
 
 The options of a configuration with their own defaults (`extends: defaults`), bounds and meaning. `flexroad
 config template` prints the values of `production`, `flexroad config show NAME` those of a configuration,
-`flexroad config schema` a schema for editors. `python -m tests.options_page` writes this page.
+`flexroad config schema` a schema for editors.
 """
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 

@@ -210,7 +210,7 @@ def _without_crg(summary: Mapping[str, Any]) -> str:
         return ""
     errors = [
         "{} on average, at most {}".format(
-            *(length_text(summary[f"{name}_{of}_mm"]) for of in ("mean", "max"))
+            *(length_text(summary[f"{name}_{of}_mm"] / 1000) for of in ("mean", "max"))
         )
         for name in ("profiles", "elevation")
     ]

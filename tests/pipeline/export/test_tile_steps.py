@@ -98,7 +98,10 @@ def test_production_carries_a_road_over_the_same_ground(tmp_path, flexroad):
     run = level_tiles(tmp_path / "survey", "production", 100.0, 100.08, 102.0)
     roads = streets(tmp_path, [(10, 10), (170, 20)])
     flexroad("export", run, "--format", FORMATS, "--roads", roads, "-o", tmp_path / "out").expected(0)
-    assert figures(tmp_path / "out")[0] == pytest.approx([0], abs=0.001)
+    steps, entries = figures(tmp_path / "out")
+    assert steps == pytest.approx([0], abs=0.001)
+    error = entries["xodr"]["profiles_max_mm"]
+    assert f"on average, at most {error:.0f} mm, without OpenCRG" in entries["xodr"]["summary"]
 
 
 def test_lift_onto_tiles_apart_ends_with_1_and_says_by_how_much(tmp_path, flexroad):
