@@ -133,6 +133,7 @@ def _cut(data: TileData, grid: Grid) -> TileData:
         road_height=None if data.road_height is None else data.road_height[part],
         offset_dsm=data.offset_dsm,
         road_mask=None if data.road_mask is None else data.road_mask[part],
+        roads=data.roads,
         decks=None if data.decks is None else data.decks[part],
     )
 

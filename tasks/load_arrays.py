@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,16 +14,18 @@ from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_project
 from flexroad.catalog.crs_checks import require_scale
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
+from flexroad.catalog.headers.mask_values import has_fractions, values_note
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.dsm_and_dtm import below_ground_note
 from flexroad.tasks.io.height_offset import offset_note
-from flexroad.tasks.io.height_units import UNITS, absurd_note, remove_absurd
+from flexroad.tasks.io.height_units import UNITS, absurd_note, remove_absurd, smaller_unit_fault
 from flexroad.tasks.io.raster import RasterWindow, misalignment, resample_to
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.load import Options
-from flexroad.tasks.types import Floats, TileData
+from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 rioxarray = lazy("rioxarray")
 
@@ -34,54 +38,66 @@ TILE_ID = "arrays"
 """The tile id of data that come from no catalog."""
 WITHOUT_ROAD = (
     "road_mask has no road cell on the grid of the dsm, so the surface is that of the terrain; "
-    "a road cell is True or not 0, for example landcover == 1"
+    "a road cell is True, not 0, or one of road_values"
 )
 """Note on a mask without road cells."""
 
 
-def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, options: Options) -> TileData:
+def load_arrays(
+    dsm: xr.DataArray,
+    dtm: xr.DataArray,
+    road_mask: xr.DataArray | Source,
+    options: Options,
+    road_values: Sequence[int] = (),
+) -> TileData:
     """Return the data of one tile, whose core is the grid of the DSM.
 
     Parameters
     ----------
     dsm, dtm : xarray.DataArray, (H, W)
         Heights (m). NaN and the array's nodata value mean unknown.
-    road_mask : xarray.DataArray, (H, W)
-        Road where True or not 0.
+    road_mask : xarray.DataArray, (H, W), or Source
+        Road where True or not 0, or roads as vectors.
     options : Options
         The halo is NaN where the DTM and the mask do not reach beyond the DSM.
+    road_values : sequence of int
+        Values of the mask that mean road; empty: every value but 0 and nodata.
 
     Returns
     -------
     TileData
         The DTM and the mask are copied where their cells coincide with those of the DSM. Otherwise they are
-        resampled (heights bilinearly, the mask to the nearest cell), with a note. A mask without road cells
-        gives a note, too.
+        resampled (heights bilinearly, the mask to the nearest cell), with a note. A mask without road cells,
+        or whose values do not fit those that mean road, gives a note, too.
 
     Raises
     ------
     TaskError
         If an array has no CRS, is in degrees or feet, is rotated, has pixels that are not square or more
-        than two dimensions; if the CRS of two arrays differ; if there are too few heights.
+        than two dimensions; if the CRS of two arrays differ; if there are too few heights, or none in the
+        range of heights; if values of the mask are fractions.
     """
     if options.road_height == "layer":
         raise TaskError("load.road_height is layer, but arrays have none; set it to auto")
-    patches = {
-        name: _patch(name, array) for name, array in (("dsm", dsm), ("dtm", dtm), ("road_mask", road_mask))
-    }
+    patches = {"dsm": _patch("dsm", dsm), "dtm": _patch("dtm", dtm)}
+    roads = road_mask if isinstance(road_mask, Source) else None
+    if not isinstance(road_mask, Source):
+        patches["road_mask"] = _patch("road_mask", road_mask)
     core = _grid(patches["dsm"])
     _check_scale(core)
     grid = core.buffered(options.halo_m)
     notes: list[str | None] = [_absurd(patches[name]) for name in ("dsm", "dtm")]
-    notes += [_misfit(patches[name], core) for name in ("dtm", "road_mask")]
+    notes += [_misfit(patch, core) for name, patch in patches.items() if name != "dsm"]
     heights = {name: _onto(patches[name], grid, Resampling.bilinear) for name in ("dsm", "dtm")}
     window = grid.window(core)
     _check_valid("dsm", heights["dsm"][window], options.min_valid)
     _check_valid("dtm", heights["dtm"][window], 0.0)
-    road = np.nan_to_num(_onto(patches["road_mask"], grid, Resampling.nearest)) != 0
     models = heights["dsm"], heights["dtm"]
     notes += [offset_note(*models) or below_ground_note(*models)]
-    notes += [] if road[window].any() else [WITHOUT_ROAD]
+    road = None
+    if not roads:
+        road, note = _road(patches["road_mask"], grid, road_values)
+        notes += [note or (None if road[window].any() else WITHOUT_ROAD)]
     return TileData(
         TILE_ID,
         grid,
@@ -89,6 +105,7 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
         heights["dsm"],
         heights["dtm"],
         road,
+        roads=roads,
         notes=tuple(filter(None, notes)),
         # Arrays declare neither date nor vertical CRS.
         offset_dsm=options.road_height == "offset" and options.offset_undeclared,
@@ -227,9 +244,34 @@ def _grid(dsm: RasterWindow) -> Grid:
 
 
 def _absurd(patch: RasterWindow) -> str:
-    """Set heights outside the valid range to NaN, as `load` does; return a note, or "" if there are none."""
+    """Set heights outside the valid range to NaN, as `load` does; return a note, or "" if there are none.
+
+    Raises
+    ------
+    TaskError
+        If there are no others.
+    """
+    given = replace(patch, values=patch.values.copy())
     count = remove_absurd(patch.values)
+    if count and np.isnan(patch.values).all():
+        low, high = np.nanmin(given.values), np.nanmax(given.values)
+        fault = smaller_unit_fault(given, "") or (
+            f" has no height in {LOWEST_M:g} to {HIGHEST_M:g} m ({low:.0f} to {high:.0f}); give metres"
+        )
+        raise TaskError(f"{patch.name}{fault}")
     return absurd_note(patch.name, count) if count else ""
+
+
+def _road(patch: RasterWindow, grid: Grid, road_values: Sequence[int]) -> tuple[Bools, str]:
+    """Return the road cells of a mask, and how its values do not fit; empty if they do."""
+    known = patch.values[~np.isnan(patch.values)]
+    values = set(np.unique(known).tolist())
+    note = values_note(values, road_values, known.size < patch.values.size, "road_values") if values else ""
+    if note and not road_values and has_fractions(values):
+        raise TaskError(f"road_mask: {note}")
+    cells = np.nan_to_num(_onto(patch, grid, Resampling.nearest))
+    road: Bools = np.isin(cells, tuple(road_values)) if road_values else cells != 0
+    return road, f"road_mask: {note}" if note else ""
 
 
 def _misfit(patch: RasterWindow, core: Grid) -> str:

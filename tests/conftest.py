@@ -22,6 +22,7 @@ settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
 
 QUICK = {
+    "extends": "defaults",
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 30},
     "variants": {
         "plane": {"fit": "plane", "sample": "corners"},

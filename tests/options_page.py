@@ -16,10 +16,9 @@ from flexroad.pipeline.config.models import Export
 PAGE = Path(__file__).parents[1] / "docs" / "options.md"
 HEAD = """# Options
 
-The options of a configuration with default, bounds and meaning, for looking up. `flexroad config
-template` prints them as YAML, `flexroad config show NAME` the values of a shipped configuration,
-`flexroad config schema` a schema for editors. `python -m tests.options_page` writes this page, and a test
-compares.
+The options of a configuration with their own defaults (`extends: defaults`), bounds and meaning. `flexroad
+config template` prints the values of `production`, `flexroad config show NAME` those of a configuration,
+`flexroad config schema` a schema for editors.
 """
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 

@@ -8,6 +8,7 @@ import pandas as pd
 from flexroad.pipeline.store.tables import read_metrics
 
 LIGHT = {
+    "extends": "defaults",
     "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
     "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
 }

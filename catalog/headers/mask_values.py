@@ -53,22 +53,42 @@ def mask_notes(root: Path, layer: str, names: Sequence[str], road_values: Sequen
         values |= found
         has_nodata |= lacks_some
         read.append(name)
-    note = _note(values, road_values, has_nodata) if values else ""
+    note = values_note(values, road_values, has_nodata, "--road-value") if values else ""
     return [f"{layer}: {note}, in the parts read of {some(read)}"] if note else []
 
 
-def _note(values: set[float], road_values: Sequence[int], has_nodata: bool) -> str:
+def values_note(values: set[float], road_values: Sequence[int], has_nodata: bool, option: str) -> str:
+    """Return how the values of a mask do not fit those that mean road; empty if they may.
+
+    Parameters
+    ----------
+    values : set of float
+        Values of its cells, at least one; nodata is none of them.
+    road_values : sequence of int
+        Values that mean road; empty: every value but 0 and nodata.
+    has_nodata : bool
+        Whether cells are nodata.
+    option : str
+        Name of the option that has ``road_values``.
+    """
     ordered = sorted(values)
     listed = ", ".join(f"{value:g}" for value in ordered[:MOST_SHOWN])
     listed += f" and {len(ordered) - MOST_SHOWN} more" if len(ordered) > MOST_SHOWN else ""
     if road_values:
         wanted = " or ".join(map(str, road_values))
-        return "" if values & set(road_values) else f"no cell has --road-value {wanted} but {listed}"
+        return "" if values & set(road_values) else f"no cell has {option} {wanted} but {listed}"
+    if has_fractions(values):
+        return f"values are {listed}, as of probabilities, and all but 0 count as road; give 0 and 1"
     if len(values - {0.0}) > 1:
-        return f"values are {listed}, and all but 0 count as road; name the roads' with --road-value"
+        return f"values are {listed}, and all but 0 count as road; name the roads' with {option}"
     if 0.0 not in values and not has_nodata:
-        return f"every cell counts as road, with the value {listed}; name the roads' with --road-value"
+        return f"every cell counts as road, with the value {listed}; name the roads' with {option}"
     return ""
+
+
+def has_fractions(values: set[float]) -> bool:
+    """Return whether values are no classes, as some are not whole."""
+    return not all(value.is_integer() for value in values)
 
 
 def _values(path: Path) -> tuple[set[float], bool]:

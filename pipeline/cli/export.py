@@ -24,6 +24,7 @@ from flexroad.pipeline.export.driver import check_formats
 from flexroad.pipeline.export.driver import export as write
 from flexroad.pipeline.export.source import Options, select
 from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.tile_steps import REMEDY
 
 app = group()
 
@@ -67,6 +68,12 @@ def export(
         ),
     ] = None,
     chosen: Options,
+    allow_steps: Annotated[
+        bool,
+        typer.Option(
+            "--allow-steps", help="End with exit code 0 although roads lie on tiles that do not meet."
+        ),
+    ] = False,
     tile: options.TileIds = None,
     bbox: options.Box = None,
     area: options.Area = None,
@@ -106,8 +113,15 @@ def export(
         except ClusterLost as error:
             echo(f"error: {error}; the same command goes on from here", err=True)
             raise typer.Exit(1) from None
+    written = {name: manifest["formats"][name] for name in names}
     for name in names:
-        _say(name, manifest["formats"][name], folder / name)
+        _say(name, written[name], folder / name)
+    faults = [f"{name}: {line}" for name in names for line in written[name].get("faults", ())]
+    for line in faults:
+        echo(f"{'note' if allow_steps else 'error'}: {line}; {REMEDY}", err=True)
+    if faults and not allow_steps:
+        echo("the files are written; --allow-steps takes them as they are", err=True)
+        raise typer.Exit(1)
 
 
 def _say(name: str, written: dict[str, Any], folder: Location) -> None:

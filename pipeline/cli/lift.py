@@ -16,6 +16,7 @@ from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.results.lift import lift as lift_file
 from flexroad.pipeline.results.points import Ground
+from flexroad.pipeline.run.tile_steps import LARGEST_M, REMEDY, length_text
 from flexroad.tasks.lift.types import Options
 
 app = group()
@@ -103,6 +104,10 @@ def lift(
             rich_help_panel=OUTPUTS,
         ),
     ] = None,
+    allow_steps: Annotated[
+        bool,
+        typer.Option("--allow-steps", help="End with exit code 0 although the tiles below do not meet."),
+    ] = False,
     variant: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Variant of the surface; default: the exported one."),
@@ -137,3 +142,10 @@ def lift(
         )
     for note in result.notes:
         echo(f"note: {note}", err=True)
+    if result.tile_step_m > LARGEST_M:
+        by = length_text(result.tile_step_m)
+        kind = "note" if allow_steps else "error"
+        echo(f"{kind}: {file}: it lies on tiles that do not meet, by up to {by}; {REMEDY}", err=True)
+    if result.tile_step_m > LARGEST_M and not allow_steps:
+        echo("the file is written; --allow-steps takes it as it is", err=True)
+        raise typer.Exit(1)

@@ -1,4 +1,7 @@
-"""Read a configuration from YAML, resolve `extends`, and validate it; one line per error."""
+"""Read a configuration from YAML, resolve `extends`, and validate it; one line per error.
+
+A file without ``extends`` extends `USUAL`. The last of a chain has ``extends: defaults``.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,8 @@ from flexroad.pipeline.config import document
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.levels import check_levels
 from flexroad.pipeline.config.methods import DEFAULTS
-from flexroad.pipeline.config.models import TAG, Config, Export, stage_models
-from flexroad.pipeline.config.settings import Setting, applied, merge
+from flexroad.pipeline.config.models import ROOT, TAG, Config, Export, stage_models
+from flexroad.pipeline.config.settings import Setting, applied, merge, texts
 from flexroad.pipeline.errors import ConfigError
 
 SPLINE = "; the solver is a method of its own: fit: {method: smoothing_spline}"
@@ -32,8 +35,10 @@ RENAMED = {
 """Option names of earlier versions and the hint for each."""
 EARLIER = {"nightly": "production"}
 """Earlier names of shipped configurations."""
-SECTIONS = ("dataset", "export", "cluster", "variants")
+SECTIONS = ("dataset", "export", "cluster", "variants", "extends")
 """Parts of a configuration that are no stages."""
+USUAL = "production"
+"""The configuration that a file without ``extends`` extends."""
 SUFFIXES = (".yaml", ".yml")
 """Endings of the files that may be extended."""
 MAX_PARENTS = 10
@@ -55,30 +60,35 @@ def shipped() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def load_config(name: str | Path, settings: Sequence[str] = ()) -> Config:
+def load_config(
+    name: str | Path, settings: Sequence[str] | Mapping[str, Any] = (), base: str = USUAL
+) -> Config:
     """Read a configuration by shipped name or by file name.
 
     Parameters
     ----------
     name : str or Path
-    settings : sequence of str
-        Options that replace those of the file: ``fit.spacing_m=5``. They are a part of the configuration's
-        name, so that no result looks like one of the file alone.
+    settings : sequence of str, or mapping
+        Options that replace those of the file: ``["fit.spacing_m=5"]`` or ``{"fit": {"spacing_m": 5}}``. They
+        are a part of the configuration's name, so that no result looks like one of the file alone.
+    base : str
+        What a file without ``extends`` extends.
 
     Raises
     ------
     ConfigError
         If no such configuration exists, or a key or value is invalid; one line per error.
     """
-    config = compose(_raw(name), str(name))
+    config = compose(_raw(name, base), str(name))
     if not settings:
         return config
-    changed = applied(config.raw, [Setting.parse(text) for text in settings])
-    return compose(changed, " ".join([str(name), *(f"--set {printable(text)}" for text in settings)]))
+    given = texts(settings)
+    changed = applied(config.raw, [Setting.parse(text) for text in given])
+    return compose(changed, " ".join([str(name), *(f"--set {printable(text)}" for text in given)]))
 
 
 def compose(raw: Mapping[str, Any], name: str) -> Config:
-    """Validate a configuration that has been read; ``name`` identifies it in error messages.
+    """Validate a configuration that extends no other; ``name`` identifies it in error messages.
 
     Raises
     ------
@@ -86,6 +96,11 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
         If a key or value is invalid; one line per error.
     """
     stages = list(stage_models())
+    raw = {"extends": ROOT, **raw}
+    if raw["extends"] != ROOT:
+        raise ConfigError(
+            f"{name}: extends: only files extend others, not {shown(raw['extends'])}; remove it"
+        )
     _reject_unknown_keys(raw, [*stages, *SECTIONS], name, "")
     variants = _mapping(raw.get("variants") or {"flexroad": {}}, name, "variants")
     base = {
@@ -119,7 +134,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
     dataset = _mapping(raw.get("dataset") or {}, name, "dataset")
     if wrong := [key for key in dataset if not isinstance(key, str)]:
         raise ConfigError(f"{name}: dataset: the key {shown(wrong[0])} is not a text; correct or remove it")
-    return Config(name=name, chains=chains, export=export, cluster=cluster, dataset=dataset, raw=dict(raw))
+    return Config(name=name, chains=chains, export=export, cluster=cluster, dataset=dataset, raw=raw)
 
 
 def read_mapping(data: bytes, name: str) -> dict[str, Any]:
@@ -133,21 +148,21 @@ def read_mapping(data: bytes, name: str) -> dict[str, Any]:
     return _mapping_of(document.parse(data, name), name)
 
 
-def _raw(name: str | Path) -> dict[str, Any]:
+def _raw(name: str | Path, base: str) -> dict[str, Any]:
     """Return the file's mapping merged over its parents."""
     path = _existing(name)
     layers, seen = [_read(path)], [path]
-    while (parent := layers[-1].pop("extends", None)) is not None:
+    while (parent := layers[-1].pop("extends", base)) != ROOT:
         path = _parent(parent, path)
         if path.resolve() in (file.resolve() for file in seen):
-            raise ConfigError(f"{path}: extends: the file extends itself; name another file or paper")
+            raise ConfigError(f"{path}: extends: the file extends itself; name another file or {USUAL}")
         if len(seen) > MAX_PARENTS:
             raise ConfigError(f"{path}: extends: more than {MAX_PARENTS} files extend each other")
         layers.append(_read(path, own=False))
         seen.append(path)
     merged = layers.pop()
     while layers:
-        merged = _extend(merged, layers.pop())
+        merged = _extend(merged, layers.pop(), str(seen[len(layers)]))
     return merged
 
 
@@ -198,7 +213,7 @@ def _read(path: Path, own: bool = True) -> dict[str, Any]:
         ) from error
     raw = _mapping_of(content, str(path))
     for key in () if own else raw:
-        if key not in ("extends", *SECTIONS, *stage_models()):
+        if key not in (*SECTIONS, *stage_models()):
             # The file may be no configuration at all: its text is not shown.
             line = content.lines.get(str(key), 1)
             raise ConfigError(
@@ -217,15 +232,19 @@ def _mapping_of(content: document.Document, name: str) -> dict[str, Any]:
     return dict(content.value)
 
 
-def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
+def _extend(parent: dict[str, Any], child: dict[str, Any], name: str) -> dict[str, Any]:
     merged = dict(parent)
     for key, value in child.items():
-        if key in ("variants", "export", "dataset"):
-            merged[key] = value
-        else:
+        if key in ("export", "cluster", *stage_models()):
+            where = f"{name}: {key}"
             # A parent without a method has the default one; another method starts from its own defaults.
-            base = merge(DEFAULTS.get(key), parent.get(key), TAG.get(key), key)
-            merged[key] = merge(base, value, TAG.get(key), key)
+            base = merge(DEFAULTS.get(key), parent.get(key), TAG.get(key), where)
+            merged[key] = merge(base, value, TAG.get(key), where)
+        elif key == "dataset":
+            # `layers` is replaced: the files of one dataset say nothing about those of another.
+            merged[key] = _mapping(parent.get(key) or {}, name, key) | _mapping(value or {}, name, key)
+        else:
+            merged[key] = value
     return merged
 
 

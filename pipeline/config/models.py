@@ -20,6 +20,8 @@ from flexroad.tasks.options import Options
 TAG = {"segment": "method", "ecsrc": "method", "fit": "method", "sample": "method", "cluster": "kind"}
 """Stage or section -> the option that a single word sets."""
 
+ROOT = "defaults"
+"""What a configuration extends whose options start from their own defaults, not from another's values."""
 
 Chain = Mapping[str, Options]
 """The options of one variant, by stage, in the paper's order."""
@@ -73,7 +75,7 @@ class Config(BaseModel):
     dataset: dict[str, Any]
     """Locations of a published dataset's files; validated and used by `catalog.sources`."""
     raw: dict[str, Any]
-    """The file with `extends` resolved, as written to the run's config.yaml."""
+    """The file with ``extends`` resolved, so that it extends `ROOT`, as written to the run's config.yaml."""
 
 
 @cache

@@ -7,9 +7,12 @@ from typing import Any
 import yaml
 
 from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.methods import DEFAULTS, HOMES, methods
-from flexroad.pipeline.config.models import Export, stage_models
+from flexroad.pipeline.config.loading import USUAL, load_config
+from flexroad.pipeline.config.methods import methods
+from flexroad.pipeline.config.models import ROOT, Export, stage_models
 from flexroad.tasks.options import Options
+
+EXTENDS = f"the configuration that this one overrides; {ROOT}: none, so that options have their own defaults"
 
 
 def schema() -> dict[str, Any]:
@@ -18,7 +21,7 @@ def schema() -> dict[str, Any]:
     override = {stage: {"anyOf": [{"type": "string"}, {"type": "object"}]} for stage in stages}
     variant = {"type": ["object", "null"], "properties": override, "additionalProperties": False}
     properties = {
-        "extends": {"type": "string", "description": "name of the configuration this one overrides"},
+        "extends": {"type": "string", "default": USUAL, "description": EXTENDS},
         "dataset": {"type": "object", "description": "a dataset's files: layers, road_values, crs"},
         **stages,
         "export": Export.model_json_schema(),
@@ -29,24 +32,24 @@ def schema() -> dict[str, Any]:
 
 
 def template() -> str:
-    """Return a configuration file with every option at its default, each with its description."""
-    lines = ["# Every option with its default. Delete what you do not change."]
-    for stage in HOMES:
-        default = DEFAULTS.get(stage, "")
-        lines += [f"{stage}:", *_option_lines(methods(stage)[default].Options)]
-        others = [name for name in methods(stage) if name != default]
+    """Return a configuration file with every option of `USUAL`, each with its description."""
+    config = load_config(USUAL)
+    (chain,) = config.chains.values()
+    lines = [f"# Every option with its value in {USUAL}. Delete what you do not change.", f"extends: {USUAL}"]
+    for stage, chosen in chain.items():
+        lines += [f"{stage}:", *_option_lines(chosen)]
+        others = [name for name in methods(stage) if name != getattr(chosen, "method", "")]
         if others:
             lines.append(f"  # other methods: {', '.join(others)}")
-    lines += ["export:", *_option_lines(Export), "cluster:", *_option_lines(Cluster)]
-    lines += ["variants:", "  flexroad: {}"]
+    lines += ["export:", *_option_lines(config.export), "cluster:", *_option_lines(config.cluster)]
+    lines += ["variants:", *(f"  {variant}: {{}}" for variant in config.chains)]
     return "\n".join(lines) + "\n"
 
 
-def _option_lines(model: type[Options]) -> list[str]:
+def _option_lines(options: Options) -> list[str]:
     lines = []
-    for key, field in model.model_fields.items():
-        value = field.get_default(call_default_factory=True)
-        text = yaml.safe_dump(_plain(value), default_flow_style=True).splitlines()[0]
+    for key, field in type(options).model_fields.items():
+        text = yaml.safe_dump(_plain(getattr(options, key)), default_flow_style=True).splitlines()[0]
         meaning = f"  # {' '.join(field.description.split())}" if field.description else ""
         lines.append(f"  {key}: {text}{meaning}")
     return lines

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import yaml
+
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config import document
 from flexroad.pipeline.config.models import TAG
@@ -46,6 +48,35 @@ class Setting:
         return len(stage) == 1 or (len(stage) == 2 and stage[1] == TAG.get(stage[0]))
 
 
+def texts(settings: Sequence[str] | Mapping[str, Any]) -> list[str]:
+    """Return settings as ``KEY=VALUE``, also those of a mapping.
+
+    Raises
+    ------
+    ConfigError
+        If a value has no text in YAML.
+    """
+    if isinstance(settings, str):
+        return [settings]
+    if not isinstance(settings, Mapping):
+        return list(settings)
+    try:
+        return [f"{key}={_flow(value)}" for key, value in settings.items()]
+    except yaml.YAMLError as error:
+        raise ConfigError(
+            f"settings {shown(settings)}: {printable(str(error.args[0]))}; give numbers, texts or lists"
+        ) from error
+
+
+def _flow(value: Any) -> str:
+    """Return a value as one line of YAML."""
+    return (
+        yaml.safe_dump(value, default_flow_style=True, width=1e9, sort_keys=False)
+        .removesuffix("...\n")
+        .strip()
+    )
+
+
 def applied(raw: Mapping[str, Any], settings: Sequence[Setting]) -> dict[str, Any]:
     """Return a configuration with changed options; equal keys take the last value.
 
@@ -72,13 +103,13 @@ def _assigned(
     mapping = tagged(options, tag, f"{where}: {printable('.'.join(parents))}")
     if rest:
         return mapping | {key: _assigned(mapping.get(key), tuple(rest), value, (*parents, key))}
-    if key == tag:
-        return merge(mapping, {key: value}, tag, where)
-    return mapping | {key: merge(mapping.get(key), value, TAG[key], where) if key in TAG else value}
+    if key == "variants" and not parents:
+        return mapping | {key: value}
+    return merge(mapping, {key: value}, tag, where)
 
 
 def merge(base: Any, override: Any, tag: str | None, where: str) -> dict[str, Any]:
-    """Merge an override into a stage's options; an override with another method replaces them.
+    """Merge an override into options, also those within options; another method replaces all.
 
     Parameters
     ----------
@@ -97,7 +128,14 @@ def merge(base: Any, override: Any, tag: str | None, where: str) -> dict[str, An
     options, changes = tagged(base, tag, where), tagged(override, tag, where)
     if tag in changes and tag in options and changes[tag] != options[tag]:
         return changes
-    return options | changes
+    return options | {key: _merged(options.get(key), key, value, where) for key, value in changes.items()}
+
+
+def _merged(base: Any, key: str, value: Any, where: str) -> Any:
+    """Return the value of one option: what it leaves out of a mapping or a stage is that of ``base``."""
+    if key in TAG or (isinstance(base, dict) and isinstance(value, dict)):
+        return merge(base, value, TAG.get(key), where)
+    return value
 
 
 def tagged(options: Any, tag: str | None, where: str) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from flexroad.pipeline.export.pieces import (
 )
 from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile, GroundTile
+from flexroad.pipeline.run.tile_steps import LARGEST_M, length_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import opencrg, opendrive
 from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
@@ -43,20 +44,23 @@ from flexroad.tasks.roads.along_line import (
     grid_error,
     height_grid,
     largest_steps,
+    on_carriageway,
     profile_error,
     profiles,
 )
 from flexroad.tasks.roads.local_frame import LocalFrame
 from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.roads.routes import Route
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats
 
-VERSION = 6
+VERSION = 7
 """Of the roads themselves: their division, lines, grids and errors."""
 INTERNAL = {"bounds", "lanes_assumed"}
 """Entries of a road's row that the report does not show."""
 REPORT = "roads.csv"
 NO_ROAD = "no road lies on the tiles"
+MOST_NAMED = 3
+"""Number of roads that a message names."""
 SHOWN_M = 10.0
 """Length of centre lines left out from which the user is told (m); the ends of routes are always a bit."""
 
@@ -117,6 +121,19 @@ class RouteUnit:
         """Return the height of the surface with steps above it, in the local frame."""
         return self._local(Ground(self.tiles).step, work)
 
+    def tile_step(self, line: ReferenceLine, v: Floats, inside: Bools, work: Work) -> float:
+        """Return the largest step between the tiles below a road (m); 0 on one tile.
+
+        Parameters
+        ----------
+        v : ndarray, (m,)
+            Distances from the line.
+        inside : ndarray, (n, m)
+            The places beside the line's points that count.
+        """
+        x, y = line.beside(v)
+        return Ground(self.tiles).largest_tile_step(*work.frame.to_run(x, y), inside, self.levels(x, y))
+
     def levels(self, x: Floats, y: Floats) -> PlaceLevels | None:
         """Return the levels of places in the local frame; None if the route is on level 0 alone."""
         return None if self._levels is None else self._levels.at(x, y)
@@ -161,8 +178,8 @@ def write_crg(
     summary = report(folder, rows, roads)
     error, steps = summary["crg_max_mm"], steps_left_out(_metres(summary["crg_steps_max_mm"]))
     surface = SMOOTH if steps else "the surface"
-    text = f"misses {surface} by at most {error:.1f} mm{steps}"
-    return with_line(summary, text if error is not None else "")
+    text = f"misses {surface} by at most {length_text(error / 1000, 1)}{steps}" if error is not None else ""
+    return with_line(summary, text)
 
 
 def write_xodr(
@@ -192,7 +209,9 @@ def _without_crg(summary: Mapping[str, Any]) -> str:
     if summary["profiles_mean_mm"] is None:
         return ""
     errors = [
-        f"{summary[f'{name}_mean_mm']:.0f} mm on average, at most {summary[f'{name}_max_mm']:.0f} mm"
+        "{} on average, at most {}".format(
+            *(length_text(summary[f"{name}_{of}_mm"] / 1000) for of in ("mean", "max"))
+        )
         for name in ("profiles", "elevation")
     ]
     steps = steps_left_out(_metres(summary["carriageway_steps_max_mm"]))
@@ -233,7 +252,7 @@ def crg_piece(unit: RouteUnit, work: Work) -> Piece:
         heights = work.vertical or "as in the run"
         comment = f"FlexRoad: {grid.line.name}\nx, y: {work.frame.proj}\nheights: {heights}"
         files[f"{road}{opencrg.NAME}"] = opencrg.encode(grid, comment)
-        rows.append(row(road, grid, height, step, profiles(grid)))
+        rows.append(row(road, grid, height, step, profiles(grid), _tile_step(unit, work, grid)))
     return Piece(files, _route_row(unit, rows, problem))
 
 
@@ -249,7 +268,7 @@ def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
         decks = structures(unit.levels_on(grid.line.x, grid.line.y), grid.line.s)
         written = opendrive.Road(str(road), grid.line, fitted, crg, decks)
         texts.append(opendrive.encode(written, work.left_hand))
-        rows.append(row(road, grid, height, step, fitted))
+        rows.append(row(road, grid, height, step, fitted, _tile_step(unit, work, grid)))
     return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, rows, problem))
 
 
@@ -265,6 +284,10 @@ def _grids(unit: RouteUnit, work: Work) -> tuple[list[tuple[HeightGrid, HeightAt
         return [], problem
     parts = lines.usable(line, height(line.x, line.y), lines.Options())
     return [(height_grid(part, height), height) for part in parts], ""
+
+
+def _tile_step(unit: RouteUnit, work: Work, grid: HeightGrid) -> float:
+    return unit.tile_step(grid.line, grid.v, on_carriageway(grid), work)
 
 
 def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
@@ -283,13 +306,17 @@ def _route_row(unit: RouteUnit, rows: list[Row], problem: str) -> Row:
     return {"route": unit.number, "roads": rows, "problem": problem}
 
 
-def row(road: int, grid: HeightGrid, height: HeightAt, step: HeightAt, fitted: Profiles) -> Row:
+def row(
+    road: int, grid: HeightGrid, height: HeightAt, step: HeightAt, fitted: Profiles, tile_step: float
+) -> Row:
     """Return a road's row of the report.
 
     Parameters
     ----------
     height, step : callable
         The surface without steps, and how much higher that with steps is, in the line's coordinates.
+    tile_step : float
+        The largest step between the tiles below its carriageway (m).
     """
     line = grid.line
     (crg_median, crg_max), (mean, most) = grid_error(grid, height), profile_error(grid, fitted)
@@ -305,6 +332,7 @@ def row(road: int, grid: HeightGrid, height: HeightAt, step: HeightAt, fitted: P
         "elevation_max_mm": level_most,
         "crg_steps_max_mm": crg_steps,
         "carriageway_steps_max_mm": carriageway_steps,
+        "tile_steps_max_mm": tile_step,
         "off_centre_line_mm": line.offset_m,
     }
     return {
@@ -356,7 +384,25 @@ def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
         "elevation_max_mm": _largest(every, "elevation_max_mm"),
         "crg_steps_max_mm": _largest(every, "crg_steps_max_mm"),
         "carriageway_steps_max_mm": _largest(every, "carriageway_steps_max_mm"),
+        "tile_steps_max_mm": _largest(every, "tile_steps_max_mm"),
+        "faults": tile_faults(every),
     }
+
+
+def tile_faults(roads: list[Row]) -> list[str]:
+    """Return a line that names the roads on tiles that do not meet; empty if all tiles do."""
+    name = "tile_steps_max_mm"
+    apart = sorted((road for road in roads if road[name] > 1000 * LARGEST_M), key=lambda road: -road[name])
+    if not apart:
+        return []
+    named = [f"{road['id']} {road['name'] or ''}".strip() for road in apart]
+    listed = ", ".join(
+        f"road {text}: {length_text(road[name] / 1000)}"
+        for text, road in zip(named[:MOST_NAMED], apart[:MOST_NAMED], strict=True)
+    )
+    more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
+    verb = "lie" if len(apart) > 1 else "lies"
+    return [f"{count(len(apart), 'road')} {verb} on tiles that do not meet ({listed}{more})"]
 
 
 def lane_notes(rows: list[Row]) -> list[str]:

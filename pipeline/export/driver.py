@@ -32,9 +32,11 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.formats import FORMATS, Format
 from flexroad.pipeline.export.source import Options, Source, check_photos
+from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, ended, untracked
+from flexroad.pipeline.run.tile_steps import REMEDY
 from flexroad.tasks.errors import TaskError
 
 SAME = ("variant", "crs", "tiles", "results")
@@ -44,6 +46,8 @@ DATUM_REMEDY = (
     "which: --vertical EPSG:N (PROJ needs its grid), --geoid FILE (.gtx or .tif), or --height-offset METRES"
 )
 MANIFEST = "export.json"
+ALONG_ROADS = ("crg", "xodr", "lines")
+"""Formats that name the roads on tiles that do not meet."""
 BEGUN = ".flexroad-export"
 """File with the formats of the folder: written first, so that an interrupted export is known, too."""
 
@@ -83,6 +87,10 @@ def export(
     for kind in chosen.values():
         if kind.check:
             kind.check(source, options)
+    apart = not has_borders(source.run.config.chains[source.variant]["fit"])
+    others = ", ".join(name for name in chosen if name not in ALONG_ROADS)
+    if apart and others and len(source.tiles) > 1:
+        notify(f"{others}: the tiles of this run do not meet, and heights have steps there; {REMEDY}")
     with held(out, source.run, chosen, notify):
         written = _earlier(out, source, options, chosen, notify)
         for name, kind in chosen.items():

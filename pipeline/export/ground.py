@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, Grid
 from flexroad.pipeline.run.finished import GroundTile, estimate
+from flexroad.pipeline.run.tile_steps import largest_tile_step
 from flexroad.tasks.levels.along_route import PlaceLevels
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
@@ -65,6 +66,35 @@ class Ground:
     def step(self, easting: Floats, northing: Floats, levels: PlaceLevels | None = None) -> Floats:
         """Return by how much the surface with steps is higher (m); the rest is as of `height`."""
         return self._first(_Patch.step, easting, northing, levels)
+
+    def largest_tile_step(
+        self, easting: Floats, northing: Floats, inside: Bools, levels: PlaceLevels | None = None
+    ) -> float:
+        """Return the largest step (m) where neighbours of a grid of points lie on two tiles; 0 if none do.
+
+        Parameters
+        ----------
+        easting, northing : ndarray, (n, m)
+            In the run's CRS (m).
+        inside : ndarray, (n, m)
+            The points that count.
+        """
+        first = np.full(easting.shape, -1)
+        for number, tile in reversed(list(enumerate(self.tiles))):
+            first[_within(tile.grid.bounds, easting, northing) & inside] = number
+        index: NDArray[np.intp] = np.arange(easting.size).reshape(easting.shape)
+        starts = np.concatenate([index[:-1].ravel(), index[:, :-1].ravel()])
+        ends = np.concatenate([index[1:].ravel(), index[:, 1:].ravel()])
+        places = np.stack([easting.ravel(), northing.ravel()])
+        flat = None if levels is None else PlaceLevels(levels.number.ravel(), levels.own.ravel())
+        return largest_tile_step(
+            places[:, starts],
+            places[:, ends],
+            first.ravel()[starts],
+            first.ravel()[ends],
+            [tile.grid.bounds for tile in self.tiles],
+            lambda tile, x, y, lines: _patch(self.tiles[tile]).height(x, y, flat and flat[starts[lines]]),
+        )
 
     def _first(
         self,

@@ -20,7 +20,9 @@ from flexroad.pipeline.export.along_roads import (
     NO_ROAD,
     RouteUnit,
     Work,
+    millimetres,
     reference_line,
+    tile_faults,
     totals,
     with_line,
     write_units,
@@ -63,8 +65,15 @@ def write_lines(
     write_whole(folder / f"{source.run.path.name}{road_lines.NAME}", key, {}, fill)
     steps = max((road["steps_max_m"] for row in rows for road in row["roads"]), default=0.0)
     left_out = steps_left_out(steps)
+    every = [road for row in rows for road in row["roads"]]
+    tile_steps = max(road["tile_steps_max_mm"] for road in every)
     return with_line(
-        {**totals(rows, roads), "steps_max_m": round(steps, 6)},
+        {
+            **totals(rows, roads),
+            "steps_max_m": round(steps, 6),
+            "tile_steps_max_mm": tile_steps,
+            "faults": tile_faults(every),
+        },
         f"along {SMOOTH}{left_out}" if left_out else "",
     )
 
@@ -82,6 +91,8 @@ def lines_piece(unit: RouteUnit, work: Work) -> Piece:
             _road(unit.road_id(number), part, along, stations(part, step)),
             _arrays(along, unit, work),
         )
+        on_line = np.zeros(1), np.ones((len(part.x), 1), np.bool_)
+        own["tile_steps_max_mm"] = millimetres(unit.tile_step(part, *on_line, work))
         if unit.levelled:
             levels = unit.levels_on(along.middle_x, along.middle_y)
             own["level"] = max(levels.tolist(), key=abs)

@@ -32,6 +32,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.results.query import required_crs
 from flexroad.pipeline.results.query_files import to_crs
+from flexroad.pipeline.run.tile_steps import length_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text
 from flexroad.tasks.lift.types import Frame, Heights, Lifted, Options
@@ -57,6 +58,8 @@ PACKED = {
 """What to do with files that are not read, by their first bytes."""
 DISTANCES = {"elevation_m": "", "superelevation_m": " with superelevation", "shape_m": " with shapes"}
 """Distances from the surface in the summary, and what they are with."""
+NEAR_M = 5.0
+"""Distance up to which consecutive points are of one line (m); lines have a height every metre or less."""
 PLACES = ".gpkg"
 """Places above limits are in a file beside the report, of the same name with this suffix."""
 
@@ -73,6 +76,8 @@ class LiftedFile:
     noun: str
     """What a row is."""
     options: Options
+    tile_step_m: float = 0.0
+    """Largest step between tiles of the run below it."""
 
     @property
     def summary(self) -> str:
@@ -84,7 +89,7 @@ class LiftedFile:
         if any(row.unknown_deck_m > 0 for row in self.rows):
             parts.append(f"{_length(self.rows, 'unknown_deck_m')} on decks or in tunnels of unknown height")
         figures = [
-            f"{1000 * max(values):.0f} mm{words}"
+            f"{length_text(max(values))}{words}"
             for name, words in DISTANCES.items()
             if (values := [value for row in self.rows if np.isfinite(value := getattr(row, name))])
         ]
@@ -195,7 +200,8 @@ def lift(
             _remove_parts(out, files)
     if report is not None:
         files += _write_report(rows, report, in_run)
-    return LiftedFile(rows, files, len(in_run.seen.earlier), module.NOUN, options)
+    seen = in_run.seen
+    return LiftedFile(rows, files, len(seen.earlier), module.NOUN, options, seen.tile_step_m)
 
 
 @dataclass(eq=False)
@@ -207,6 +213,8 @@ class _Seen:
     bounds: Floats = field(default_factory=lambda: np.array([np.inf, np.inf, -np.inf, -np.inf]))
     """Of all points, in the CRS of the run."""
     earlier: set[str] = field(default_factory=set)
+    tile_step_m: float = 0.0
+    """Largest step between tiles on its lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,6 +266,8 @@ class _InRun:
         found = replace(found, z=found.z - self.place.z)
         seen = self.seen
         seen.earlier.update(earlier)
+        step = self.ground.largest_tile_step(easting, northing, NEAR_M)
+        seen.tile_step_m = max(seen.tile_step_m, step)
         seen.known += int(np.isfinite(found.z).any(axis=0).sum())
         inside = np.isfinite(easting) & np.isfinite(northing)
         if inside.any():

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely import STRtree, box, points
 
+from flexroad.catalog import Bounds
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import (
     FinishedTile,
     GroundTile,
@@ -27,6 +29,7 @@ from flexroad.pipeline.run.finished import (
 )
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, peek_statuses
+from flexroad.pipeline.run.tile_steps import largest_tile_step
 from flexroad.tasks.lift.types import Heights
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
@@ -163,6 +166,31 @@ class Ground:
                     row[here[on]] = surface.at(own.level.number).height(east[on], north[on])
         numbers = tuple(sorted(rows))
         return Heights(numbers, np.stack([rows[number] for number in numbers])), tuple(earlier)
+
+    def largest_tile_step(self, easting: Floats, northing: Floats, near_m: float) -> float:
+        """Return the largest step (m) between the tiles of neighbouring points, ``(n,)``; 0 if there is none.
+
+        Parameters
+        ----------
+        near_m : float
+            Distance up to which a point and the next one belong to one line (m).
+        """
+        if has_borders(self.run.config.chains[self.variant]["fit"]):
+            return 0.0
+        tiles, surfaces = np.full(easting.shape, -1), list[tuple[Bounds, Surface]]()
+        for status, surface, road, selected in self._surfaces(easting, northing):
+            tiles[_inside(road, easting, northing, selected)] = len(surfaces)
+            surfaces.append((status.graph.tile.grid.bounds, surface))
+        places = np.stack([easting, northing])
+        far = ~(np.hypot(*np.diff(places)) <= near_m)
+        return largest_tile_step(
+            places[:, :-1],
+            places[:, 1:],
+            np.where(far, -1, tiles[:-1]),
+            tiles[1:],
+            [bounds for bounds, _ in surfaces],
+            lambda number, x, y, _: surfaces[number][1].height(x, y),
+        )
 
     def errors(self, easting: Floats, northing: Floats, numbers: NDArray[np.int8]) -> Floats:
         """Return the estimated errors (m) of the surface at n points on given levels.

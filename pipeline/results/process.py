@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.sources import rasters
@@ -94,7 +95,7 @@ def run(
     out: str | Path,
     tiles: Sequence[str] = (),
     workers: int | None = None,
-    settings: Sequence[str] = (),
+    settings: Sequence[str] | Mapping[str, Any] = (),
     store: str | Path | None = None,
     allow: Sequence[str | Path] = (),
     observer: Observer | None = None,
@@ -116,8 +117,8 @@ def run(
     workers : int, optional
         Most worker processes; 1: this process alone; None: as many as pay. A script that starts them needs
         ``if __name__ == "__main__":`` around the call.
-    settings : sequence of str
-        Options of the configuration: ``fit.spacing_m=5``.
+    settings : sequence of str, or mapping
+        Options of the configuration: ``["fit.spacing_m=5"]`` or ``{"fit": {"spacing_m": 5}}``.
     store : str or Path, optional
         Folder of stage results that several runs share.
     allow : sequence of str or Path

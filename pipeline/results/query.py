@@ -19,6 +19,7 @@ from flexroad.catalog.text import count, reason
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.results.points import Answer, Ground
 from flexroad.pipeline.results.query_files import Points, to_crs
+from flexroad.pipeline.run.tile_steps import LARGEST_M, REMEDY, length_text
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.types import Floats
 
@@ -183,7 +184,10 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float, level: Level
     table = points.drop(columns=["east", "north"] if len(lines) > 1 else ["line", "east", "north"])
     columns = _columns(answer, level)
     table = table.assign(height_m=columns.pop("height_m"), grade_percent=100 * slope, **columns)
-    return AnswerTable(table, easting[rows], northing[rows], crs_of(ground), answer, level=level)
+    apart = ground.largest_tile_step(easting, northing, 1.01 * step_m)
+    note = f"the line crosses tiles that do not meet, by up to {length_text(apart)}; {REMEDY}"
+    notes = (note,) if apart > LARGEST_M else ()
+    return AnswerTable(table, easting[rows], northing[rows], crs_of(ground), answer, notes, level=level)
 
 
 def stations(lines: list[Floats], step_m: float) -> pd.DataFrame:

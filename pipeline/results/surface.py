@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import warnings
 import zipfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,6 +19,8 @@ from threadpoolctl import threadpool_limits
 from flexroad.catalog import Bounds, Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import atomic_path
+from flexroad.catalog.storage.scratch import ScratchFolder
+from flexroad.catalog.text import reason
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import has_borders
@@ -25,19 +29,21 @@ from flexroad.tasks.border import BorderStages
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import npz
 from flexroad.tasks.load_arrays import load_arrays
-from flexroad.tasks.options import stage_function
+from flexroad.tasks.options import Options, stage_function
 from flexroad.tasks.quality.assess import NO_ROAD
-from flexroad.tasks.segment import mask
+from flexroad.tasks.segment import mask, vector
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask
+from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, Source
 
 if TYPE_CHECKING:
+    import geopandas
     import rioxarray
     import trimesh
     import xarray as xr
 else:
-    rioxarray, trimesh, xr = lazy("rioxarray"), lazy("trimesh"), lazy("xarray")
+    geopandas, rioxarray = lazy("geopandas"), lazy("rioxarray")
+    trimesh, xr = lazy("trimesh"), lazy("xarray")
 
 AXES = {"z": "x east, y north, z up", "y": "x east, y up, z south"}
 """Directions of the mesh axes by the upward axis."""
@@ -289,9 +295,12 @@ class Surface:
 def fit(
     dsm: xr.DataArray,
     dtm: xr.DataArray,
-    road_mask: xr.DataArray,
+    road_mask: xr.DataArray | geopandas.GeoDataFrame,
     config: str | Path = "production",
     variant: str | None = None,
+    *,
+    road_values: Sequence[int] = (),
+    settings: Sequence[str] | Mapping[str, Any] = (),
 ) -> Surface:
     """Fit a smooth surface to the road and the terrain of one area.
 
@@ -307,15 +316,21 @@ def fit(
     dtm : xarray.DataArray, (H, W)
         Digital terrain model, heights in m, in the same CRS. If its cells do not coincide with those of the
         DSM, it is resampled bilinearly, with a warning.
-    road_mask : xarray.DataArray, (H, W)
-        Road where True or not 0, in the same CRS. If its cells do not coincide with those of the DSM, the
-        nearest cell is taken, with a warning. It replaces the configuration's ``segment``. Without any road
-        cell, also after the filter, the surface is that of the terrain, as in a run, and has the flag
-        ``no-road`` (`Surface.flags`); a mask without road cells also gives a warning.
+    road_mask : xarray.DataArray, (H, W), or geopandas.GeoDataFrame
+        Road where True, not 0, or one of ``road_values``, in the same CRS. If its cells do not coincide with
+        those of the DSM, the nearest cell is taken, with a warning. It replaces the configuration's
+        ``segment``. Or areas and centre lines of roads, which ``segment: vector`` reads with its options.
+        Without any road cell, also after the filter, the surface is that of the terrain, as in a run, and has
+        the flag ``no-road`` (`Surface.flags`); a mask without road cells also gives a warning, and so do
+        several classes that all count as road, or a mask that is all road.
     config : str or Path
         A shipped configuration (``production``, ``paper``) or a YAML file.
     variant : str, optional
         A variant of the configuration; by default the first one exported.
+    road_values : sequence of int
+        Values of the road mask that mean road; empty: all but 0 and nodata.
+    settings : sequence of str, or mapping
+        Options of the configuration: ``["fit.spacing_m=5"]`` or ``{"fit": {"spacing_m": 5}}``.
 
     Returns
     -------
@@ -326,9 +341,10 @@ def fit(
     ------
     TaskError
         If an array has no CRS, is in degrees or feet, is rotated, or its pixels are not square; if the CRS of
-        two arrays differ; if the DSM has too few heights; if a stage fails.
+        two arrays differ; if the DSM has too few heights; if the mask has fractions, such as
+        probabilities; if a stage fails.
     ConfigError
-        If there is no such configuration or variant.
+        If there is no such configuration, variant or setting.
 
     Examples
     --------
@@ -340,26 +356,60 @@ def fit(
     EPSG:25832, 60 x 60 m, bounds 500200 5600000 500260 5600060
     road: 1576 cells given, 1445 kept by the filter
     """
-    chosen = load_config(config)
+    chosen = load_config(config, settings)
     variant = variant or chosen.export.variants[0]
     if variant not in chosen.chains:
         raise ConfigError(f"{config} has no variant {variant!r}; it has {', '.join(chosen.chains)}")
     chain = chosen.chains[variant]
-    data = load_arrays(dsm, dtm, road_mask, chain["load"])
-    for note in data.notes:
-        warnings.warn(note, stacklevel=2)
     # At these sizes several BLAS threads are much slower than one.
-    with threadpool_limits(1):
-        road = mask.segment(data, mask.Options())
+    with threadpool_limits(1), _layer(road_mask) as layer:
+        data = load_arrays(dsm, dtm, layer, chain["load"], road_values)
+        if data.roads and road_values:
+            raise ConfigError("road_values are of a mask; select roads of a table with segment.where")
+        segment = _segment(data, chain["segment"])
+        road = stage_function("segment", segment)(data, segment)
+        for note in (*data.notes, *(road.notes if data.roads else ())):
+            warnings.warn(note, stacklevel=2)
         clusters = stage_function("ecsrc", chain["ecsrc"])(data, road, chain["ecsrc"])
         framed: dict[str, Frame] = {}
         # As in a run, the control points on the border are fitted first.
         if has_borders(chain["fit"]):
-            stages = replace(BorderStages.of(chain), segment=mask.Options())
+            stages = replace(BorderStages.of(chain), segment=segment)
             wide = chain["load"].model_copy(update={"halo_m": stages.reach_m})
-            framed["frame"] = stages.frame(load_arrays(dsm, dtm, road_mask, wide), data.core)
+            framed["frame"] = stages.frame(load_arrays(dsm, dtm, layer, wide, road_values), data.core)
         fitted = stage_function("fit", chain["fit"])(data, clusters, chain["fit"], **framed)
-    return Surface(fitted, data.core.crs, data.core.bounds, road, clusters, chain["sample"], str(config))
+    return Surface(fitted, data.core.crs, data.core.bounds, road, clusters, chain["sample"], chosen.name)
+
+
+@contextlib.contextmanager
+def _layer(road_mask: xr.DataArray | geopandas.GeoDataFrame) -> Iterator[xr.DataArray | Source]:
+    """Yield the mask, or the roads of a table as a layer in a temporary file."""
+    if isinstance(road_mask, xr.DataArray) or not isinstance(road_mask, geopandas.GeoDataFrame):
+        yield road_mask
+        return
+    if road_mask.crs is None:
+        raise TaskError("the roads have no CRS; write it, e.g. roads.set_crs('EPSG:25832')")
+    with ScratchFolder() as folder:
+        path = Path(folder) / "roads.gpkg"
+        try:
+            road_mask.to_file(path, driver="GPKG")
+        except (RuntimeError, TypeError, ValueError) as error:
+            raise TaskError(
+                f"the roads cannot be written as a GeoPackage: {reason(error)}; leave out other columns"
+            ) from error
+        yield Source("roads", (path,))
+
+
+def _segment(data: types.TileData, options: Options) -> Options:
+    """Return the options of the segmentation for what is given: a mask, or roads as vectors."""
+    if data.roads is None:
+        return mask.Options()
+    of_vectors = options if isinstance(options, vector.Options) else vector.Options()
+    if of_vectors.levels:
+        raise ConfigError(
+            "segment.levels gives several surfaces, fit one; make a catalog and a run for levels"
+        )
+    return of_vectors
 
 
 def open_surface(path: str | Path) -> Surface:
@@ -390,7 +440,8 @@ def open_surface(path: str | Path) -> Surface:
             if "labels" not in archive.files:
                 return Surface(fitted, fitted.crs, fitted.bounds, None, None, sample.Options(), "")
             grid, core = (_grid(fitted.crs, archive[name]) for name in ("grid", "core"))
-            road = RoadMask(grid, core, archive["road_mask"], archive["outside"])
+            areas = archive["areas"] if "areas" in archive.files else None
+            road = RoadMask(grid, core, archive["road_mask"], archive["outside"], areas=areas)
             clusters = RoadClusters(grid, archive["labels"])
             sampling = sample.Options.model_validate_json(str(archive["sampling"]))
             return Surface(fitted, core.crs, core.bounds, road, clusters, sampling, str(archive["config"]))
@@ -417,7 +468,9 @@ def _cut(values: Bools, road: RoadMask) -> Bools:
 
 def _masks(road: RoadMask, clusters: RoadClusters, sampling: sample.Options, config: str) -> dict[str, Any]:
     """Return the arrays that `Surface.save` adds to those of the spline, by name."""
+    outlines = {} if road.areas is None else {"areas": road.areas}
     return {
+        **outlines,
         "grid": np.asarray(astuple(road.grid)[1:], np.float64),
         "core": np.asarray(astuple(road.core)[1:], np.float64),
         "road_mask": road.mask,

@@ -49,7 +49,7 @@ from flexroad.catalog.storage.paths import (
 )
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.loading import compose, load_config, read_mapping
-from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.config.models import ROOT, Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import check_tiles
 from flexroad.pipeline.graph.graph import Pattern, TileGraph
@@ -402,7 +402,8 @@ def _config(path: Location) -> Config:
     if file is None and exists(path):
         raise ConfigError(f"{path} is not a regular file; `flexroad run` writes it again")
     if isinstance(path, Path):
-        return load_config(path)
+        # Earlier versions wrote it without `extends`.
+        return load_config(path, base=ROOT)
     return compose(read_mapping(read(path), str(path)), str(path))
 
 

@@ -75,10 +75,15 @@ def is_conversion(note: str) -> bool:
     return note.endswith(CONVERTED)
 
 
-def smaller_unit_fault(patch: RasterWindow) -> str | None:
+def smaller_unit_fault(patch: RasterWindow, declare: str) -> str | None:
     """Return that all heights are outside the range as they are in a smaller unit, to follow the file's name.
 
     None if they vary too little or too much for heights in one of `SMALLER`.
+
+    Parameters
+    ----------
+    declare : str
+        The remedy besides the division, with a comma before it; empty if there is none.
     """
     heights = patch.values * _unit(patch)[1]
     most = max(SMALLER.values())
@@ -93,8 +98,7 @@ def smaller_unit_fault(patch: RasterWindow) -> str | None:
     numbers = " or ".join(str(SMALLER[unit]) for unit in fitting)
     return (
         f": all {heights.size} heights on this tile are outside {LOWEST_M:g} to {HIGHEST_M:g} m "
-        f"({low:.0f} to {high:.0f}); if they are in {' or '.join(fitting)}, divide them by {numbers}, "
-        "or declare that unit with gdal_edit.py -units"
+        f"({low:.0f} to {high:.0f}); if they are in {' or '.join(fitting)}, divide them by {numbers}{declare}"
     )
 
 

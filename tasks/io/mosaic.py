@@ -118,7 +118,8 @@ class Mosaic:
     def _smaller_unit(self, file: SourceFile, tile: Tile) -> str | None:
         """Return that the file's heights on the tile may be in a smaller unit than metres, None if not."""
         patch = _window(tile, self.layer, file, tile.grid, tile.grid)
-        return smaller_unit_fault(with_unit(patch, self.layer)) if patch else None
+        declare = ", or declare that unit with gdal_edit.py -units"
+        return smaller_unit_fault(with_unit(patch, self.layer), declare) if patch else None
 
 
 def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = False) -> Mosaic:

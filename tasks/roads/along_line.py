@@ -102,7 +102,7 @@ def profiles(grid: HeightGrid, knot_m: float = 5.0) -> Profiles:
     two heights do not count; what is between their neighbours is used. The length of a cubic piece is
     ``knot_m``.
     """
-    inside, s = _carriageway(grid), grid.line.s
+    inside, s = on_carriageway(grid), grid.line.s
     crown, inside = _crown(grid, inside)
     height, slope = _straight(np.where(inside, grid.heights - crown, 0.0), grid.v, inside)
     return Profiles(_spline(s, height, knot_m), _spline(s, np.arctan(slope), knot_m))
@@ -125,19 +125,20 @@ def largest_steps(grid: HeightGrid, step: HeightAt) -> tuple[float, float]:
     NaN if no node has a height.
     """
     steps = np.abs(step(*grid.line.beside(grid.v)))
-    known, inside = steps[np.isfinite(steps)], steps[_carriageway(grid)]
+    known, inside = steps[np.isfinite(steps)], steps[on_carriageway(grid)]
     everywhere, carriageway = (float(part.max()) if len(part) else np.nan for part in (known, inside))
     return everywhere, carriageway
 
 
 def _missed(grid: HeightGrid, fitted: Floats) -> tuple[float, float]:
-    missed = np.abs(fitted - grid.heights)[_carriageway(grid)]
+    missed = np.abs(fitted - grid.heights)[on_carriageway(grid)]
     if not len(missed):
         return np.nan, np.nan
     return float(missed.mean()), float(missed.max())
 
 
-def _carriageway(grid: HeightGrid) -> Bools:
+def on_carriageway(grid: HeightGrid) -> Bools:
+    """Return the nodes with a height between the edges of the carriageway, ``(n, m)``."""
     return _between_edges(grid) & np.isfinite(grid.heights)
 
 

@@ -10,10 +10,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import geopandas
 import numpy as np
 import pytest
 import rasterio
 import rioxarray
+import shapely
 import trimesh
 import xarray as xr
 
@@ -178,6 +180,117 @@ def test_fit_without_road_equals_run_and_is_flagged(tmp_path, rasters):
     assert flexroad.open_surface(tmp_path / "terrain.npz").flags == ("no-road",)
 
 
+def classes(scene) -> xr.DataArray:
+    """Land cover: roads 1, houses 2."""
+    return xr.where(scene.road_mask, 1, 2).rio.write_crs(scene.rio.crs)
+
+
+def test_fit_road_values_equals_mask_of_these(scene, surface):
+    fitted = flexroad.fit(scene.dsm, scene.dtm, classes(scene), road_values=[1])
+    x, y = np.random.default_rng(0).uniform((500200, 5600000), (500260, 5600060), (500, 2)).T
+    np.testing.assert_array_equal(fitted.height(x, y), surface.height(x, y))
+    np.testing.assert_array_equal(fitted.road.mask, surface.road.mask)
+
+
+@pytest.mark.parametrize(
+    ("change", "values", "message"),
+    [
+        (
+            classes,
+            (),
+            "road_mask: values are 1, 2, and all but 0 count as road; name the roads' with road_val",
+        ),
+        (classes, (7,), "road_mask: no cell has road_values 7 but 1, 2"),
+        (lambda scene: scene.road_mask | True, (), "road_mask: every cell counts as road, with the value 1"),
+    ],
+    ids=["classes", "another value", "all road"],
+)
+def test_fit_mask_that_is_no_mask_of_roads_warns(scene, change, values, message):
+    with pytest.warns(UserWarning, match=message):
+        flexroad.fit(scene.dsm, scene.dtm, change(scene).rio.write_crs(25832), road_values=values)
+
+
+def test_fit_probabilities_raise(scene):
+    probable = (scene.road_mask * 0.6 + 0.2).rio.write_crs(25832)
+    with pytest.raises(flexroad.TaskError, match=r"road_mask: values are 0.2, 0.8, as of probabilities"):
+        flexroad.fit(scene.dsm, scene.dtm, probable)
+
+
+def test_fit_settings_as_texts_and_as_dict_are_equal_and_named(scene):
+    one = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, settings=["fit.spacing_m=10"])
+    other = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, settings={"fit": {"spacing_m": 10}})
+    assert one.fitted.A.shape == other.fitted.A.shape == (9, 9)
+    assert one.height(*CENTRE) == other.height(*CENTRE)
+    assert "config production --set fit.spacing_m=10>" in repr(one)
+    with pytest.raises(flexroad.ConfigError, match="fit.spacing: unknown key; did you mean spacing_m"):
+        flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, settings={"fit.spacing": 10})
+
+
+@pytest.fixture(scope="module")
+def streets() -> geopandas.GeoDataFrame:
+    """A street across the scene by its centre line, and a footway that does not count."""
+    lines = shapely.linestrings(
+        [[(500180, 5600010), (500280, 5600050)], [(500180, 5600040), (500280, 5600040)]]
+    )
+    table = {"highway": ["residential", "footway"], "width": ["8", "3"]}
+    return geopandas.GeoDataFrame(table, geometry=lines, crs="EPSG:25832")
+
+
+def test_fit_table_of_roads_equals_run_over_same_file(tmp_path, rasters, streets):
+    for name in ("dsm", "dtm"):
+        rasters[name].rio.to_raster(tmp_path / f"{name}.tif")
+    streets = streets.set_geometry(streets.translate(-220, -20))
+    streets.to_file(tmp_path / "roads.gpkg")
+    layers = {"dsm": "dsm.tif", "dtm": "dtm.tif", "roads": "roads.gpkg"}
+    catalog = flexroad.catalog_from(tmp_path, tmp_path / "c.parquet", tile_size_m=60, **layers)
+    run = flexroad.run(catalog, "production_vector", out=tmp_path / "run", workers=1)
+    for config in ("production", "production_vector"):
+        fitted = flexroad.fit(rasters["dsm"], rasters["dtm"], streets, config)
+        x, y = np.random.default_rng(0).uniform((499980, 5599980), (500040, 5600040), (500, 2)).T
+        np.testing.assert_allclose(fitted.height(x, y), run.height(x, y), rtol=0, atol=1e-9)
+    # A street of 8 m across 60 m.
+    assert fitted.road.mask[50:-50, 50:-50].sum() == pytest.approx(8 * 60 * np.hypot(10, 4) / 10, rel=0.03)
+    fitted.save(tmp_path / "road.npz")
+    again = flexroad.open_surface(tmp_path / "road.npz").to_mesh()
+    np.testing.assert_array_equal(again.faces, fitted.to_mesh().faces)
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "error", "message"),
+    [
+        (
+            lambda roads: roads.set_crs(None, allow_override=True),
+            {},
+            flexroad.TaskError,
+            "the roads have no CRS",
+        ),
+        (
+            lambda roads: roads.assign(WIDTH=8),
+            {},
+            flexroad.TaskError,
+            "cannot be written as a GeoPack",
+        ),
+        (lambda roads: roads, {"road_values": [1]}, flexroad.ConfigError, "road_values are of a mask"),
+        (
+            lambda roads: roads,
+            {"settings": {"segment": {"method": "vector", "levels": True}}},
+            flexroad.ConfigError,
+            "segment.levels gives several surfaces",
+        ),
+    ],
+    ids=["no CRS", "equal columns", "road_values", "levels"],
+)
+def test_fit_unusable_table_of_roads_raises(scene, streets, change, options, error, message):
+    with pytest.raises(error, match=message):
+        flexroad.fit(scene.dsm, scene.dtm, change(streets), **options)
+
+
+def test_fit_table_without_a_road_here_is_flagged(scene, streets):
+    with pytest.warns(UserWarning, match="no road of roads.gpkg lies on this tile"):
+        fitted = flexroad.fit(scene.dsm, scene.dtm, streets.translate(1000).to_frame("geometry"))
+    assert fitted.flags == ("no-road",)
+
+
 def test_fit_whose_road_the_filter_drops_is_flagged(scene, surface):
     assert surface.flags == ()
     # Less than the smallest area that the filter keeps.
@@ -257,6 +370,9 @@ def rotated(array):
         ("dtm", lambda a: a.assign_coords(x=a.x + 5000), "dtm .* does not overlap the dsm"),
         ("dsm", lambda a: a.where(a.x < 500206), "dsm has 10.0% valid cells, below 25%"),
         ("dtm", lambda a: a * np.nan, "dtm has only nodata"),
+        ("dsm", lambda a: a * 100, r"dsm: all 3600 heights .* outside -500 to 9000 m \(15\d+ to 17\d+\); if"
+         " they are in cm or mm, divide them by 100 or 1000$"),
+        ("dtm", lambda a: a * 0 - 9999, r"dtm has no height in -500 to 9000 m \(-9999 to -9999\); give"),
         ("dsm", lambda a: a.to_dataset(), "dsm is a Dataset; give an xarray.DataArray"),
         ("dsm", lambda a: xr.concat([a, a], "time"), r"dsm has dimensions \(time: 2, y: 60, x: 60\)"),
         ("dsm", lambda a: a.assign_attrs(units="m", scale_factor=0.01), "scale_factor 0.01"),

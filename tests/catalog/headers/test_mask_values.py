@@ -20,6 +20,12 @@ CLASSES = np.array([[1, 2], [5, 7]], np.uint8).repeat(20, 0).repeat(20, 1)
         (CLASSES // 3, None, (), "values are 0, 1, 2, and all but 0 count as road; name the roads'"),
         (CLASSES, 7, (7,), "no cell has --road-value 7 but 1, 2, 5"),
         (CLASSES * 0 + 1, None, (), "every cell counts as road, with the value 1; name the roads'"),
+        (
+            CLASSES / 14,
+            None,
+            (),
+            "values are 0.0714286, 0.142857, 0.357143, 0.5, as of probabilities, and all",
+        ),
         (CLASSES // 7, None, (), None),
         (CLASSES // 7 * 255, None, (), None),
         (CLASSES // 7, 0, (), None),
@@ -28,7 +34,7 @@ CLASSES = np.array([[1, 2], [5, 7]], np.uint8).repeat(20, 0).repeat(20, 1)
     ],
 )
 def test_values_that_do_not_fit_are_noted(values, nodata, road, note, tmp_path):
-    write(tmp_path / "m.tif", values.astype(np.int32), nodata=nodata)
+    write(tmp_path / "m.tif", values.astype(np.float64), nodata=nodata)
     notes = mask_notes(tmp_path, "road_mask", ["m.tif"], road)
     assert len(notes) == (note is not None)
     assert note is None or notes[0].startswith(f"road_mask: {note}")

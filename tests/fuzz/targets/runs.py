@@ -18,6 +18,7 @@ from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.store.tables import read_metrics
 
 LIGHT = {
+    "extends": "defaults",
     "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
     "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
     "cluster": {"flush": False},

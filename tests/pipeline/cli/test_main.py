@@ -24,7 +24,7 @@ def words(made_survey, tmp_path_factory) -> list:
     """The words of a run command over the complete survey, without --out and --executor."""
     config = tmp_path_factory.mktemp("cli") / "quick.yaml"
     config.write_text(
-        "fit: {control_points: [12, 12], iterations: 30}\n"
+        "extends: defaults\nfit: {control_points: [12, 12], iterations: 30}\n"
         "variants:\n"
         "  plane: {fit: plane, sample: corners}\n"
         "  rgt: {fit: raster, sample: uniform}\n"
@@ -195,7 +195,7 @@ def test_run_with_tile_or_bbox_selects_tiles(made_survey, tmp_path):
 def test_run_with_tile_keeps_other_tiles_of_the_run(survey, tmp_path):
     catalog = Catalog.read(survey)
     config = tmp_path / "c.yaml"
-    config.write_text("fit: {control_points: [12, 12], iterations: 5}\n")
+    config.write_text("extends: defaults\nfit: {control_points: [12, 12], iterations: 5}\n")
     words = [
         "run",
         "--config",
@@ -221,7 +221,7 @@ def test_run_with_failed_tile_exits_with_1(survey, tmp_path):
     path = tile.paths(tile.layer("dtm"))[0]
     path.unlink()
     config = tmp_path / "c.yaml"
-    config.write_text("fit: {control_points: [12, 12], iterations: 5}\n")
+    config.write_text("extends: defaults\nfit: {control_points: [12, 12], iterations: 5}\n")
     words = ["--config", config, "--catalog", survey, "--out", tmp_path / "run", "--executor", "serial"]
     said = flexroad("run", *words, expect=1)
     assert f"failed {tile.id}: load: TaskError: " in said
@@ -272,7 +272,7 @@ def test_process_that_cannot_start_prints_one_line_and_exits_with_2():
 def test_config_commands_print_options():
     assert "paper" in flexroad("config", "show")
     assert "theta_z_m: 0.5" in flexroad("config", "show", "paper")
-    assert "theta_z_m: 0.5" in flexroad("config", "template")
+    assert "theta_z_m: 0.25" in flexroad("config", "template")
     assert "theta_z_m" in json.dumps(json.loads(flexroad("config", "schema"))["properties"]["ecsrc"])
 
 

@@ -38,7 +38,7 @@ def made_run(folder: Path, columns: int = SIZE) -> Path:
     for name, values in (("dsm", heights), ("dtm", heights), ("road_mask", road)):
         write(folder / f"{name}.tif", values, WEST, SOUTH + SIZE)
     catalog, config = folder / "catalog.json", folder / "plane.yaml"
-    config.write_text("fit: plane\nvariants:\n  flexroad: {}\n")
+    config.write_text("extends: defaults\nfit: plane\nvariants:\n  flexroad: {}\n")
     layers = ["--dsm", "dsm.tif", "--dtm", "dtm.tif", "--road-mask", "road_mask.tif", "--road-value", 1]
     command_line.call("catalog", "rasters", folder, *layers, "--tile-size", SIZE, "-o", catalog).expected(0)
     words = ["--config", config, "--catalog", catalog, "--executor", "serial"]

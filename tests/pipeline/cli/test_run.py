@@ -20,7 +20,7 @@ from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.store import checked_json
 from tests.command_line import same_signals
 
-QUICK = "fit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}\n"
+QUICK = "extends: defaults\nfit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}\n"
 
 
 @pytest.fixture

@@ -54,6 +54,51 @@ def test_extends_merges_over_parent(tmp_path):
     assert config.chains["flexroad"]["fit"].learning_rate == 0.1
 
 
+@pytest.mark.parametrize("text", ["", "# nothing\n", "cluster: {workers: 2}\n", "extends: production\n"])
+def test_file_without_extends_is_production(tmp_path, text):
+    (tmp_path / "mine.yaml").write_text(text)
+    production = load_config("production")
+    assert load_config(tmp_path / "mine.yaml").chains == production.chains
+    (tmp_path / "heir.yaml").write_text("extends: mine.yaml\nload: {halo_m: 60}\n")
+    chain = load_config(tmp_path / "heir.yaml").chains["flexroad"]
+    assert (chain["load"].halo_m, chain["fit"]) == (60, production.chains["flexroad"]["fit"])
+
+
+def test_extends_defaults_has_the_defaults_of_the_options(tmp_path):
+    (tmp_path / "mine.yaml").write_text("extends: defaults\n")
+    assert load_config(tmp_path / "mine.yaml").chains == compose({}, "x").chains
+    (tmp_path / "mine.yaml").write_text("extends:\n")
+    assert "extends: expected a file or a shipped name, not None" in refusal(tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_configuration_of_a_run_is_complete(name, tmp_path):
+    config = load_config(name)
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config.raw, sort_keys=False))
+    again = load_config(tmp_path / "config.yaml")
+    assert (again.chains, again.export, again.dataset) == (config.chains, config.export, config.dataset)
+
+
+def test_file_keeps_the_options_that_it_leaves_out(tmp_path):
+    (tmp_path / "base.yaml").write_text(
+        "export: {formats: [npz], texture_px: 512}\n"
+        "segment: {method: vector, cleanup: {drop_m2: 9}}\n"
+        "dataset: {crs: EPSG:25832, layers: {dsm: a.tif, dtm: b.tif}}\n"
+    )
+    (tmp_path / "mine.yaml").write_text(
+        "extends: base.yaml\n"
+        "export: {texture_px: 64}\n"
+        "segment: {cleanup: {fill_m2: 8}}\n"
+        "dataset: {layers: {dsm: c.tif}}\n"
+    )
+    config = load_config(tmp_path / "mine.yaml")
+    assert (config.export.formats, config.export.texture_px) == (("npz",), 64)
+    cleanup = config.chains["flexroad"]["segment"].cleanup
+    assert (cleanup.drop_m2, cleanup.fill_m2) == (9, 8)
+    # The files of a dataset are of one dataset: another's layers are no part of it.
+    assert config.dataset == {"crs": "EPSG:25832", "layers": {"dsm": "c.tif"}}
+
+
 def test_override_with_other_filter_uses_its_defaults(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("extends: paper\necsrc: planar\nvariants: {flexroad: {}, bare: {ecsrc: off}}\n")
@@ -248,11 +293,15 @@ def test_any_change_gives_a_configuration_or_lines(tmp_path, data):
     assert all(line.isprintable() for line in message.splitlines())
 
 
-def test_template_equals_default_configuration():
+def test_template_is_production_with_every_option(tmp_path):
+    (tmp_path / "mine.yaml").write_text(template())
+    filled, production = load_config(tmp_path / "mine.yaml"), load_config("production")
+    assert filled.chains == production.chains
+    assert (filled.export, filled.cluster) == (production.export, production.cluster)
     raw = yaml.safe_load(template())
-    filled, empty = compose(raw, "x"), compose({}, "x")
-    assert filled.chains == empty.chains
-    assert filled.export == empty.export
+    assert raw.pop("extends") == "production"
+    # Its values alone are complete, too.
+    assert compose(raw, "x").chains == production.chains
 
 
 def test_schema_contains_every_stage_and_option():

@@ -41,6 +41,52 @@ def test_setting_below_a_single_word_keeps_the_method():
 
 
 @pytest.mark.parametrize(
+    "settings",
+    [
+        [
+            "fit.spacing_m=5",
+            "segment={method: vector, cleanup: {drop_m2: 9, fill_m2: 8}}",
+            "export.formats=[npz]",
+        ],
+        {
+            "fit": {"spacing_m": 5},
+            "segment": {"method": "vector", "cleanup": {"drop_m2": 9, "fill_m2": 8}},
+            "export.formats": ("npz",),
+        },
+    ],
+    ids=["texts", "dict"],
+)
+def test_settings_as_texts_and_as_dict_are_equal(settings):
+    config = load_config("production", settings)
+    chain = config.chains["flexroad"]
+    assert (chain["fit"].spacing_m, chain["fit"].huber_m, chain["fit"].bending_m3) == (5, 0.1, 30)
+    assert (chain["segment"].cleanup.drop_m2, chain["segment"].cleanup.fill_m2) == (9, 8)
+    assert config.export.formats == ("npz",)
+
+
+def test_settings_as_a_dict_are_part_of_the_name_and_keep_small_numbers():
+    config = load_config("production", {"ecsrc.verge_m": 1e-5, "fit": {"spacing_m": 5}})
+    assert config.name == "production --set ecsrc.verge_m=1.0e-05 --set fit={spacing_m: 5}"
+    assert config.chains["flexroad"]["ecsrc"].verge_m == 1e-5
+
+
+def test_settings_with_a_value_that_is_not_yaml_raise():
+    with pytest.raises(
+        ConfigError, match="settings .* cannot represent an object; give numbers, texts or lists"
+    ):
+        load_config("production", {"fit.spacing_m": object()})
+
+
+def test_setting_of_a_mapping_keeps_the_options_that_it_leaves_out():
+    load = load_config("production", ["load={halo_m: 20}"]).chains["flexroad"]["load"]
+    assert (load.halo_m, load.road_height) == (20, "auto")
+    vector = ["segment={method: vector, cleanup: {drop_m2: 9}}", "segment.cleanup={fill_m2: 8}"]
+    cleanup = load_config("production", vector).chains["flexroad"]["segment"].cleanup
+    assert (cleanup.drop_m2, cleanup.fill_m2) == (9, 8)
+    assert list(load_config("paper", ["variants={mine: {}}"]).chains) == ["mine"]
+
+
+@pytest.mark.parametrize(
     ("setting", "message"),
     [
         (
@@ -57,7 +103,10 @@ def test_setting_below_a_single_word_keeps_the_method():
         ("fit.degree=" + "9" * 500, "--set fit.degree: not readable as YAML: line 1, column 1: a number of"),
         ("fit.degree", "--set 'fit.degree': give KEY=VALUE, like --set fit.spacing_m=5"),
         ("fit..degree=2", "--set 'fit..degree=2': give KEY=VALUE"),
-        ("extends=production", "paper --set extends=production: extends: unknown key; valid are"),
+        (
+            "extends=production",
+            "paper --set extends=production: extends: only files extend others, not 'production'",
+        ),
     ],
 )
 def test_invalid_setting_raises_one_line_that_names_it(setting, message):

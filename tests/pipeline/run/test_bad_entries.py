@@ -21,7 +21,7 @@ PLANE = {"fit": "plane", "sample": "corners"}
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
     path = tmp_path_factory.mktemp("config") / "plane.yaml"
-    path.write_text(yaml.safe_dump({**PLANE, "variants": {"plane": {}}}))
+    path.write_text(yaml.safe_dump({"extends": "defaults", **PLANE, "variants": {"plane": {}}}))
     return path
 
 

@@ -236,7 +236,7 @@ def test_truncated_file_fails_only_its_tile_of_several_that_list_it(name, run, f
     fault = Fault(None, name, f"{name} {name}/{first.id}.tif cannot be read: .*; fetch it again")
     assert_only_tile_failed(run(catalog=catalog), first, fault, flexroad, tmp_path / "run", str(path))
     halo = tmp_path / "halo.yaml"
-    halo.write_text("load: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
+    halo.write_text("extends: defaults\nload: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
     result = run(catalog=catalog, config=halo)
     assert [line.split(":")[0] for line in result.errors] == [f"failed {first.id}"]
     other = Catalog.read(catalog).tiles[3].id
@@ -377,7 +377,9 @@ def test_tile_of_2_by_2_cells_fails_only_nurbs(run, tmp_path):
     rows = read_metrics(tmp_path / "run").set_index("variant")
     assert dict(rows.status) == {"plane": "done", "rgt": "done", "flexroad": "failed"}
     config = tmp_path / "linear.yaml"
-    config.write_text("fit: {degree: 1, control_points: [2, 2]}\necsrc: {min_area_m2: 0}\n")
+    config.write_text(
+        "extends: defaults\nfit: {degree: 1, control_points: [2, 2]}\necsrc: {min_area_m2: 0}\n"
+    )
     assert run(catalog=catalog, config=config, out=tmp_path / "linear").code == 0
 
 
@@ -415,12 +417,15 @@ DEEP = "{a: " * 2000 + "1" + "}" * 2000
         ("fit: {degre: 3}", "fit.degre: unknown key; did you mean degree?"),
         ("fitt: {degree: 3}", "fitt: unknown key; did you mean fit?"),
         ("variants: {a: {smple: uniform}}", "variants.a.smple: unknown key; did you mean sample?"),
-        ("fit: {degree: 35, control_points: [35, 35]}", "fit.degree: input should be less than or equal"),
+        ("fit: {degree: 35}", "fit.degree: input should be less than or equal"),
         (
-            "fit: {degree: 5, control_points: [5, 9]}",
+            "fit: {method: nurbs, degree: 5, control_points: [5, 9]}",
             "degree 5 needs more control points each way than 5 x 9",
         ),
-        ("fit: {learning_rate: .inf}", "fit.learning_rate: input should be a finite number, not inf"),
+        (
+            "fit: {method: nurbs, learning_rate: .inf}",
+            "fit.learning_rate: input should be a finite number, not inf",
+        ),
         ("fit: bspline", "fit: there is no method 'bspline'"),
         ("fit:\n\tdegree: 3", "not readable as YAML: .*line 2"),
         ("- a", "expected a mapping of stages to options, but it is a list"),
@@ -447,11 +452,18 @@ def test_invalid_configuration_creates_no_run(text, message, run, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_empty_configuration_is_default(flexroad, tmp_path):
+def test_empty_configuration_is_production(flexroad, tmp_path):
     (tmp_path / "empty.yaml").write_text("")
     result = flexroad("config", "show", tmp_path / "empty.yaml")
     assert (result.code, result.errors) == (0, [])
-    assert "control_points" in result.out
+    assert result.out == flexroad("config", "show", "production").out
+    assert "method: smoothing_spline" in result.out
+
+
+def test_setting_without_a_name_is_shown_in_production(flexroad):
+    result = flexroad("config", "show", "--set", "fit.spacing_m=5").expected(0)
+    production = flexroad("config", "show", "production").out
+    assert result.out == production.replace("spacing_m: 3.6", "spacing_m: 5.0") != production
 
 
 def test_extends_path_is_relative_to_file(flexroad, tmp_path):
@@ -463,7 +475,7 @@ def test_extends_path_is_relative_to_file(flexroad, tmp_path):
 @pytest.mark.parametrize("fit", ["{control_points: [100000, 100000]}", "{spacing_m: 1.0e-9}"])
 def test_too_many_control_points_fail_each_tile(fit, run, survey, tmp_path):
     config = tmp_path / "huge.yaml"
-    config.write_text(f"fit: {fit}\n")
+    config.write_text(f"extends: defaults\nfit: {fit}\n")
     result = run(config=config)
     assert result.code == 1
     assert [line.split(": ")[0] for line in result.errors] == [
@@ -474,7 +486,9 @@ def test_too_many_control_points_fail_each_tile(fit, run, survey, tmp_path):
 
 def test_second_configuration_replaces_rows_of_first(run, flexroad, quick_config, tmp_path):
     other = tmp_path / "other.yaml"
-    other.write_text("fit: {control_points: [8, 8], iterations: 3}\nvariants: {smooth: {}}\n")
+    other.write_text(
+        "extends: defaults\nfit: {control_points: [8, 8], iterations: 3}\nvariants: {smooth: {}}\n"
+    )
     assert run().code == 0
     assert run(config=other).code == 0
     assert set(read_metrics(tmp_path / "run").variant) == {"smooth"}
@@ -611,7 +625,7 @@ def test_missing_file_that_all_tiles_list_fails_only_its_tile(run, survey, tmp_p
     first, *others = Catalog.read(survey).tiles
     layer(first, "dsm").unlink()
     halo = tmp_path / "halo.yaml"
-    halo.write_text("load: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
+    halo.write_text("extends: defaults\nload: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
     result = run(config=halo)
     assert [line.split(":")[0] for line in result.errors] == [f"failed {first.id}"]
     item = json.loads((tmp_path / "run" / "tiles" / others[0].id / "item.json").read_text())

@@ -19,6 +19,7 @@ from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.store_users import runs_using, unregister
 
 QUICK = {
+    "extends": "defaults",
     "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
     "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
     "export": {"variants": ["rgt", "flexroad"], "formats": ["glb", "cog"]},

@@ -21,6 +21,7 @@ from tests.dask_processes import until
 pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 CONFIG = """
+extends: defaults
 fit: {control_points: [20, 20], iterations: 3000}
 variants: {plane: {fit: plane, sample: corners}, flexroad: {}}
 """

@@ -36,7 +36,7 @@ from tests.s3_server import Fault
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
-LIGHT = {"variants": {"plane": {"fit": "plane", "sample": "corners"}}}
+LIGHT = {"extends": "defaults", "variants": {"plane": {"fit": "plane", "sample": "corners"}}}
 CONFIG = compose(LIGHT, "light")
 
 

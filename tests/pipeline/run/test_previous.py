@@ -1,4 +1,4 @@
-"""The metrics before the last execution that computed tiles are kept, for the comparison in the report."""
+"""Runs of earlier versions, and the metrics before the last execution that computed tiles, for the report."""
 
 import pytest
 
@@ -15,6 +15,15 @@ from flexroad.pipeline.store.tables import METRICS, PREVIOUS, read_metrics
 @pytest.fixture
 def run(survey, quick_config, tmp_path):
     return Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
+
+
+def test_run_of_a_version_without_extends_keeps_its_options(run):
+    file = run.path / "config.yaml"
+    text = file.read_text()
+    assert text.startswith("extends: defaults\n")
+    file.write_text(text.removeprefix("extends: defaults\n"))
+    assert Run.open(run.path).config.chains == run.config.chains
+    assert run.config.chains["flexroad"]["fit"].method == "nurbs"
 
 
 def touch(run):
