@@ -45,7 +45,8 @@ def format_summary(summary: Summary) -> str:
     parts = [f"{summary.cached} cached"]
     if summary.without_roads:
         parts.append(f"{summary.without_roads} without roads")
-    states = f"{summary.done} done ({', '.join(parts)}), {summary.failed} failed, {summary.pending} pending"
+    done = f"{summary.done} done ({', '.join(parts)}){summary.to_look_at}"
+    states = f"{done}, {summary.failed} failed, {summary.pending} pending"
     changes = f"{summary.new} new, {summary.changed} changed, {summary.vanished} vanished"
     return f"{count(summary.tiles, 'tile')}: {states}; {changes}; {summary.seconds:.0f} s"
 

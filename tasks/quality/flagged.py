@@ -19,6 +19,8 @@ LOCAL_FLAGS = (
     "error-estimate", "worst-error", "patch", "spike", "edge-step", "loose", "off-dtm", "inferred", "dropped",
 )  # fmt: skip
 """Flags of `tasks.quality.assess` that have places; the others concern the complete tile."""
+UNKNOWN = np.uint16(1 << 15)
+"""Of a tile whose flags are not known: its result is of an earlier version."""
 
 
 def flagged_cells(
@@ -61,8 +63,14 @@ def flagged_cells(
 
 
 def flag_names(bits: int) -> tuple[str, ...]:
-    """Return the names of the flags of a cell, or of all cells that a geometry passes."""
-    return tuple(flag for i, flag in enumerate(LOCAL_FLAGS) if bits >> i & 1)
+    """Return the names of the flags of a cell, or of all cells that a geometry passes; ``unknown`` is one."""
+    found = [flag for i, flag in enumerate(LOCAL_FLAGS) if bits >> i & 1]
+    return (*found, "unknown") if bits & UNKNOWN else tuple(found)
+
+
+def passed(bits: Bits) -> int:
+    """Return the flags of all cells that a geometry passes, from those of its points."""
+    return int(np.bitwise_or.reduce(bits, axis=None, initial=0))
 
 
 def bend(height: Floats, road: Bools) -> Floats:
