@@ -52,8 +52,8 @@ class Summary:
 
     @property
     def to_look_at(self) -> str:
-        """``, 4 to look at`` for a line about the tiles; empty if none has flags."""
-        return f", {len(self.flagged)} to look at" if self.flagged else ""
+        """``; 4 to look at`` for the end of a line about the tiles; empty if none has flags."""
+        return f"; {len(self.flagged)} to look at" if self.flagged else ""
 
     @property
     def exit_code(self) -> int:
