@@ -344,6 +344,11 @@ class Quality:
     """Share of the weights at a bound; NaN unless the surface is a NURBS."""
     error_estimate_m: float
     """Mean estimated error of the surface, by `tasks.quality.estimate`."""
+    worst_error_estimate_m: float
+    """Largest estimated error that 25 m2 of connected road reach, by `tasks.quality.worst`."""
+    worst_easting: float
+    """Easting of the cell with the largest estimate in that piece of road (m)."""
+    worst_northing: float
     suspect_m2: float
     """Area of the largest road patch whose distance to scan and DTM exceeds that of two heights of the same
     ground (m2); 0 if the road has none."""
@@ -357,6 +362,8 @@ class Quality:
     """Names of problems, from `tasks.quality.assess.FLAGS`."""
     support: NDArray[np.uint8]
     """Class of the core's cells by `tasks.quality.support.Support`, ``(H, W)``."""
+    flagged: NDArray[np.uint16]
+    """Raised flags of the core's cells by `tasks.quality.flagged.LOCAL_FLAGS`, ``(H, W)``."""
     levels: tuple[tuple[int, Quality], ...] = ()
     """Number and quality of each other level, on its decks or tubes: beyond them its support is none."""
     structures: Structures | None = None

@@ -47,7 +47,8 @@ def format_summary(summary: Summary) -> str:
         parts.append(f"{summary.without_roads} without roads")
     states = f"{summary.done} done ({', '.join(parts)}), {summary.failed} failed, {summary.pending} pending"
     changes = f"{summary.new} new, {summary.changed} changed, {summary.vanished} vanished"
-    return f"{count(summary.tiles, 'tile')}: {states}; {changes}; {summary.seconds:.0f} s"
+    seconds = f"{summary.seconds:.0f} s{summary.to_look_at}"
+    return f"{count(summary.tiles, 'tile')}: {states}; {changes}; {seconds}"
 
 
 def warn(line: str, kind: str = "warning") -> None:

@@ -21,6 +21,7 @@ from flexroad.pipeline.results.query import (
     along_lines,
     at_points,
     beyond_survey,
+    on_flagged,
     outside,
     required_crs,
 )
@@ -102,10 +103,10 @@ def query(
     ] = None,
     allow: options.Allow = None,
 ) -> None:
-    """Print heights, normals and classes at points or along lines.
+    """Print heights, normals, classes and flags at points or along lines.
 
-    The output is CSV: the columns of the points and height_m, nx, ny, nz, tile and class; with --line also
-    distance and grade.
+    The output is CSV: the columns of the points and height_m, nx, ny, nz, tile, class and flags; with --line
+    also distance and grade.
     """
     if (points is None) == (line is None):
         raise ConfigError("give the points with --points FILE, or a line with --line")
@@ -133,7 +134,9 @@ def query(
             f"the last finished state; next: flexroad rerun {shlex.quote(str(path))}",
             err=True,
         )
-    for note in filter(None, (*result.notes, outside(result, ground), beyond_survey(result))):
+    for note in filter(
+        None, (*result.notes, outside(result, ground), beyond_survey(result), on_flagged(result))
+    ):
         echo(f"note: {note}", err=True)
 
 

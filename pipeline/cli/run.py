@@ -41,6 +41,9 @@ from flexroad.tasks.io.height_offset import is_offset, on_tiles
 
 app = group()
 
+SHOWN = 5
+"""Tiles to look at that ``status`` names; summary.json has all."""
+
 
 def _address(value: str | None) -> str | None:
     """Return the address of a scheduler; a wrong one is refused before the catalog is read."""
@@ -347,3 +350,8 @@ def _print_status(run: Run, as_json: bool) -> None:
         echo(describe_owner(lock_owner) + pace)
     for failure in state.failures:
         echo(f"  {failure.notice}")
+    if state.flagged:
+        rest = len(state.flagged) - SHOWN
+        more = f" and {count(rest, 'other')}" if rest > 0 else ""
+        echo(f"to look at: {', '.join(state.flagged[:SHOWN])}{more}")
+        echo(f"next: flexroad report {shlex.quote(str(run.path))} --format html")

@@ -30,16 +30,18 @@ from flexroad.pipeline.export.pieces import (
     write_whole,
 )
 from flexroad.pipeline.export.source import Options, Source
-from flexroad.pipeline.run.finished import FinishedTile, GroundTile
+from flexroad.pipeline.run.finished import FinishedTile, GroundTile, passing
 from flexroad.pipeline.run.tile_steps import LARGEST_M, length_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import opencrg, opendrive
 from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
+from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tasks.roads import reference_line as lines
 from flexroad.tasks.roads.along_line import (
     HeightAt,
     HeightGrid,
     Profiles,
+    across,
     elevation_error,
     grid_error,
     height_grid,
@@ -150,6 +152,15 @@ class RouteUnit:
     def _local(self, of: Callable[[Floats, Floats, PlaceLevels | None], Floats], work: Work) -> HeightAt:
         return lambda x, y: of(*work.frame.to_run(x, y), self.levels(x, y))
 
+    def flags(self, line: ReferenceLine, work: Work) -> str:
+        """Return the flags that the carriageway of one of its roads passes, by name."""
+        v = across(line, 1.0, 0.0)
+        x, y = line.beside(v)
+        on = np.abs(v) <= line.width[:, None] / 2
+        x, y = x[on], y[on]
+        bits = Ground(self.tiles).flags(*work.frame.to_run(x, y), self.levels(x, y))
+        return ", ".join(flag_names(bits))
+
     def road_id(self, part: int) -> int:
         """Return the number of a road: OpenDRIVE's readers want whole numbers."""
         return self.number * 1000 + part
@@ -252,7 +263,8 @@ def crg_piece(unit: RouteUnit, work: Work) -> Piece:
         heights = work.vertical or "as in the run"
         comment = f"FlexRoad: {grid.line.name}\nx, y: {work.frame.proj}\nheights: {heights}"
         files[f"{road}{opencrg.NAME}"] = opencrg.encode(grid, comment)
-        rows.append(row(road, grid, height, step, profiles(grid), _tile_step(unit, work, grid)))
+        found = row(road, grid, height, step, profiles(grid), _tile_step(unit, work, grid))
+        rows.append(found | {"flags": unit.flags(grid.line, work)})
     return Piece(files, _route_row(unit, rows, problem))
 
 
@@ -268,7 +280,8 @@ def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
         decks = structures(unit.levels_on(grid.line.x, grid.line.y), grid.line.s)
         written = opendrive.Road(str(road), grid.line, fitted, crg, decks)
         texts.append(opendrive.encode(written, work.left_hand))
-        rows.append(row(road, grid, height, step, fitted, _tile_step(unit, work, grid)))
+        found = row(road, grid, height, step, fitted, _tile_step(unit, work, grid))
+        rows.append(found | {"flags": unit.flags(grid.line, work)})
     return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, rows, problem))
 
 
@@ -429,14 +442,16 @@ def _has_unusual_lanes(road: Row) -> bool:
 
 
 def totals(rows: list[Row], roads: Network) -> dict[str, Any]:
-    """Return number and length of the roads, and what was left out of the centre lines on the tiles."""
+    """Return number, length and flags of the roads, and what was left out of centre lines on the tiles."""
     length = sum(road["length_m"] for row in rows for road in row["roads"])
+    flagged = {str(road["id"]): road["flags"] for row in rows for road in row["roads"] if road["flags"]}
     return {
         "roads": sum(len(row["roads"]) for row in rows),
         "length_m": round(length, 1),
         "left_out_m": round(max(0.0, sum(roads.lengths) - length), 1),
         "left_out_areas": roads.areas,
-        "notes": list(roads.notes),
+        "flagged_roads": flagged,
+        "notes": [*roads.notes, *([passing(flagged, "road")] if flagged else [])],
     }
 
 

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, Grid
-from flexroad.pipeline.run.finished import GroundTile, estimate
+from flexroad.pipeline.run.finished import GroundTile, estimate, flagged
 from flexroad.pipeline.run.tile_steps import largest_tile_step
 from flexroad.tasks.levels.along_route import PlaceLevels
+from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
@@ -132,6 +133,17 @@ class Ground:
                     cells = tile.grid.cells(easting[here], northing[here])
                     error[here], support[here] = (values[cells] for values in estimates)
         return error, support
+
+    def flags(self, easting: Floats, northing: Floats, levels: PlaceLevels | None = None) -> int:
+        """Return the flags that points pass (`tasks.quality.flagged.flag_names`), each on its own level."""
+        numbers = np.zeros(easting.shape, np.int8) if levels is None else levels.number * levels.own
+        bits = 0
+        for tile in self.tiles:
+            within = _within(tile.grid.bounds, easting, northing)
+            for number in np.unique(numbers[within]).tolist():
+                here = within & (numbers == number)
+                bits |= passed(flagged(tile, number)[tile.grid.cells(easting[here], northing[here])])
+        return bits
 
 
 @dataclass(frozen=True, eq=False)

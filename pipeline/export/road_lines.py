@@ -87,12 +87,11 @@ def lines_piece(unit: RouteUnit, work: Work) -> Piece:
     rows, arrays = list[Row](), dict[str, Any]()
     for number, part in enumerate(parts):
         along = stations(part, height)
-        own, segments = (
-            _road(unit.road_id(number), part, along, stations(part, step)),
-            _arrays(along, unit, work),
-        )
+        own = _road(unit.road_id(number), part, along, stations(part, step))
         on_line = np.zeros(1), np.ones((len(part.x), 1), np.bool_)
         own["tile_steps_max_mm"] = millimetres(unit.tile_step(part, *on_line, work))
+        own["flags"] = unit.flags(part, work)
+        segments = _arrays(along, unit, work)
         if unit.levelled:
             levels = unit.levels_on(along.middle_x, along.middle_y)
             own["level"] = max(levels.tolist(), key=abs)

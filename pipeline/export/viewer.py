@@ -58,6 +58,7 @@ PENDING, DONE, FAILED = range(3)
 """States of tiles in the index."""
 MEASURES = {
     "error_estimate_m": ("Error estimate", "m"),
+    "worst_error_estimate_m": ("Error estimate of the worst 25 m²", "m"),
     "suspect_m2": ("Largest suspect patch", "m²"),
     "measured_road": ("Road measured by the scan", "%"),
     "dtm_road": ("Road from the terrain model", "%"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,10 +17,9 @@ from flexroad.pipeline.run.lock import exit_reason, owner
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, Track, open_database, recorded, summary, untracked
 from flexroad.pipeline.run.summary import Summary
-from flexroad.pipeline.store.records import TileState
+from flexroad.pipeline.store.records import TileState, needs_look
 from flexroad.pipeline.store.tables import METRICS, level_rows, metrics_frame, read_metrics
 from flexroad.tasks.errors import MeshFault
-from flexroad.tasks.quality.assess import NO_ROAD
 
 FIGURES = {
     "l2_road_m": "L2 road (m)",
@@ -54,6 +54,7 @@ FAULT = f"evaluate: {MeshFault.__name__}: "
 """Start of the error of a row whose mesh has a fault."""
 ESTIMATES = {
     "error_estimate_m": "error estimate (m)",
+    "worst_error_estimate_m": "of its worst 25 m² (m)",
     "suspect_m2": "largest suspect patch (m²)",
     "residual_p95_m": "p95 to its road points (m)",
     "curvature_per_m": "curvature (1/m)",
@@ -204,7 +205,8 @@ def _rows(run: Run) -> pd.DataFrame:
 
 def _state(counts: Summary) -> str:
     without = f" ({counts.without_roads} of them without roads)" if counts.without_roads else ""
-    return f"Tiles: {counts.done} done{without}, {counts.failed} failed, {counts.pending} pending"
+    states = f"{counts.done} done{without}, {counts.failed} failed, {counts.pending} pending"
+    return f"Tiles: {states}{counts.to_look_at}"
 
 
 def _over_tiles(
@@ -284,7 +286,7 @@ def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
     if not done["error_estimate_m"].notna().any():
         return pd.DataFrame()
     table = done.groupby("variant")[[*ESTIMATES, *SUPPORT]].mean().reindex(variants)
-    flagged = (~done["flags"].fillna("").isin(["", NO_ROAD])).groupby(done.variant).sum()
+    flagged = done["flags"].map(needs_look).groupby(done.variant).sum()
     table = _labelled(table)
     table.insert(0, "flagged tiles", flagged.reindex(variants))
     return table.reset_index().rename(columns={"variant": "method"})
@@ -326,6 +328,10 @@ def highest_error_estimates(done: pd.DataFrame, variant: str, most: int) -> pd.D
     )
     result = _labelled(table[[*ESTIMATES, *SUPPORT]])
     result.insert(0, "tile", table.tile_id)
+    places = table[["worst_easting", "worst_northing"]].itertuples(index=False)
+    result["worst at (E / N)"] = [
+        f"{east:.0f} / {north:.0f}" if math.isfinite(east) else "–" for east, north in places
+    ]
     return result.assign(flags=table["flags"].replace("", "–"))
 
 

@@ -32,10 +32,12 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.results.query import required_crs
 from flexroad.pipeline.results.query_files import to_crs
+from flexroad.pipeline.run.finished import passing
 from flexroad.pipeline.run.tile_steps import length_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text
 from flexroad.tasks.lift.types import Frame, Heights, Lifted, Options
+from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
@@ -113,6 +115,8 @@ class LiftedFile:
                 f"{' and '.join(parts)} of {count(len(without), self.noun)} lie beyond the finished tiles "
                 f"and {kept} ({_first(without)})"
             )
+        if flagged := {row.id: ", ".join(flag_names(row.flags)) for row in self.rows if row.flags}:
+            notes.append(passing(flagged, self.noun))
         for note, rows in self._by_note.items():
             notes.append(f"{count(len(rows), self.noun)}: {note} ({_first(rows)})")
         if unknown:
@@ -445,4 +449,4 @@ def _row(row: Lifted) -> dict[str, str | int | float]:
     values["points_without_ground"] = row.points_without_ground
     for name, (value, factor, digits) in figures.items():
         values[name] = round(value * factor, digits) if np.isfinite(value) else ""
-    return {**values, "note": row.note}
+    return {**values, "flags": ", ".join(flag_names(row.flags)), "note": row.note}

@@ -25,12 +25,14 @@ from flexroad.pipeline.run.finished import (
     GroundTile,
     RunPlace,
     estimate,
+    flagged,
     open_variant,
 )
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, peek_statuses
 from flexroad.pipeline.run.tile_steps import largest_tile_step
 from flexroad.tasks.lift.types import Heights
+from flexroad.tasks.quality.flagged import UNKNOWN, Bits
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Floats, RoadMask, Surface
@@ -54,6 +56,8 @@ class Answer:
     """``(n,)``, tile ids."""
     kind: NDArray[np.str_]
     """``(n,)``, ``road`` or ``terrain`` according to the segmented mask."""
+    flags: Bits
+    """``(n,)``, raised flags of the cells at the points, by `tasks.quality.flagged`."""
     earlier: tuple[str, ...] = ()
     """Ids of tiles whose values are of earlier sources or options (`Ground.earlier`)."""
     level: NDArray[np.int8] | None = None
@@ -116,7 +120,7 @@ class Ground:
         kind = np.full(easting.shape, "", dtype=object)
         tile[:] = ""
         earlier, numbers = [], {0}
-        of_level = np.zeros(easting.shape, np.int8)
+        of_level, flags = np.zeros(easting.shape, np.int8), np.zeros(easting.shape, np.uint16)
         for status, surface, road, selected in self._surfaces(easting, northing):
             earlier += [] if status.done else [status.graph.tile.id]
             tile[selected] = status.graph.tile.id
@@ -127,11 +131,13 @@ class Ground:
                 height[chosen], normal[chosen] = own.height(east, north), own.normal(east, north)
                 is_road = (number != 0) | road.mask[road.grid.cells(east, north)]
                 kind[chosen], of_level[chosen] = np.where(is_road, "road", "terrain"), number
+                flags[chosen] = self._flags(status, number, east, north)
         return Answer(
             height,
             normal,
             tile.astype(str),
             kind.astype(str),
+            flags,
             tuple(earlier),
             of_level if level is None else np.full(easting.shape, level, np.int8),
             tuple(sorted(numbers)),
@@ -140,7 +146,7 @@ class Ground:
     def heights(
         self, easting: Floats, northing: Floats, steps: bool = True
     ) -> tuple[Heights, tuple[str, ...]]:
-        """Return the heights of n points on all levels, and the ids of the tiles with `earlier` values.
+        """Return the heights of n points on all levels, with flags, and the ids of the tiles of `earlier`.
 
         Heights are NaN off the finished tiles and beyond the survey.
 
@@ -151,6 +157,7 @@ class Ground:
         """
         easting, northing = np.asarray(easting, np.float64), np.asarray(northing, np.float64)
         rows, earlier = {0: np.full(easting.shape, np.nan)}, list[str]()
+        flags = {0: np.zeros(easting.shape, np.uint16)}
         for status, surface, road, selected in self._surfaces(easting, northing):
             earlier += [] if status.done else [status.graph.tile.id]
             here = _inside(road, easting, northing, selected)
@@ -159,13 +166,17 @@ class Ground:
                 rows[0][here] = surface.smooth(east, north)
             else:
                 rows[0][here] = surface.height(east, north)
+            flags[0][here] = self._flags(status, 0, east, north)
             if isinstance(surface, LevelledSurface):
                 for own in surface.levels:
                     row = rows.setdefault(own.level.number, np.full(easting.shape, np.nan))
                     on = own.level.covers(east, north)
                     row[here[on]] = surface.at(own.level.number).height(east[on], north[on])
+                    bits = flags.setdefault(own.level.number, np.zeros(easting.shape, np.uint16))
+                    bits[here[on]] = self._flags(status, own.level.number, east[on], north[on])
         numbers = tuple(sorted(rows))
-        return Heights(numbers, np.stack([rows[number] for number in numbers])), tuple(earlier)
+        z, bits = (np.stack([each[number] for number in numbers]) for each in (rows, flags))
+        return Heights(numbers, z, bits), tuple(earlier)
 
     def largest_tile_step(self, easting: Floats, northing: Floats, near_m: float) -> float:
         """Return the largest step (m) between the tiles of neighbouring points, ``(n,)``; 0 if there is none.
@@ -226,11 +237,23 @@ class Ground:
             name: np.concatenate(
                 [getattr(answer, name)[rows] for answer, rows in zip(answers, kept, strict=True)]
             )
-            for name in ("height", "normal", "tile", "kind", "level")
+            for name in ("height", "normal", "tile", "kind", "flags", "level")
         }
         order = np.lexsort((columns["level"], columns["level"] != 0, points))
         columns = {name: values[order] for name, values in columns.items()}
         return points[order], replace(ground, **columns)
+
+    def _flags(self, status: TileStatus, number: int, easting: Floats, northing: Floats) -> Bits:
+        """Return the flags of the cells of a tile at points, on a level."""
+        if status.done:
+            cells = flagged(GroundTile.of(FinishedTile.of(self.run, status, self.variant)), number)
+        else:
+            nodes = self.run.folder(status.graph.tile.id).nodes(self.variant)
+            last = RunPlace.of(self.run).artefacts.find("assess", nodes.get("assess", ""))
+            if last is None:
+                return np.full(easting.shape, UNKNOWN)
+            cells = last.value.at(number).flagged
+        return cells[status.graph.around.grid.cells(easting, northing)]
 
     def _surfaces(
         self, easting: Floats, northing: Floats

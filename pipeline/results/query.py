@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
@@ -19,8 +20,10 @@ from flexroad.catalog.text import count, reason
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.results.points import Answer, Ground
 from flexroad.pipeline.results.query_files import Points, to_crs
+from flexroad.pipeline.run.finished import SEE_REPORT
 from flexroad.pipeline.run.tile_steps import LARGEST_M, REMEDY, length_text
 from flexroad.pipeline.store.tables import csv_text
+from flexroad.tasks.quality.flagged import Bits, flag_names
 from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
@@ -33,6 +36,10 @@ MAX_POINTS = 10_000_000
 """Largest number of points of the profiles of one command: their table takes gigabytes."""
 LevelWanted = int | Literal["all"] | None
 """A level of roads above roads, all that each point has, or the highest."""
+MOST_NAMED = 3
+"""Kinds of flagged places that a note names."""
+PASSED_M = 1.0
+"""Distance of the points between two steps of a profile at which flagged places are looked for (m)."""
 MILLIMETRES = ("distance_m", "easting", "northing")
 """Columns that are written with three decimals; other numbers have nine digits."""
 
@@ -124,7 +131,7 @@ def required_crs(ground: Ground) -> str:
 
 
 def at_points(ground: Ground, points: Points, level: LevelWanted = None) -> AnswerTable:
-    """Return what a run has at points: the columns height_m, nx, ny, nz, tile and class.
+    """Return what a run has at points: the columns height_m, nx, ny, nz, tile, class, flags.
 
     Points of a vector file also get the columns easting and northing (m), in the CRS of the run. With a level
     there is also a column level; with all levels, each point has a row for each level that it has.
@@ -167,8 +174,8 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float, level: Level
     """Return profiles: what a run has every ``step_m`` along lines, and at their ends.
 
     The columns are line (only if there are several), distance_m, easting, northing, height_m, grade_percent,
-    nx, ny, nz, tile and class. The grade is that of the surface in the direction of the line, positive
-    uphill. For levels see `at_points`.
+    nx, ny, nz, tile, class and flags. The grade is that of the surface in the direction of the line, positive
+    uphill. Flags are those up to the next point. For levels see `at_points`.
 
     Raises
     ------
@@ -178,6 +185,8 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float, level: Level
     points = stations(lines, step_m)
     easting, northing = points.easting.to_numpy(), points.northing.to_numpy()
     rows, answer = _on_level(ground, easting, northing, level)
+    if step_m > PASSED_M and level != "all":
+        answer = replace(answer, flags=_up_to_next(ground, lines, points, level))
     points = points.iloc[rows]
     # A normal is (-dz/dx, -dz/dy, 1), scaled to length 1.
     slope = -(answer.normal[:, :2] * points[["east", "north"]].to_numpy()).sum(axis=1) / answer.normal[:, 2]
@@ -188,6 +197,20 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float, level: Level
     note = f"the line crosses tiles that do not meet, by up to {length_text(apart)}; {REMEDY}"
     notes = (note,) if apart > LARGEST_M else ()
     return AnswerTable(table, easting[rows], northing[rows], crs_of(ground), answer, notes, level=level)
+
+
+def _up_to_next(ground: Ground, lines: list[Floats], points: pd.DataFrame, level: int | None) -> Bits:
+    """Return the flags that each line passes from each of its points to the next one."""
+    length = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines)
+    between = stations(lines, max(PASSED_M, 2 * length / MAX_POINTS))
+    found = ground.at(between.easting.to_numpy(), between.northing.to_numpy(), level).flags
+    # Lines one behind the other.
+    own, fine = (
+        table.line.to_numpy() * (length + 1.0) + table.distance_m.to_numpy() for table in (points, between)
+    )
+    bits = np.zeros(len(points), np.uint16)
+    np.bitwise_or.at(bits, np.searchsorted(own, fine + 1e-6, side="right") - 1, found)
+    return bits
 
 
 def stations(lines: list[Floats], step_m: float) -> pd.DataFrame:
@@ -233,7 +256,8 @@ def _along(line: Floats, step_m: float) -> Floats:
 def _columns(answer: Answer, level: LevelWanted) -> dict[str, Any]:
     normal = dict(zip(("nx", "ny", "nz"), answer.normal.T, strict=True))
     columns = {"height_m": answer.height, **normal, "tile": answer.tile, "class": answer.kind}
-    return columns if level is None else columns | {"level": answer.level}
+    columns |= {} if level is None else {"level": answer.level}
+    return columns | {"flags": [", ".join(flag_names(bits)) for bits in answer.flags.tolist()]}
 
 
 def beyond_survey(result: AnswerTable) -> str:
@@ -245,6 +269,17 @@ def beyond_survey(result: AnswerTable) -> str:
     if result.level not in (None, 0, "all"):
         return f"{count(number, 'point')} {verb} on no road of level {result.level}; {whose} height is empty"
     return f"{count(number, 'point')} {verb} beyond the survey; {whose} height, normal and class are empty"
+
+
+def on_flagged(result: AnswerTable) -> str:
+    """Return a line about the points on flagged places, empty if there are none."""
+    found = Counter(name for name in result.table["flags"] if name)
+    if not found:
+        return ""
+    number = found.total()
+    told = "; ".join(f"{names}: {n:,}" for names, n in found.most_common(MOST_NAMED))
+    verb = "lies" if number == 1 else "lie"
+    return f"{count(number, 'point')} {verb} on flagged places ({told}); {SEE_REPORT}"
 
 
 def outside(result: AnswerTable, ground: Ground) -> str:

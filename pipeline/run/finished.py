@@ -8,7 +8,7 @@ is kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import blake2b
@@ -22,6 +22,7 @@ from flexroad.catalog import Grid, Tile
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.storage.paths import Location, parse_location, read, stat
+from flexroad.catalog.text import count, some
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing, product_layers
 from flexroad.pipeline.graph.stages import STAGE_NAMES
@@ -35,6 +36,7 @@ from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
+from flexroad.tasks.quality.flagged import Bits
 from flexroad.tasks.quality.places import Place, places
 from flexroad.tasks.types import (
     Floats,
@@ -51,6 +53,7 @@ ESTIMATES = 32
 """Number of tiles of which a process keeps the error estimates (0.6 MB each)."""
 NO_DISTANCES = (math.nan,) * len(FIGURES)
 """Distances of a mesh that has none, or is of an older version (m)."""
+SEE_REPORT = "`flexroad report` says what is wrong there"
 COMPUTED_AGAIN = "it was computed again while it was exported; export again"
 
 
@@ -399,3 +402,17 @@ def estimate(tile: GroundTile, number: int) -> tuple[NDArray[np.float32], NDArra
     except ConfigError:
         return None
     return error.astype(np.float32), support
+
+
+@lru_cache(maxsize=ESTIMATES)
+def flagged(tile: GroundTile, number: int) -> Bits:
+    """Return the flags of each cell of a tile on a level, ``(H, W)``; those of level 0 if it has no other."""
+    return tile.unread.quality.at(number).flagged
+
+
+def passing(flags: Mapping[str, str], noun: str) -> str:
+    """Return a line about the roads or features that pass flagged places, from their flags by name."""
+    number = len(flags)
+    verb = "passes" if number == 1 else "pass"
+    named = some([f"{name}: {own}" for name, own in flags.items()])
+    return f"{count(number, noun)} {verb} flagged places ({named}); {SEE_REPORT}"

@@ -275,7 +275,8 @@ def _close(
         states = zip(run.catalog.tiles, database.states(), strict=True)
         write_collection(run, [tile for tile, state in states if state in ("done", "cached")])
     summary = replace(summary, seconds=round(time.perf_counter() - start_s, 3))
-    log.note("end", **{name: value for name, value in asdict(summary).items() if name != "failures"})
+    lists = ("failures", "flagged")
+    log.note("end", **{name: value for name, value in asdict(summary).items() if name not in lists})
     about = {
         "start": start,
         "end": utc_now(),

@@ -267,11 +267,11 @@ def recorded_summary(run: Run, database: RunDatabase, since: str) -> tuple[Summa
 
     They are read from the database; only if it is damaged or has other tiles, every tile is checked.
     """
-    listed = database.listed((tile.id for tile in run.catalog.tiles), since)
+    listed = database.listed((tile.id for tile in run.catalog.tiles), since, run.config.export.variants[0])
     if listed is None:
         return _checked(run, database, since)
-    current = summarise(len(run.catalog.tiles), listed.counts, database.failures(), listed.without_roads)
-    return current, listed.finished
+    found = listed.without_roads, listed.flagged
+    return summarise(len(run.catalog.tiles), listed.counts, database.failures(), *found), listed.finished
 
 
 def _checked(
@@ -283,16 +283,20 @@ def _checked(
 ) -> tuple[Summary, int]:
     """Return what `recorded_summary` returns, from the tiles' folders and source files."""
     counts, failures, finished, without_roads = Counter[TileState](), list[Failure](), 0, 0
+    flagged, variant = list[str](), run.config.export.variants[0]
     states = tile_states(run, database, since)
     for status, state in track(states, "checking tiles", len(run.catalog.tiles)):
         counts[state] += 1
         each(status, state)
         record = status.last_record
         finished += record is not None and record.finished >= (since or "")
-        without_roads += status.done and record is not None and record.without_roads
+        if status.done and record is not None:
+            without_roads += record.without_roads
+            flagged += [record.tile_id] if variant in record.flagged else []
         if state == "failed" and record and len(failures) < MAX_FAILURES:
             failures += record.failures
-    return summarise(len(run.catalog.tiles), counts, failures, without_roads), finished
+    current = summarise(len(run.catalog.tiles), counts, failures, without_roads, tuple(flagged))
+    return current, finished
 
 
 def progress(run: Run, owner: Owner) -> tuple[Summary, str]:

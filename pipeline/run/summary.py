@@ -45,8 +45,15 @@ class Summary:
     """Error that stopped the last execution as a whole; empty if there was none."""
     without_roads: int = 0
     """Done tiles that have no road: their surface is that of the terrain."""
+    flagged: tuple[str, ...] = ()
+    """Ids of the done tiles to look at: those with flags in the variant exported first, but for no-road."""
     failures: tuple[Failure, ...] = ()
     """The first `MAX_FAILURES` failures, in the catalog's order."""
+
+    @property
+    def to_look_at(self) -> str:
+        """``; 4 to look at`` for the end of a line about the tiles; empty if none has flags."""
+        return f"; {len(self.flagged)} to look at" if self.flagged else ""
 
     @property
     def exit_code(self) -> int:
@@ -57,7 +64,11 @@ class Summary:
 
 
 def summarise(
-    tiles: int, counts: Counter[TileState], failures: Iterable[Failure], without_roads: int = 0
+    tiles: int,
+    counts: Counter[TileState],
+    failures: Iterable[Failure],
+    without_roads: int = 0,
+    flagged: tuple[str, ...] = (),
 ) -> Summary:
     """Return the summary of a run with ``tiles`` tiles from the number of tiles in each state."""
     done, first = counts["done"] + counts["cached"], tuple(islice(failures, MAX_FAILURES))
@@ -69,6 +80,7 @@ def summarise(
         counts["cached"],
         pending,
         without_roads=without_roads,
+        flagged=flagged,
         failures=first,
     )
 

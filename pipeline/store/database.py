@@ -42,7 +42,7 @@ from flexroad.pipeline.store.sqlite_file import (
 )
 
 NAME = "database.sqlite"
-VERSION = 3
+VERSION = 4
 Recover = Callable[[str], TileRecord | None]
 """Returns the record in a tile's marker, by the tile's id."""
 
@@ -51,10 +51,12 @@ PAGE = 500
 FLUSH_S = 1.0
 """Interval between writes of recorded tiles (s)."""
 CHECKSUM_BYTES = 16
+SEPARATOR = "\n"
+"""Between the variants in which a tile has flags."""
 TABLES = (
     "CREATE TABLE entry (tile TEXT PRIMARY KEY, finished TEXT, record TEXT, checksum BLOB)",
     "CREATE TABLE asked (position INTEGER PRIMARY KEY, tile TEXT UNIQUE, standing TEXT, finished TEXT,"
-    " roadless INTEGER, record BLOB, checksum BLOB)",
+    " roadless INTEGER, flagged TEXT, record BLOB, checksum BLOB)",
     "CREATE TABLE total (checksum BLOB)",
 )
 T = TypeVar("T")
@@ -69,6 +71,8 @@ class Listed:
     """Number of tiles finished (done or failed) since the time asked for."""
     without_roads: int = 0
     """Number of done tiles without roads."""
+    flagged: tuple[str, ...] = ()
+    """Ids of the done tiles that have flags in the variant asked for."""
 
 
 class RunDatabase:
@@ -183,7 +187,7 @@ class RunDatabase:
         """Return a tile's record, from its marker if the database has none."""
         return self.get(tile_id) or self._recover(tile_id)
 
-    def listed(self, tiles: Iterable[str], since: str = "") -> Listed | None:
+    def listed(self, tiles: Iterable[str], since: str = "", variant: str = "") -> Listed | None:
         """Return the counts over the list of tiles; None if it is damaged or has other tiles.
 
         Parameters
@@ -192,13 +196,15 @@ class RunDatabase:
             The ids that the list should have, in its order.
         since : str
             Count the tiles finished since this time (ISO 8601, UTC).
+        variant : str
+            List the tiles that have flags in this variant.
         """
         self.flush()
-        counts, finished, without_roads = Counter[TileState](), 0, 0
+        counts, finished, without_roads, flagged = Counter[TileState](), 0, 0, list[str]()
         combined, total = 0, bytes(CHECKSUM_BYTES)
         # One query sees one state of the file, also while a run writes it.
         query = (
-            "SELECT position, tile, standing, finished, roadless, record, checksum,"
+            "SELECT position, tile, standing, finished, roadless, flagged, record, checksum,"
             " (SELECT checksum FROM total)"
             " FROM asked ORDER BY position"
         )
@@ -210,11 +216,13 @@ class RunDatabase:
                     return None
                 counts[fields[2]] += 1
                 finished += bool(fields[3]) and str(fields[3]) >= since
-                without_roads += fields[2] in ("done", "cached") and fields[4]
+                if fields[2] in ("done", "cached"):
+                    without_roads += fields[4]
+                    flagged += [tile] if variant and variant in fields[5].split(SEPARATOR) else []
                 combined ^= int.from_bytes(checksum)
         except (*Damage, ValueError):
             return None
-        return Listed(counts, finished, without_roads) if total == _bytes(combined) else None
+        return Listed(counts, finished, without_roads, tuple(flagged)) if total == _bytes(combined) else None
 
     def states(self) -> Iterator[TileState]:
         """Yield the state of every tile as set by the last run, in the catalog's order.
@@ -262,7 +270,7 @@ class RunDatabase:
             yield from record.failures if record else ()
 
     def _entries(self, condition: str) -> Iterator[tuple[str, TileState, TileRecord | None]]:
-        for _, tile, state, _, _, link, _ in self._asked(condition):
+        for _, tile, state, _, _, _, link, _ in self._asked(condition):
             # No join: where an entry cannot be read, the rest of the page can.
             row = self._row("SELECT finished, record FROM entry WHERE tile = ?", tile) if link else None
             record = _record(tile, row[0], row[1], link) if row else None
@@ -272,13 +280,13 @@ class RunDatabase:
         """Yield rows of `asked`, read in pages."""
         self.flush()
         query = (
-            "SELECT position, tile, standing, finished, roadless, record, checksum FROM asked"
+            "SELECT position, tile, standing, finished, roadless, flagged, record, checksum FROM asked"
             f" WHERE position > ? {condition} ORDER BY position LIMIT {PAGE}"
         )
         last = 0
         while page := self._page(query, last):
             for row in page:
-                if digest(*row[:6]) != row[6] or row[0] <= last:
+                if digest(*row[:7]) != row[7] or row[0] <= last:
                     raise OSError(errno.EIO, "the list of tiles is damaged", str(self._staged.where))
                 last = row[0]
                 yield row
@@ -303,10 +311,10 @@ class RunDatabase:
         for position, (tile, state) in enumerate(tiles, 1):
             entry = execute("SELECT finished, record, checksum FROM entry WHERE tile = ?", (tile,)).fetchone()
             record = _record(tile, *entry) if entry else None
-            about = (entry[0], int(record.without_roads), entry[2]) if record else ("", 0, b"")
+            about = (entry[0], *_marks(record), entry[2]) if record else ("", 0, "", b"")
             fields = (position, tile, state, *about)
             checksum = digest(*fields)
-            execute("INSERT INTO asked VALUES (?, ?, ?, ?, ?, ?, ?)", (*fields, checksum))
+            execute("INSERT INTO asked VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*fields, checksum))
             combined ^= int.from_bytes(checksum)
         execute("DELETE FROM total")
         execute("INSERT INTO total VALUES (?)", (_bytes(combined),))
@@ -339,21 +347,21 @@ class RunDatabase:
 
         It is None if the tile has no row, or a damaged one, which stays as it is.
         """
-        query = "SELECT position, standing, finished, roadless, record, checksum FROM asked WHERE tile = ?"
-        row = self._connection.execute(query, (entry.tile_id,)).fetchone()
-        if row is None or digest(row[0], entry.tile_id, *row[1:5]) != row[5]:
-            return None
-        fields = (
-            *(row[0], entry.tile_id, entry.state, entry.finished),
-            *(int(entry.without_roads), link),
+        query = (
+            "SELECT position, standing, finished, roadless, flagged, record, checksum FROM asked"
+            " WHERE tile = ?"
         )
+        row = self._connection.execute(query, (entry.tile_id,)).fetchone()
+        if row is None or digest(row[0], entry.tile_id, *row[1:6]) != row[6]:
+            return None
+        fields = (row[0], entry.tile_id, entry.state, entry.finished, *_marks(entry), link)
         checksum = digest(*fields)
         self._connection.execute(
-            "UPDATE asked SET standing = ?, finished = ?, roadless = ?, record = ?, checksum = ?"
+            "UPDATE asked SET standing = ?, finished = ?, roadless = ?, flagged = ?, record = ?, checksum = ?"
             " WHERE position = ?",
             (*fields[2:], checksum, row[0]),
         )
-        return int.from_bytes(row[5]) ^ int.from_bytes(checksum)
+        return int.from_bytes(row[6]) ^ int.from_bytes(checksum)
 
     def _write(self, change: Callable[[], T]) -> T:
         """Write in one transaction, into a new and empty file if the old one turns out to be damaged."""
@@ -370,6 +378,11 @@ class RunDatabase:
                 return change()
         except Damage as error:
             raise os_error(error, self._staged.where) from error
+
+
+def _marks(record: TileRecord) -> tuple[int, str]:
+    """Return whether a tile has no roads, and the variants in which it has flags, as the list has them."""
+    return int(record.without_roads), SEPARATOR.join(record.flagged)
 
 
 def digest(*fields: Any) -> bytes:

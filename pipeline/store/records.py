@@ -85,6 +85,16 @@ class TileRecord:
         flags = [(row.get("flags") or "").split(", ") for row in self.rows]
         return self.state == "done" and bool(flags) and all(NO_ROAD in names for names in flags)
 
+    @property
+    def flagged(self) -> tuple[str, ...]:
+        """The variants that have flags (`needs_look`)."""
+        return tuple(row["variant"] for row in self.rows if needs_look(row.get("flags")))
+
+
+def needs_look(flags: object) -> bool:
+    """Return whether a row with these flags should be looked at: it has one beside `NO_ROAD`."""
+    return isinstance(flags, str) and not {*flags.split(", ")} <= {"", NO_ROAD}
+
 
 def from_item(item: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
     """Return the record of a finished tile from its STAC item.

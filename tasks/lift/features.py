@@ -18,6 +18,7 @@ from flexroad.tasks.lift.levels import ANY, Numbers, along
 from flexroad.tasks.lift.lines import STEP_M, Line, largest, steepest
 from flexroad.tasks.lift.shapes import POINT, POLYGON, Shape
 from flexroad.tasks.lift.types import Heights, Lifted, Options, RunSurface, Steep
+from flexroad.tasks.quality.flagged import Bits, passed
 from flexroad.tasks.roads import level_numbers
 from flexroad.tasks.types import Bools, Floats
 
@@ -247,6 +248,8 @@ class _Group:
     """``(n,)``, heights of the points on the levels of their paths; NaN without ground."""
     numbers: Numbers
     """``(n,)``, numbers of these levels."""
+    flags: Bits
+    """``(n,)``, flags of the surface there."""
     crossfalls: Floats | None
     errors: Floats | None
     options: Options
@@ -272,7 +275,7 @@ def _group(
         errors[known] = run.errors(samples.east[known], samples.north[known], numbers[known])
     if options.columns or options.crossfall_limit is not None:
         crossfalls = samples.crossfalls(numbers, run)
-    group = _Group(samples, z, numbers, crossfalls, errors, options)
+    group = _Group(samples, z, numbers, heights.flags_on(numbers), crossfalls, errors, options)
     for feature, parts in zip(features, own, strict=True):
         if feature.shape is None or not parts:
             yield feature.shape and feature.shape.with_paths(iter(())), Lifted(feature.id)
@@ -329,6 +332,7 @@ def _point(name: str, shape: Shape, at: int, group: _Group) -> tuple[Shape, Lift
         levels=(int(group.numbers[at]),),
         before_m=before,
         error_m=math.nan if group.errors is None else float(group.errors[at]),
+        flags=int(group.flags[at]),
     )
 
 
@@ -423,6 +427,7 @@ def _row(
         error_m=np.nan if group.errors is None else largest(group.errors[place]),
         points_without_ground=points,
         steep=tuple(steep),
+        flags=passed(group.flags[place]),
     )
 
 

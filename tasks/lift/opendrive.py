@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -23,6 +23,7 @@ from flexroad.tasks.lift.profile import AHEAD_M, value_at
 from flexroad.tasks.lift.road_profiles import NONE, CrossSections
 from flexroad.tasks.lift.types import Frame, Heights, HeightsAt, Lifted, Options, Steep
 from flexroad.tasks.lift.xml_text import Part
+from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Bools, Floats
 
 NOUN = "road"
@@ -258,7 +259,9 @@ def _lifted(
         road.part, opendrive_text.records("elevation", elevation), lateral, surface
     )
     row = _row(road, sections, used, unknown_m, elevation, across, shapes, options)
-    return text, row
+    on_lanes = np.flatnonzero(road.inside)
+    numbers = np.array(heights.numbers, np.int8)[np.repeat(rows, len(road.t))[on_lanes]]
+    return text, replace(row, flags=passed(heights[on_lanes].flags_on(numbers)))
 
 
 def _sections(

@@ -21,6 +21,7 @@ from flexroad.tasks.lift.lines import Line, largest
 from flexroad.tasks.lift.meetings import Meetings
 from flexroad.tasks.lift.types import Frame, Heights, HeightsAt, Lifted, Options
 from flexroad.tasks.lift.xml_text import Part
+from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
 
 NOUN = "way"
@@ -275,6 +276,7 @@ class _Added:
             elevation_m=largest(np.abs(np.interp(line.s, line.s[index], z[index]) - z)),
             grade=grade,
             steep=steep,
+            flags=passed(heights.flags_on(numbers)),
         )
 
     def _note(self, way: _Way, line: Line, index: Indices, z: Floats) -> None:

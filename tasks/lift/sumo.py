@@ -19,6 +19,7 @@ from flexroad.tasks.lift.lines import STEP_M, Line, largest
 from flexroad.tasks.lift.meetings import Meetings
 from flexroad.tasks.lift.types import Frame, Heights, HeightsAt, Lifted, Options
 from flexroad.tasks.lift.xml_text import Part
+from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
 
 NOUN = "edge"
@@ -224,7 +225,8 @@ class _Copy:
         edits, lanes, start = dict[ET.Element, dict[str, str]](), list[Lifted](), 0
         for shape in piece.shapes:
             end = start + len(shape.line.s)
-            z, numbers = self._heights(element, shape, heights[start:end], own)
+            here = heights[start:end]
+            z, numbers = self._heights(element, shape, here, own)
             without = shape.line.length_where(~np.isfinite(z))
             if level < 0 and own is None:
                 # A tunnel whose level is not known meets other roads at its ends alone.
@@ -237,7 +239,9 @@ class _Copy:
             index = shape.line.needed(z, self.options.tolerance_m, self.options.add_vertices is not False)
             self._edit(shape, index, z, edits)
             if shape.element.tag == "lane" and not shape.area:
-                lanes.append(replace(self._row(shape, taken, index, numbers), without_ground_m=without))
+                row = self._row(shape, taken, index, numbers)
+                flags = passed(here.flags_on(numbers))
+                lanes.append(replace(row, without_ground_m=without, flags=flags))
         edited = [piece.part.with_attributes(each, values) for each, values in edits.items()]
         text = piece.part.replaced(edited)
         if not lanes or element.get("function"):
@@ -329,4 +333,5 @@ def _joined(name: str, lanes: list[Lifted], unknown: bool) -> Lifted:
         elevation_m=off,
         grade=grade,
         steep=tuple(place for lane in lanes for place in lane.steep),
+        flags=passed(np.array([lane.flags for lane in lanes], np.uint16)),
     )

@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.tasks.quality.flagged import Bits
 from flexroad.tasks.types import Bools, Floats
 
 Places = slice | Bools | NDArray[np.intp]
@@ -22,9 +23,20 @@ class Heights:
     """The k levels, ascending; 0, the ground, is one of them."""
     z: Floats
     """``(k, n)``, m; NaN where a level is not, and beyond the surface."""
+    flags: Bits | None = None
+    """``(k, n)``, flags of the surface by `tasks.quality.flagged`; None if it has none."""
 
     def __getitem__(self, places: Places) -> Heights:
-        return replace(self, z=self.z[:, places])
+        flags = None if self.flags is None else self.flags[:, places]
+        return replace(self, z=self.z[:, places], flags=flags)
+
+    def flags_on(self, numbers: NDArray[np.int8]) -> Bits:
+        """Return the flags of the points on given levels, ``(n,)``."""
+        found = np.zeros(len(numbers), np.uint16)
+        if self.flags is not None:
+            for number, row in zip(self.numbers, self.flags, strict=True):
+                found[numbers == number] = row[numbers == number]
+        return found
 
     @property
     def ground(self) -> Floats:
@@ -147,6 +159,8 @@ class Lifted:
     note: str = ""
     points_without_ground: int = 0
     """Number of points where the run has no surface."""
+    flags: int = 0
+    """Flags of the surface that it passes (`tasks.quality.flagged.flag_names`)."""
 
     def noted(self, note: str) -> Lifted:
         """Return the row with a note."""

@@ -14,22 +14,26 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flexroad.catalog.grid import Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.levels.seen import level_data, level_road
 from flexroad.tasks.metrics.statistics import mean, nmad
-from flexroad.tasks.quality.estimate import compare
+from flexroad.tasks.quality.estimate import Compared, compare
+from flexroad.tasks.quality.flagged import flagged_cells
 from flexroad.tasks.quality.holdout import Refit, holdout
 from flexroad.tasks.quality.structures import STRUCTURE_FLAGS, structures
 from flexroad.tasks.quality.support import Support
+from flexroad.tasks.quality.worst import worst_piece
 from flexroad.tasks.roads.dtm_validity import AGREE_M
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
 
-VERSION = 5
+VERSION = 6
 
 FLAGS = {
     "error-estimate": "error_estimate_m",
+    "worst-error": "worst_error_estimate_m",
     "patch": "suspect_m2",
     "spike": "curvature_per_m",
     "edge-step": "edge_step_m",
@@ -55,6 +59,12 @@ class Options(base.Options):
         0.1,
         gt=0,
         description="flag error-estimate: mean estimated error of the surface on the road (m)",
+    )
+    worst_error_estimate_m: float = Field(
+        0.5,
+        gt=0,
+        description="flag worst-error: largest estimated error of a connected 25 m2 of road (m); sound roads "
+        "have less than 0.3",
     )
     suspect_m2: float = Field(
         50.0, gt=0, description="flag patch: largest patch of road farther than agree_m from DSM and DTM (m2)"
@@ -165,6 +175,7 @@ def _assess(
         "off_dtm_road": mean(np.abs(to_dtm) > options.agree_m),
         "bounded_weights": _share_at_bound(surface),
         "error_estimate_m": mean(_finite(estimate[on_road])),
+        **_worst(cells, data.core),
         **asdict(holdout(data, road, clusters, refit, options.agree_m, options.holdout)),
         "suspect_m2": _largest_patch(on_road & (cells.deviation > options.agree_m)) * cell**2,
     }
@@ -175,7 +186,16 @@ def _assess(
         flags = []
     if not kept.any():
         flags = [NO_ROAD, *flags]
-    return Quality(**figures, flags=tuple(flags), support=classes)
+    limits = {flag: getattr(options, name) for flag, name in FLAGS.items()}
+    flagged = flagged_cells(cells, cell, limits, options.agree_m, flags)
+    return Quality(**figures, flags=tuple(flags), support=classes, flagged=flagged)
+
+
+def _worst(cells: Compared, core: Grid) -> dict[str, float]:
+    """Return the largest estimate of a piece of road (m), and where; NaN without road."""
+    worst = worst_piece(cells.estimate, cells.on_road, core)
+    found = (worst.estimate_m, worst.easting, worst.northing) if worst else (float("nan"),) * 3
+    return dict(zip(("worst_error_estimate_m", "worst_easting", "worst_northing"), found, strict=True))
 
 
 def cell_errors(

@@ -33,6 +33,9 @@ MIN_SHARE = 0.2
 """Smallest share of cells with a residual in a square that counts."""
 SCATTER_M = 5.0
 """Side of the square over which the scatter of the DSM is taken (m); smaller than a tree crown."""
+CLIMB, CLIMB_M = 0.15, 3.0
+"""Steepest road off the ground (m per m), and least width of what is steeper (m): ramps are built with up to
+15%, objects rise by more, and the edge of a deck is narrower."""
 
 
 def error_estimate(
@@ -85,15 +88,49 @@ def deviation(off_dsm: Floats, off_dtm: Floats, scatter: Floats, kept: Bools, in
     return np.fmin(by_scan, by_dtm)
 
 
-def scatter(dsm_above_dtm: Floats, kept: Bools, cell: float) -> Floats:
+def scatter(dsm: Floats, dtm: Floats, kept: Bools, cell: float) -> Floats:
     """Return the standard deviation of DSM minus DTM on kept cells around each cell, ``(H, W)``, m.
 
-    It is small on roads and bridge decks and large in tree crowns; 0 where no kept cell is near.
+    That of the DSM alone counts where it is smaller: a deck is smooth above a steep bank. It is small on
+    roads and decks and large in tree crowns; 0 where no kept cell is near.
     """
-    valid, size = kept & np.isfinite(dsm_above_dtm), _width(SCATTER_M, cell)
+    valid, size = kept & np.isfinite(dsm - dtm), _width(SCATTER_M, cell)
     share = _share_around(valid, size)
-    mean, square = (_mean_around(values, valid, share, size) for values in (dsm_above_dtm, dsm_above_dtm**2))
+    # From a height near by: squares of heights above the sea lose digits.
+    level = float(np.mean(dsm[valid])) if valid.any() else 0.0
+    return np.fmin(*(_deviation_around(heights, valid, share, size) for heights in (dsm - dtm, dsm - level)))
+
+
+def _deviation_around(values: Floats, valid: Bools, share: Floats, size: int) -> Floats:
+    """Return the standard deviation of the valid values in a square around each cell, ``(H, W)``."""
+    mean, square = (_mean_around(own, valid, share, size) for own in (values, values**2))
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)))
+
+
+def climbed(smooth: Floats, dtm: Floats, kept: Bools, cell: float, agree_m: float) -> Bools:
+    """Return the kept cells where the surface climbs an object, and those that they enclose, ``(H, W)``.
+
+    It is off the DTM there, and steeper than a road, in itself and relative to the DTM: a deck is level above
+    a steep bank, and a street in a hill is as steep as the DTM.
+
+    Parameters
+    ----------
+    smooth, dtm : (H, W) array
+        Heights of the surface without steps, and of the terrain (m).
+    kept : (H, W) array of bool
+        Road cells that the filter kept.
+    cell : float
+        Size of a cell (m).
+    agree_m : float
+        Largest difference between two heights of the same ground (m).
+    """
+    steep = kept & (np.abs(smooth - dtm) > agree_m)
+    if steep.any():
+        for heights in (smooth, smooth - dtm):
+            slope = scipy.ndimage.generic_gradient_magnitude(heights, scipy.ndimage.sobel) / (8 * cell)
+            steep &= slope > CLIMB
+    wide = scipy.ndimage.binary_opening(steep, np.ones((_width(CLIMB_M, cell),) * 2))
+    return np.asarray(scipy.ndimage.binary_fill_holes(wide) & kept)
 
 
 def _unexplained(residual: Floats, cells: Bools, cell: float) -> Floats:
@@ -158,7 +195,8 @@ class Compared:
     """Distance to the nearer of DSM and DTM (m), by `quality.estimate.deviation`; the estimated error of
     inferred cells."""
     estimate: Floats
-    """Estimated error of the surface (m), by `quality.estimate.error_estimate`."""
+    """Estimated error of the surface (m), by `quality.estimate.error_estimate`; at least the distance to the
+    DTM on objects that it climbs, and the deviation where that exceeds ``agree_m``."""
     goes_on: Bools
     """Cells of level 0 below decks or above tubes: a road that ends there at a joint goes on."""
     lacking: Bools
@@ -195,12 +233,17 @@ def compare(
     height = surface.lattice(data.core.eastings, data.core.northings)
     smooth = height - surface.steps if isinstance(surface, SteppedSurface) else height
     off_dsm, off_dtm = height - fitted.dsm[window], height - data.dtm[window]
-    spread = scatter((fitted.dsm - data.dtm)[window], kept, data.core.cell)
+    spread = scatter(fitted.dsm[window], data.dtm[window], kept, data.core.cell)
     residual = height - ground_to_fit(fitted, clusters, window)
     residual[classes == Support.NONE] = np.nan
     estimate = error_estimate(residual, off_dtm, spread, kept, on_road, data.core.cell, only_road)
     inferred = classes == Support.INFERRED
-    distance = np.where(inferred, estimate, deviation(off_dsm, off_dtm, spread, kept, inferred))
+    away = deviation(off_dsm, off_dtm, spread, kept, inferred)
+    on_object = climbed(smooth, data.dtm[window], kept, data.core.cell, agree_m)
+    # Within `agree_m` DSM and DTM show the same ground, and residuals say more.
+    least = np.where(on_object, np.abs(off_dtm), np.where(on_road & (away > agree_m), away, np.nan))
+    estimate = np.fmax(estimate, least)
+    distance = np.where(inferred, estimate, away)
     excess = (data.dsm - fitted.dsm)[window]
     return Compared(
         on_road, kept, classes, height, smooth, off_dsm, excess, off_dtm, distance, estimate,

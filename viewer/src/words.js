@@ -10,6 +10,7 @@ export const SUPPORT_MEANING = {
 
 const FLAGS = {
   "error-estimate": "the surface is far from scan and terrain model on average",
+  "worst-error": "25 m² of road in one piece are far off",
   patch: "a patch of road is far from scan and terrain model",
   spike: "the surface bends more than a road can",
   "edge-step": "steps along the edges of the road",

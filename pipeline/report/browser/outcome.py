@@ -43,6 +43,10 @@ MEANINGS = {
         "the surface is {value} m off on average, by what it leaves of DSM and DTM (limit {limit} m)",
         "compare DSM and DTM{there}: one of them is wrong or older",
     ),
+    "worst-error": _Meaning(
+        "25 m² of road in one piece are {value} m off or more (limit {limit} m)",
+        "look{there} for an object that the road climbs, a deck that ends in the air, or a wrong DTM",
+    ),
     "patch": _Meaning(
         "{value} m² of road in one piece are far from both DSM and DTM (limit {limit} m²)",
         "look for a bridge (`flexroad catalog check` maps unnamed ones), a tree or a gap in the data{there}",

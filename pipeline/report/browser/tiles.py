@@ -18,6 +18,7 @@ from flexroad.catalog import Tile
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import printable
 from flexroad.pipeline.report.content import Content
+from flexroad.pipeline.store.records import needs_look
 from flexroad.tasks.quality.assess import FLAGS, NO_ROAD
 from flexroad.tasks.quality.structures import STRUCTURE_FLAGS
 
@@ -39,6 +40,7 @@ STATES = {
 
 LABELS: dict[str, tuple[str, str]] = {
     "error_estimate_m": ("error estimate", "m"),
+    "worst_error_estimate_m": ("error estimate of the worst 25 m²", "m"),
     "l2_road_m": ("road error (L2)", "m"),
     "p95_road_m": ("road error, 95th percentile", "m"),
     "rmse_road_m": ("road error (RMSE)", "m"),
@@ -125,8 +127,7 @@ def tile_table(tiles: Sequence[Tile], content: Content) -> TileTable:
 def _state(state: str, flags: Any) -> str:
     if state in ("failed", "pending"):
         return state
-    names = set(flags.split(", ")) if isinstance(flags, str) and flags else set()
-    return "flagged" if names - {NO_ROAD} else "no-road" if names else "fine"
+    return "flagged" if needs_look(flags) else "no-road" if flags == NO_ROAD else "fine"
 
 
 def _bounds(tiles: Sequence[Tile], crs: str) -> NDArray[np.float64]:

@@ -109,7 +109,7 @@ def test_query_writes_csv_with_heights(finished, made_survey, tmp_path):
     answers.write_text(flexroad("query", finished, "--points", points))
     table = pd.read_csv(answers)
     assert list(table.columns) == [
-        "name", "easting", "northing", "height_m", "nx", "ny", "nz", "tile", "class",
+        "name", "easting", "northing", "height_m", "nx", "ny", "nz", "tile", "class", "flags",
     ]  # fmt: skip
     inside, outside = table.iloc[0], table.iloc[1]
     assert inside.tile == catalog.tiles[0].id

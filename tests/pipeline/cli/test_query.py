@@ -169,7 +169,7 @@ def test_profile_along_points_has_distances_heights_and_grades(run, flexroad):
     table = answer(flexroad("query", run, "--line", line, "--step", 4))
     assert list(table.columns) == [
         "distance_m", "easting", "northing", "height_m", "grade_percent",
-        "nx", "ny", "nz", "tile", "class",
+        "nx", "ny", "nz", "tile", "class", "flags",
     ]  # fmt: skip
     assert list(table.distance_m) == [0, 4, 8, 12, 16, 20, 24, 26.5]
     assert list(table.easting - WEST) == [5, 9, 13, 17, 21, 25, 25, 25]

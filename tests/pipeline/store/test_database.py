@@ -180,7 +180,7 @@ def test_list_of_earlier_write_is_noticed(full):
         assert database.listed(TILES) is not None
         assert list(database.states())[4] == "failed"
     with contextlib.closing(sqlite3.connect(full)) as connection, connection:
-        connection.execute("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?, ?, ?, ?)", old)
+        connection.execute("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?, ?, ?, ?, ?)", old)
     with RunDatabase.open_readonly(full) as database:
         assert database.listed(TILES) is None
 

@@ -23,7 +23,7 @@ NOISE = 0.05 * np.random.default_rng(4).standard_normal(GRID.shape)
 CROWN = STREET & (np.hypot(ROW - 55, COL - 60) < 9)
 DOME = 5 + np.random.default_rng(5).uniform(-2, 2, GRID.shape)
 FIT = nurbs.Options(control_points=(18, 16), weights="unit")
-OTHERS = ("flags", "support", "levels", "structures", "bounded_weights")
+OTHERS = ("flags", "flagged", "support", "levels", "structures", "bounded_weights")
 FLOATS = [field.name for field in fields(Quality) if not field.name.startswith(("holdout", *OTHERS))]
 
 

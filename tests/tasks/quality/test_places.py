@@ -49,7 +49,7 @@ def near(place, row, col, tolerance_cells=0):
 def test_place_without_fault_is_that_of_largest_estimate():
     flags, at = found()
     assert flags == ()
-    assert at.keys() == {"error-estimate"}
+    assert at.keys() == {"error-estimate", "worst-error"}
 
 
 def test_spike_and_step_are_at_the_pole():

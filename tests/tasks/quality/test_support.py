@@ -161,7 +161,9 @@ def test_of_faces_of_a_deck_uses_its_own_classes():
     grid = Grid(GRID.crs, WEST, SOUTH + 60, 1.0, 60, 60)
     road = RoadMask(grid, grid, np.zeros(grid.shape, bool), np.zeros(grid.shape, bool))
     ground, deck = (np.full(grid.shape, kind, np.uint8) for kind in (Support.INFERRED, Support.MEASURED))
-    quality = Quality(**dict.fromkeys(FIGURES, 0.0), flags=(), support=deck)
+    quality = Quality(
+        **dict.fromkeys(FIGURES, 0.0), flags=(), support=deck, flagged=np.zeros_like(deck, np.uint16)
+    )
     kinds = of_faces(ground, road, mesh, ((1, quality),))
     np.testing.assert_array_equal(kinds == Support.MEASURED, mesh.level == 1)
     assert quality.at(1) is quality
