@@ -78,7 +78,7 @@ def _full_name(root: str, file: str) -> str:
 
 
 def lines(skipped: Iterable[Skipped]) -> list[str]:
-    """Return one line per layer and reason, with the tiles that are missing."""
+    """Return one line per layer and reason, with the tiles that a run lost."""
     groups: dict[tuple[str, str], list[Skipped]] = defaultdict(list)
     for one in skipped:
         groups[one.layer, one.reason].append(one)
@@ -88,7 +88,7 @@ def lines(skipped: Iterable[Skipped]) -> list[str]:
 def _line(layer: str, reason: str, group: Sequence[Skipped]) -> str:
     names = some([f"folder {one.file[:-1]}" if one.is_folder else one.file for one in group])
     tiles = sorted({tile for one in group for tile in one.tiles})
-    ending = f"; with it {count(len(tiles), 'tile')} of the run: {some(tiles)}" if tiles else ""
+    ending = f"; the run lost {count(len(tiles), 'tile')} with that: {some(tiles)}" if tiles else ""
     return f"skipped {names} ({layer}): {reason}{ending}" if layer else f"skipped {reason}{ending}"
 
 

@@ -15,6 +15,8 @@ class Finding:
     text: str
     fault: bool = False
     """Whether this should be corrected before a run."""
+    failing: frozenset[str] = frozenset()
+    """Ids of the tiles that would fail in a run."""
 
 
 def evenly(tiles: Sequence[Tile], most: int) -> list[Tile]:

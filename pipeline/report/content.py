@@ -204,7 +204,8 @@ def _rows(run: Run) -> pd.DataFrame:
 
 def _state(counts: Summary) -> str:
     without = f" ({counts.without_roads} of them without roads)" if counts.without_roads else ""
-    return f"Tiles: {counts.done} done{without}, {counts.failed} failed, {counts.pending} pending"
+    skipped = f"; {count(counts.skipped, 'file')} skipped by the catalog" if counts.skipped else ""
+    return f"Tiles: {counts.done} done{without}, {counts.failed} failed, {counts.pending} pending{skipped}"
 
 
 def _over_tiles(
