@@ -307,6 +307,9 @@ def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Finding:
     )
     if not coregistration.matters(shift, cell, scatter):
         return Finding(f"dop: {measured}: no significant shift")
+    if shift.confidence < coregistration.CLEAR:
+        line = f"dop seems to lie {measured}: too unclear to move it; compare it with the heights in a GIS"
+        return Finding(line, warning=True)
     return Finding(
         f"dop lies {measured}: move it, e.g. with gdal_translate -a_ullr, before it is used with them",
         fault=True,

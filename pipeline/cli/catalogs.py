@@ -328,7 +328,7 @@ def catalog_check(
     """
     catalog, faults = Catalog.read(path, allow or ()), 0
     for remark in check(catalog, load_config(config or fitting_config(catalog)), path, decks):
-        echo(f"warning: {remark.text}" if remark.fault else remark.text)
+        echo(f"warning: {remark.text}" if remark.fault or remark.warning else remark.text)
         faults += remark.fault
     if faults:
         raise typer.Exit(1)
