@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import islice, pairwise, repeat
 from typing import Any
@@ -28,6 +28,8 @@ MAX_UNPACKED = 8 * 2**30
 """Most rows and bytes of a table, unpacked; ten million tiles of 250 m are 625,000 km2."""
 
 
+SKIPPED = "flexroad:skipped"
+"""Key of the list of skipped files in the metadata of a table, and in a feature collection."""
 EDGES = ("xmin", "ymin", "xmax", "ymax")
 
 
@@ -47,8 +49,10 @@ FIELDS = tuple(
 """Fields of an asset that make a layer, without its extents."""
 
 
-def entries(data: bytes) -> Iterator[Item]:
-    """Yield the fields of each item that make a tile; reading complete items is many times slower.
+def entries(data: bytes) -> tuple[Iterator[Item], Any]:
+    """Return the fields of each item that make a tile, and the entries of skipped files.
+
+    Reading complete items is many times slower.
 
     Raises
     ------
@@ -62,7 +66,8 @@ def entries(data: bytes) -> Iterator[Item]:
     plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
     plain += [name for name in columns if name.startswith("assets.") and name.endswith(FIELDS)]
     names = [name for name in columns if name.endswith(".flexroad:extents")]
-    return _rows(file, plain, names)
+    skipped = (file.metadata.metadata or {}).get(SKIPPED.encode(), b"[]")
+    return _rows(file, plain, names), json.loads(skipped)
 
 
 def _rows(file: Any, plain: list[str], names: list[str]) -> Iterator[Item]:
@@ -145,7 +150,7 @@ def schema_of(full: Item) -> Any:
     return schema.set(number, schema.field(number).with_metadata(metadata))
 
 
-def table_bytes(items: Iterable[Item], schema: Any) -> bytes:
+def table_bytes(items: Iterable[Item], schema: Any, skipped: Sequence[Item] = ()) -> bytes:
     """Return a table of items as GeoParquet 1.1, as stac-geoparquet writes it.
 
     To import that takes an eighth of a run with nothing to do, and its conversion is many times slower.
@@ -154,11 +159,14 @@ def table_bytes(items: Iterable[Item], schema: Any) -> bytes:
     ----------
     schema : pyarrow.Schema
         Of `schema_of`.
+    skipped : sequence of dict
+        Entries of skipped files, which its metadata have.
     """
     column = {"encoding": "WKB", "geometry_types": [], "crs": _crs(), "edges": "planar"}
     column["covering"] = {"bbox": {name: ["bbox", name] for name in EDGES}}
     geo = {"version": "1.1.0", "columns": {"geometry": column}, "primary_column": "geometry"}
     metadata = {"geo": json.dumps(geo), "stac-geoparquet": json.dumps({"version": "1.0.0"})}
+    metadata |= {SKIPPED: json.dumps(list(skipped))} if skipped else {}
     schema, rows, written = schema.with_metadata(metadata), map(row, items), pa.BufferOutputStream()
     with pq.ParquetWriter(written, schema, write_page_checksum=True) as writer:
         while group := list(_tables(islice(rows, GROUP), schema)):

@@ -11,7 +11,7 @@ import difflib
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property, lru_cache
@@ -27,8 +27,9 @@ from flexroad.catalog.area import Area
 from flexroad.catalog.crs import short
 from flexroad.catalog.entries import TileReader
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.geoparquet import Item, Unreadable
+from flexroad.catalog.geoparquet import SKIPPED, Item, Unreadable
 from flexroad.catalog.grid import Bounds, Grid, overlap
+from flexroad.catalog.skipped import Skipped, from_fields, to_fields
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
 from flexroad.catalog.text import edges, printable
@@ -47,6 +48,8 @@ class Catalog:
     """The tiles of a data set, in the order of their ids."""
 
     tiles: tuple[Tile, ...]
+    skipped: tuple[Skipped, ...] = ()
+    """Files that could not be used when the catalog was made: the tiles lack their cells."""
 
     def __post_init__(self) -> None:
         ids.check([tile.id for tile in self.tiles])
@@ -90,7 +93,8 @@ class Catalog:
         allowed = AllowedFolders.of(path.parent, allow)
         reader = TileReader(str(absolute(path).parent), allowed, kind, path.name)
         try:
-            tiles = reader.tiles(_from_json(data) if is_json else geoparquet.entries(data))
+            entries, files = _from_json(data) if is_json else geoparquet.entries(data)
+            tiles, skipped = reader.tiles(entries), from_fields(files, str(absolute(path).parent))
         except ImportError:
             # A fault of this installation, not of the file.
             raise
@@ -100,7 +104,7 @@ class Catalog:
             # Damaged files raise any error in the readers of JSON and Parquet.
             reason = printable(" ".join(str(error).split()))[:200] or type(error).__name__
             raise _not_a_catalog(path, reason) from error
-        catalog = cls(tiles)
+        catalog = cls(tiles, skipped)
         if tiles and not catalog.usable:
             raise _not_a_catalog(path, f"no entry can be used: {tiles[0].fault}")
         return catalog
@@ -127,9 +131,10 @@ class Catalog:
             raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, but not {path.name}")
         folder = absolute(path).parent
         items = (item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles)
-        make: Callable[[Iterable[Item]], bytes] = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet
+        files = [to_fields(one.below(str(folder)) if movable else one) for one in self.skipped]
+        make = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet
         try:
-            paths.write(path, make(items), flushed=True)
+            paths.write(path, make(items, files), flushed=True)
         except OSError as error:
             raise CatalogError(f"cannot write catalog {path}: {error.strerror or error}") from error
 
@@ -169,7 +174,7 @@ class Catalog:
             tiles = list(compress(usable, area.touched(tile.grid for tile in usable)))
             if not tiles:
                 raise area.none_touched()
-        return Catalog(tuple(tiles))
+        return replace(self, tiles=tuple(tiles))
 
     def _check_bbox(self, bbox: Bounds) -> None:
         west, south, east, north = bbox
@@ -303,12 +308,13 @@ def _content(path: Location) -> bytes:
     return paths.read(path)
 
 
-def _from_json(data: bytes) -> list[Any]:
+def _from_json(data: bytes) -> tuple[list[Any], Any]:
+    """Return the entries of tiles and of skipped files."""
     content = json.loads(data, object_pairs_hook=_unique)
     features = content.get("features") if isinstance(content, dict) else None
     if not isinstance(features, list):
         raise ValueError("it has no list of features")
-    return features
+    return features, content.get(SKIPPED, [])
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> Item:
@@ -320,12 +326,13 @@ def _unique(pairs: list[tuple[str, Any]]) -> Item:
     return found
 
 
-def _to_json(items: Iterable[Item]) -> bytes:
-    return json.dumps({"type": "FeatureCollection", "features": list(items)}, indent=1).encode()
+def _to_json(items: Iterable[Item], skipped: Sequence[Item]) -> bytes:
+    content = {"type": "FeatureCollection", "features": list(items)}
+    return json.dumps(content | ({SKIPPED: skipped} if skipped else {}), indent=1).encode()
 
 
-def _to_parquet(items: Iterable[Item]) -> bytes:
-    return geoparquet.table_bytes(items, _schema())
+def _to_parquet(items: Iterable[Item], skipped: Sequence[Item]) -> bytes:
+    return geoparquet.table_bytes(items, _schema(), skipped)
 
 
 @cache

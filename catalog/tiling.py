@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -25,8 +25,10 @@ from flexroad.catalog.crs_checks import elsewhere, require_scale
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid, is_whole, union
 from flexroad.catalog.headers.cover import height_share
-from flexroad.catalog.headers.rasters import RasterFile, require_metric, skip, zoned
+from flexroad.catalog.headers.rasters import RasterFile, require_metric, zoned
+from flexroad.catalog.index import Catalog
 from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import count, some
 from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, RECENT, Layer, Tile, by_cover
 
@@ -73,12 +75,22 @@ class TilingResult:
     """In the order of their ids."""
     notes: tuple[str, ...]
     """What was assumed, and the tiles that were left out, one line each."""
-    left_out: tuple[str, ...] = ()
-    """The files and folders that cannot be used, one line per reason: the tiles lack their cells."""
+    skipped: tuple[Skipped, ...] = ()
+    """The files and folders that cannot be used: the tiles lack their cells."""
 
-    def after(self, notes: Sequence[str], left_out: Sequence[str]) -> TilingResult:
-        """Return the result with earlier notes and files left out before its own."""
-        return replace(self, notes=(*notes, *self.notes), left_out=(*left_out, *self.left_out))
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """What is skipped, one line per reason."""
+        return tuple(lines(self.skipped))
+
+    @property
+    def catalog(self) -> Catalog:
+        """The catalog of the tiles."""
+        return Catalog(self.tiles, self.skipped)
+
+    def after(self, notes: Sequence[str], skipped: Sequence[Skipped]) -> TilingResult:
+        """Return the result with earlier notes and skipped files before its own."""
+        return replace(self, notes=(*notes, *self.notes), skipped=(*skipped, *self.skipped))
 
 
 class _PlacedFile(NamedTuple):
@@ -173,12 +185,12 @@ def cut(
             require_scale(f"--to-crs {conversion.to_crs}", grid_crs, area, "give --to-crs {zone}")
     else:
         require_metric(next(file for file in dsm if file.crs == grid_crs), "--reproject")
-    placed, left_out = {}, list[str]()
+    placed, skipped = {}, list[Skipped]()
     for name in (name for name in LAYERS if name in layer_files):
-        placed[name], lines = _place(name, layer_files[name], grid_crs)
-        left_out += lines
-    placed["dsm"], lines = _alike(placed)
-    left_out += lines
+        placed[name], lost = _place(root, name, layer_files[name], grid_crs)
+        skipped += lost
+    placed["dsm"], huge = _alike(root, placed)
+    skipped += huge
     notes = [note for name, files in placed.items() for note in _other_crs(name, files, grid_crs, conversion)]
 
     grids = _cut(placed["dsm"], grid_crs, tile_size_m)
@@ -203,39 +215,38 @@ def cut(
         covering, nearby = by_cover(own, grid)
         survey_date = taken(near["dsm"].on(position).files, date)
         tiles.append(Tile(tile_id, grid, covering, str(root), *survey_date, dataset=dataset, nearby=nearby))
-    return TilingResult(tuple(tiles), (*notes, *uncovered, *assumed(tiles)), tuple(left_out))
+    return TilingResult(tuple(tiles), (*notes, *uncovered, *assumed(tiles)), tuple(skipped))
 
 
-def _place(layer: str, files: Sequence[RasterFile], crs: str) -> tuple[list[_PlacedFile], list[str]]:
-    """Return the files with their bounds in the tiles' CRS, and lines on those without a position in it."""
+def _place(
+    root: Path, layer: str, files: Sequence[RasterFile], crs: str
+) -> tuple[list[_PlacedFile], list[Skipped]]:
+    """Return the files with their bounds in the tiles' CRS, and those without a position in it."""
     placed = [
         _PlacedFile(f, f.bounds if same(f.crs, crs) else bounds_in(crs, f.crs, f.bounds)) for f in files
     ]
-    kept, lost = list[_PlacedFile](), defaultdict[str, list[str]](list)
+    kept, lost = list[_PlacedFile](), list[Skipped]()
     for entry in placed:
         # NaN is not below either.
         if np.abs(entry.bounds).max() <= FARTHEST:
             kept.append(entry)
-        else:
-            lost[entry.file.crs].append(entry.file.name)
-    lines = [
-        skip(
-            some(names),
-            layer,
-            f"in {short(system)} it has no position in {short(crs)}, the CRS of the dsm; "
-            "correct its CRS with `gdal_edit.py -a_srs`",
+            continue
+        reason = (
+            f"in {short(entry.file.crs)} it has no position in {short(crs)}, the CRS of the dsm; "
+            "correct its CRS with `gdal_edit.py -a_srs`"
         )
-        for system, names in lost.items()
-    ]
+        lost.append(Skipped(entry.file.name, layer, reason, str(root)))
     if not kept:
-        raise CatalogError(f"no usable file of the layer {layer}; {lines[0]}")
-    return kept, lines
+        raise CatalogError(f"no usable file of the layer {layer}; {lines(lost)[0]}")
+    return kept, lost
 
 
-def _alike(placed: Mapping[str, Sequence[_PlacedFile]]) -> tuple[list[_PlacedFile], list[str]]:
+def _alike(
+    root: Path, placed: Mapping[str, Sequence[_PlacedFile]]
+) -> tuple[list[_PlacedFile], list[Skipped]]:
     """Return the DSM files without those of huge cells, which would be cut into millions of tiles."""
     usual = statistics.median_high(_cell_size(entry) for name in HEIGHTS for entry in placed.get(name, ()))
-    kept, lines = list[_PlacedFile](), list[str]()
+    kept, huge = list[_PlacedFile](), list[Skipped]()
     for entry in placed["dsm"]:
         if _cell_size(entry) <= MAX_CELL_RATIO * usual:
             kept.append(entry)
@@ -244,10 +255,10 @@ def _alike(placed: Mapping[str, Sequence[_PlacedFile]]) -> tuple[list[_PlacedFil
             f"it has cells of {_cell_size(entry):g} m, while most files of heights have {usual:g} m; "
             "correct its georeference, or resample it with gdalwarp -tr"
         )
-        lines.append(skip(entry.file.name, "dsm", reason))
+        huge.append(Skipped(entry.file.name, "dsm", reason, str(root)))
     if not kept:
-        raise CatalogError(f"no usable file of the layer dsm; {lines[0]}")
-    return kept, lines
+        raise CatalogError(f"no usable file of the layer dsm; {lines(huge)[0]}")
+    return kept, huge
 
 
 def _cell_size(placed: _PlacedFile) -> float:

@@ -8,7 +8,6 @@ import os
 import sys
 import threading
 import warnings
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,6 +30,7 @@ from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.headers.valid_cells import color_kinds
+from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.storage.settings import gdal_options
 from flexroad.catalog.text import access_reason, some
 from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
@@ -139,7 +139,7 @@ class _Skip(Exception):
 
 def scan(
     root: Path, layer: str, pattern: str, crs: str | None, allow: Sequence[str] = ()
-) -> tuple[list[RasterFile], list[str]]:
+) -> tuple[list[RasterFile], list[Skipped]]:
     """Open each file of a layer once.
 
     Parameters
@@ -159,8 +159,8 @@ def scan(
     -------
     files : list of RasterFile
         Ordered by name.
-    left_out : list of str
-        Skipped files and folders, one line per reason.
+    skipped : list of Skipped
+        Files and folders that are left out.
 
     Raises
     ------
@@ -171,14 +171,16 @@ def scan(
     files, skipped = opened(root, layer, paths, crs, allow)
     if not files:
         folder, _ = _start(root, pattern)
-        raise CatalogError(f"no usable file for {_option(layer)} {pattern!r} below {folder}; {skipped[0]}")
+        raise CatalogError(
+            f"no usable file for {_option(layer)} {pattern!r} below {folder}; {lines(skipped)[0]}"
+        )
     return files, [*skipped, *unlisted]
 
 
 def opened(
     root: Path, layer: str, paths: Iterable[Path], crs: str | None, allow: Sequence[str] = ()
-) -> tuple[list[RasterFile], list[str]]:
-    """Open files of a layer, each once; return the usable ones, and a line per reason on the others.
+) -> tuple[list[RasterFile], list[Skipped]]:
+    """Open files of a layer, each once; return the usable ones, and the others with the reason.
 
     Raises
     ------
@@ -187,27 +189,22 @@ def opened(
     """
     files: list[RasterFile] = []
     allowed = AllowedFolders.of(root, allow)
-    skipped: dict[str, list[str]] = defaultdict(list)
+    skipped: list[Skipped] = []
     with quiet():
         for path in paths:
             try:
                 files.append(_open(root, path, crs, allowed, layer in HEIGHTS))
             except _Skip as reason:
-                skipped[str(reason)].append(_name(root, path))
-    return files, [skip(some(names), layer, reason) for reason, names in skipped.items()]
-
-
-def skip(names: str, layer: str, reason: str) -> str:
-    """Return the line on files or folders of a layer that a catalog leaves out."""
-    return f"skipped {names} ({layer}): {reason}"
+                skipped.append(Skipped(_name(root, path), layer, str(reason), str(root)))
+    return files, skipped
 
 
 def _option(layer: str) -> str:
     return "--" + layer.replace("_", "-")
 
 
-def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[str]]:
-    """Return the files that match a glob pattern, by name, and lines on the folders that cannot be listed.
+def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[Skipped]]:
+    """Return the files that match a glob pattern, by name, and the folders that cannot be listed.
 
     If the pattern's last part has a dot, it names files, and a folder that matches is in place of one.
 
@@ -232,11 +229,11 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[str
         raise CatalogError(f"{_option(layer)} {pattern!r} is no pattern below {folder}: {error}") from error
     names_files = "." in Path(relative).name
     paths = [path for path in found if names_files or not _is_folder(path)]
-    lines = unlisted_lines(root, layer, unlisted)
+    skipped = unlisted_folders(root, layer, unlisted)
     if not paths:
-        why = lines[0] if lines else there(folder)
+        why = lines(skipped)[0] if skipped else there(folder)
         raise CatalogError(f"no file matches {_option(layer)} {pattern!r} below {folder}; {why}")
-    return paths, lines
+    return paths, skipped
 
 
 def glob(folder: Path, pattern: str) -> tuple[list[Path], list[tuple[Path, OSError]]]:
@@ -285,10 +282,10 @@ def _is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112
 
 
-def unlisted_lines(root: Path, layer: str, unlisted: Iterable[tuple[Path, OSError]]) -> list[str]:
-    """Return a line on each folder that cannot be listed."""
+def unlisted_folders(root: Path, layer: str, unlisted: Iterable[tuple[Path, OSError]]) -> list[Skipped]:
+    """Return folders that cannot be listed as a catalog keeps them."""
     return [
-        skip(f"folder {_name(root, folder)}", layer, f"it {access_reason(error)}")
+        Skipped(f"{_name(root, folder)}/", layer, f"it {access_reason(error)}", str(root))
         for folder, error in unlisted
     ]
 

@@ -21,6 +21,7 @@ from flexroad.catalog.headers.open_vector import ERRORS, layer_info, vector_name
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.skipped import Skipped
 from flexroad.catalog.text import access_reason, count, reason
 from flexroad.catalog.tile import REACH_M, RECENT, Layer, Tile
 
@@ -50,8 +51,8 @@ class VectorFile:
 
 def find(
     root: Path, given: str, crs: str | None, sublayer: str | None = None
-) -> tuple[list[VectorFile], list[str]]:
-    """Open vector files; return the usable ones, and a line on each other one.
+) -> tuple[list[VectorFile], list[Skipped]]:
+    """Open vector files; return the usable ones, and the others.
 
     Parameters
     ----------
@@ -71,16 +72,17 @@ def find(
         in it, or it has several and ``sublayer`` is None.
     """
     root = root.resolve()
-    paths, lines = ([Path(given)], []) if Path(given).is_file() else matching(root, "roads", given)
-    files, errors = list[VectorFile](), list[CatalogError]()
+    paths, unlisted = ([Path(given)], []) if Path(given).is_file() else matching(root, "roads", given)
+    files, errors = list[VectorFile](), dict[Path, CatalogError]()
     for path in paths:
         try:
             files.append(opened(path, crs, sublayer))
         except CatalogError as error:
-            errors.append(error)
+            errors[path] = error
     if not files:
-        raise errors[0]
-    return files, [*(f"skipped {error}" for error in errors), *lines]
+        raise next(iter(errors.values()))
+    skipped = (Skipped(str(path.absolute()), "", str(error)) for path, error in errors.items())
+    return files, [*skipped, *unlisted]
 
 
 def layers(path: Path) -> dict[str, str]:
@@ -165,14 +167,14 @@ def bounds_of(info: Mapping[str, Any]) -> Bounds:
 
 def with_roads(
     tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | None
-) -> tuple[tuple[Tile, ...], list[str]]:
+) -> tuple[tuple[Tile, ...], list[Skipped]]:
     """Return the tiles with a layer ``roads`` of the files within `REACH_M` of each tile.
 
     Returns
     -------
     tiles : tuple of Tile
-    left_out : list of str
-        A line on each file that reaches no tile.
+    far : list of Skipped
+        The files that reach no tile.
 
     Raises
     ------
@@ -193,12 +195,12 @@ def with_roads(
     ]
     reached = np.bincount(np.concatenate(near), minlength=len(files))
     far = [
-        f"--roads {file.path} {_far(file, tiles)}"
+        Skipped(str(file.path), "", f"--roads {file.path} {_far(file, tiles)}")
         for file, number in zip(files, reached, strict=True)
         if not number
     ]
     if len(far) == len(files):
-        raise CatalogError(far[0])
+        raise CatalogError(far[0].reason)
     # A CRS is that of the complete layer, so that all tiles describe the layer in the same way.
     bare = None if all(file.has_crs for file in files) else crs
 
@@ -219,7 +221,7 @@ def with_roads(
         else tile
         for tile, numbers in zip(tiles, near, strict=True)
     )
-    return tuple(with_layer), [f"skipped {line}" for line in far]
+    return tuple(with_layer), far
 
 
 def _boxes(extents: NDArray[np.float64]) -> NDArray[np.object_]:

@@ -27,9 +27,10 @@ from flexroad.catalog.headers.mask_values import mask_notes
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.plateaus import plateau_notes
 from flexroad.catalog.headers.point_clouds import chunks
-from flexroad.catalog.headers.rasters import RasterFile, glob, opened, scan, skip, there, unlisted_lines
+from flexroad.catalog.headers.rasters import RasterFile, glob, opened, scan, there, unlisted_folders
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import some
 from flexroad.catalog.tile import HEIGHTS, Tile
 from flexroad.catalog.tiling import Conversion, TilingResult, cut
@@ -122,28 +123,28 @@ def index(
         no tile is left; or as of `newest_first`.
     """
     root = root.resolve()
-    downloads, left_out = _downloads(root)
+    downloads, skipped = _downloads(root)
     layer_files: dict[str, list[RasterFile]] = {}
-    bridges, notes, skipped = _bridges(root, downloads, derived)
-    left_out += skipped
+    bridges, notes, unusable = _bridges(root, downloads, derived)
+    skipped += unusable
     if bridges:
         layer_files["bridges"] = bridges
     for layer in LAYER_OF.values():
         named = [download for download in downloads if download.layer == layer]
-        files, skipped = opened(root, layer, [download.path for download in named], CRS)
+        files, unusable = opened(root, layer, [download.path for download in named], CRS)
         files, misplaced = _placed(root, files, named)
-        left_out += [*skipped, *misplaced]
+        skipped += [*unusable, *misplaced]
         if files:
-            layer_files[layer], lines = newest_first(root, layer, files)
-            notes += lines
+            layer_files[layer], dated = newest_first(root, layer, files)
+            notes += dated
     if "dsm" not in layer_files:
-        why = left_out[0] if left_out else there(root)
+        why = lines(skipped)[0] if skipped else there(root)
         raise CatalogError(f"no usable dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz below {root}; {why}")
     if road_mask is not None:
-        masks, skipped = scan(root, "road_mask", road_mask, CRS, allow)
-        layer_files["road_mask"], lines = newest_first(root, "road_mask", masks)
-        notes += lines
-        left_out += skipped
+        masks, unusable = scan(root, "road_mask", road_mask, CRS, allow)
+        layer_files["road_mask"], dated = newest_first(root, "road_mask", masks)
+        notes += dated
+        skipped += unusable
         notes += mask_notes(root, "road_mask", [file.name for file in layer_files["road_mask"]], road_values)
     for layer in (heights for heights in HEIGHTS if heights in layer_files):
         notes += plateau_notes(layer, {file.name: root / file.name for file in layer_files[layer]})
@@ -158,31 +159,31 @@ def index(
         dataset=DATASET,
         conversion=Conversion(reproject),
     )
-    indexed = indexed.after(notes, left_out)
+    indexed = indexed.after(notes, skipped)
     if roads is not None:
-        vectors, skipped = find(root, roads, CRS, roads_layer)
+        vectors, unusable = find(root, roads, CRS, roads_layer)
         tiles, far = with_roads(indexed.tiles, vectors, CRS)
-        indexed = replace(indexed, tiles=tiles, left_out=(*indexed.left_out, *skipped, *far))
+        indexed = replace(indexed, tiles=tiles, skipped=(*indexed.skipped, *unusable, *far))
     return replace(indexed, notes=(*indexed.notes, *_without_terrain(indexed.tiles)))
 
 
-def _downloads(root: Path) -> tuple[list[Download], list[str]]:
-    """Return the downloads below a folder, newest first, and lines on folders that cannot be listed."""
+def _downloads(root: Path) -> tuple[list[Download], list[Skipped]]:
+    """Return the downloads below a folder, newest first, and the folders that cannot be listed."""
     if not root.is_dir():
         raise CatalogError(f"folder {root} does not exist")
     found, unlisted = glob(root, "**/*")
     downloads = [download for download in map(parse, found) if download]
-    lines = unlisted_lines(root, "downloads", unlisted)
     # The first file with a value is used.
-    return sorted(downloads, key=lambda download: -download.year), lines
+    newest = sorted(downloads, key=lambda download: -download.year)
+    return newest, unlisted_folders(root, "downloads", unlisted)
 
 
 def _placed(
     root: Path, files: Sequence[RasterFile], named: Sequence[Download]
-) -> tuple[list[RasterFile], list[str]]:
-    """Return the files whose position matches their name, dated by it, and lines on the others."""
+) -> tuple[list[RasterFile], list[Skipped]]:
+    """Return the files whose position matches their name, dated by it, and the others."""
     by_name = {download.path.relative_to(root).as_posix(): download for download in named}
-    kept, lines = [], []
+    kept, misplaced = list[RasterFile](), list[Skipped]()
     for file in files:
         download = by_name[file.name]
         west, south, east, north = download.square
@@ -191,8 +192,9 @@ def _placed(
             kept.append(_dated(file, download.year))
         else:
             reason = f"its centre {x:.0f} {y:.0f} in {short(file.crs)} does not match its name"
-            lines.append(skip(file.name, str(download.layer), f"{reason}; download it again"))
-    return kept, lines
+            reason = f"{reason}; download it again"
+            misplaced.append(Skipped(file.name, str(download.layer), reason, str(root)))
+    return kept, misplaced
 
 
 def _dated(file: RasterFile, year: int) -> RasterFile:
@@ -204,8 +206,8 @@ def _dated(file: RasterFile, year: int) -> RasterFile:
 
 def _bridges(
     root: Path, downloads: Sequence[Download], derived: Path | None
-) -> tuple[list[RasterFile], list[str], list[str]]:
-    """Return rasters of the bridge decks in the point clouds, newest first, notes, and lines on others."""
+) -> tuple[list[RasterFile], list[str], list[Skipped]]:
+    """Return rasters of the bridge decks in the point clouds, newest first, notes, and clouds left out."""
     clouds = [download for download in downloads if download.layer is None]
     names = [download.path.relative_to(root).as_posix() for download in clouds]
     if not clouds:
@@ -213,16 +215,16 @@ def _bridges(
     if derived is None:
         note = f"point clouds were not read, so the reference lacks the bridges in {some(names)}"
         return [], [note], []
-    targets, lines = [], []
+    targets, unusable = list[Path](), list[Skipped]()
     for cloud in clouds:
         target = derived.resolve() / f"{cloud.path.stem}_bridges.tif"
         try:
             if _deck_raster(cloud.path, target, cloud.square, CRS):
                 targets.append(target)
         except CatalogError as error:
-            lines.append(f"skipped {error}")
+            unusable.append(Skipped(str(cloud.path), "", str(error)))
     files, skipped = opened(root, "bridges", targets, CRS)
-    return files, [], [*lines, *skipped]
+    return files, [], [*unusable, *skipped]
 
 
 def _deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:

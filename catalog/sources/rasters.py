@@ -71,7 +71,7 @@ def index(
         for name in LAYERS
         if name in patterns and name != "roads"
     }
-    left_out = [line for _, lines in scanned.values() for line in lines]
+    skipped = [file for _, files in scanned.values() for file in files]
     notes, files = list[str](), dict[str, list[RasterFile]]()
     for name, (found, _) in scanned.items():
         files[name], lines = newest_first(root, name, found)
@@ -90,12 +90,12 @@ def index(
         min_cover=min_cover,
         conversion=conversion,
     )
-    indexed = indexed.after(notes, left_out)
+    indexed = indexed.after(notes, skipped)
     if "roads" not in patterns:
         return indexed
-    roads, skipped = find(root, patterns["roads"], crs, roads_layer)
+    roads, unusable = find(root, patterns["roads"], crs, roads_layer)
     tiles, far = with_roads(indexed.tiles, roads, crs)
-    return replace(indexed, tiles=tiles, left_out=(*indexed.left_out, *skipped, *far))
+    return replace(indexed, tiles=tiles, skipped=(*indexed.skipped, *unusable, *far))
 
 
 def _check(root: Path, patterns: Mapping[str, str]) -> None:

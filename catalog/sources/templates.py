@@ -23,7 +23,8 @@ from flexroad.catalog import layouts
 from flexroad.catalog.derived import is_current, rasters_of_points, write_heights
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.headers.rasters import RasterFile, glob, opened, require_metric, there, unlisted_lines
+from flexroad.catalog.headers.rasters import RasterFile, glob, opened, require_metric, there, unlisted_folders
+from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import shown, some
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.tiling import MASKS, TilingResult, assumed, taken
@@ -185,16 +186,16 @@ def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = No
     """
     if not root.is_dir():
         raise CatalogError(f"folder {root} does not exist")
-    root, left_out = root.resolve(), list[str]()
+    root, left_out = root.resolve(), list[Skipped]()
     by_layer: dict[str, dict[str, _MatchedFile]] = {}
     for name in LAYERS:
         if name in layout.layers:
             by_layer[name], skipped = _files(root, name, layout)
             left_out += skipped
     if not by_layer["dsm"]:
-        why = left_out[0] if left_out else there(root, "; describe them with --layout")
+        why = lines(left_out)[0] if left_out else there(root, "; describe them with --layout")
         raise CatalogError(f"no usable file matches {layout.layers['dsm']!r} (dsm) below {root}; {why}")
-    left_out += _without_metres(by_layer["dsm"])
+    left_out += _without_metres(root, by_layer["dsm"])
     tiles = _tiles(root, by_layer, layout, dataset, date)
     return TilingResult(tiles, (*_lacking(tiles, layout), *assumed(tiles)), tuple(left_out))
 
@@ -212,30 +213,31 @@ def _named(root: Path, layout: Layout, date: datetime | None, derived: Path | No
         by_layer[name], skipped = _opened(root, name, parts, layout.crs, "leave one of them")
         left_out += skipped
     if not by_layer.get("dsm"):
-        why = left_out[0] if left_out else there(root, "; describe them with --layout")
+        why = lines(left_out)[0] if left_out else there(root, "; describe them with --layout")
         raise CatalogError(
             f"no usable file is the dsm of a tile such as {layouts.NAMED[0]} below {root}; {why}"
         )
-    left_out += _without_metres(by_layer["dsm"])
+    left_out += _without_metres(root, by_layer["dsm"])
     tiles = _tiles(root, by_layer, layout, GEROD, date)
     return TilingResult(tiles, (*notes, *assumed(tiles)), tuple(left_out))
 
 
 def _rasters(
     root: Path, found: Sequence[layouts.Found], derived: Path | None, crs: str
-) -> tuple[dict[Path, layouts.Found], list[str]]:
-    """Return the files that are rasters, with those made of points, and lines on points that are left out."""
-    paths, left_out = dict[Path, layouts.Found](), list[str]()
+) -> tuple[dict[Path, layouts.Found], list[Skipped]]:
+    """Return the files that are rasters, with those made of points, and the points that are left out."""
+    paths, left_out = dict[Path, layouts.Found](), list[Skipped]()
     for file in found:
         if not file.name.lower().endswith(layouts.POINTS):
             paths[root / file.name] = file
         elif derived is None:
-            left_out.append(f"skipped {file.name} ({file.layer}): points need a folder for their rasters")
+            reason = "points need a folder for their rasters"
+            left_out.append(Skipped(file.name, file.layer, reason, str(root)))
         else:
             try:
                 paths |= _of_points(root / file.name, file, derived.resolve(), crs)
             except CatalogError as error:
-                left_out.append(f"skipped {file.name} ({file.layer}): {error}")
+                left_out.append(Skipped(file.name, file.layer, str(error), str(root)))
     return paths, left_out
 
 
@@ -279,8 +281,8 @@ def _tiles(
     )
 
 
-def _without_metres(dsm: dict[str, _MatchedFile]) -> list[str]:
-    """Remove the files that are not in metres, and return a line on each; one must be left."""
+def _without_metres(root: Path, dsm: dict[str, _MatchedFile]) -> list[Skipped]:
+    """Remove the files that are not in metres, and return them; one must be left."""
     errors = dict[str, CatalogError]()
     for tile_id, match in dsm.items():
         try:
@@ -289,13 +291,13 @@ def _without_metres(dsm: dict[str, _MatchedFile]) -> list[str]:
             errors[tile_id] = error
     if len(errors) == len(dsm):
         raise next(iter(errors.values()))
-    for tile_id in errors:
-        del dsm[tile_id]
-    return [f"skipped {error}" for error in errors.values()]
+    return [
+        Skipped(dsm.pop(tile_id).file.name, "", str(error), str(root)) for tile_id, error in errors.items()
+    ]
 
 
-def _files(root: Path, layer: str, layout: Layout) -> tuple[dict[str, _MatchedFile], list[str]]:
-    """Return the files of a layer by tile id, and lines on skipped files and folders."""
+def _files(root: Path, layer: str, layout: Layout) -> tuple[dict[str, _MatchedFile], list[Skipped]]:
+    """Return the files of a layer by tile id, and skipped files and folders."""
     template = layout.layers[layer]
     pattern = _pattern(template)
     try:
@@ -309,13 +311,13 @@ def _files(root: Path, layer: str, layout: Layout) -> tuple[dict[str, _MatchedFi
     }
     remedy = f"change the template {template!r} so that it matches only one of them"
     by_tile, skipped = _opened(root, layer, parts, layout.crs, remedy)
-    return by_tile, [*skipped, *unlisted_lines(root, layer, unlisted)]
+    return by_tile, [*skipped, *unlisted_folders(root, layer, unlisted)]
 
 
 def _opened(
     root: Path, layer: str, parts: Mapping[Path, tuple[str, str]], crs: str | None, remedy: str
-) -> tuple[dict[str, _MatchedFile], list[str]]:
-    """Return the files of a layer by tile id, and lines on skipped files.
+) -> tuple[dict[str, _MatchedFile], list[Skipped]]:
+    """Return the files of a layer by tile id, and skipped files.
 
     ``parts`` gives id and stratum of each path, ``remedy`` what to do with two files of a tile.
     """

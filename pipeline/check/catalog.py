@@ -106,9 +106,9 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
     """
     unusable = [tile for tile in tiles if tile.fault]
     for tile in unusable[:MAX_SHOWN]:
-        yield Finding(f"{tile.id}: {tile.fault}", fault=True)
-    if len(unusable) > MAX_SHOWN:
-        yield Finding(f"{len(unusable) - MAX_SHOWN} more entries cannot be used", fault=True)
+        yield Finding(f"{tile.id}: {tile.fault}", fault=True, failing=frozenset({tile.id}))
+    if more := frozenset(tile.id for tile in unusable[MAX_SHOWN:]):
+        yield Finding(f"{len(more)} more entries cannot be used", fault=True, failing=more)
     usable = [tile for tile in tiles if not tile.fault]
     named = set[str]()
     for layer, stage, ids in lacking(usable, config):
@@ -131,7 +131,8 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
 
 
 def _would_fail(ids: Sequence[str], tiles: Sequence[Tile], reason: str) -> Finding:
-    return Finding(f"{len(ids)} of {count(len(tiles), 'tile')} would fail: {reason}: {some(ids)}", fault=True)
+    line = f"{len(ids)} of {count(len(tiles), 'tile')} would fail: {reason}: {some(ids)}"
+    return Finding(line, fault=True, failing=frozenset(ids))
 
 
 def _absent(tiles: Sequence[Tile], layers: Collection[str]) -> dict[Location, str]:
@@ -151,20 +152,23 @@ def _missing(
     tiles: Sequence[Tile], layers: Collection[str], absent: Mapping[Location, str]
 ) -> Iterator[Finding]:
     """Name the files that are missing or cannot be read, each with the number of tiles that it lies on."""
-    number: Counter[Location] = Counter()
+    on_file: dict[Location, set[str]] = defaultdict(set)
     for tile in tiles if absent else ():
         for layer in (layer for layer in tile.all_layers if layer.name in layers):
             on_tile = layer.reaching(tile.grid.bounds)
-            number.update(tile.paths(on_tile) if on_tile else ())
-    by_reason: dict[str, list[str]] = defaultdict(list)
+            for path in tile.paths(on_tile) if on_tile else ():
+                on_file[path].add(tile.id)
+    by_reason: dict[str, list[Location]] = defaultdict(list)
     for path, reason in absent.items():
-        line = f"{path} ({count(number[path], 'tile')})"
-        by_reason[reason].append(f"{line}; {REMEDIES[reason]}" if reason in REMEDIES else line)
-    for reason, lines in by_reason.items():
-        for line in lines[:MAX_SHOWN]:
-            yield Finding(f"{reason}: {line}", fault=True)
-        if len(lines) > MAX_SHOWN:
-            yield Finding(f"{reason}: {len(lines) - MAX_SHOWN} more files", fault=True)
+        by_reason[reason].append(path)
+    for reason, paths in by_reason.items():
+        remedy = f"; {REMEDIES[reason]}" if reason in REMEDIES else ""
+        for path in paths[:MAX_SHOWN]:
+            line = f"{reason}: {path} ({count(len(on_file[path]), 'tile')}){remedy}"
+            yield Finding(line, fault=True, failing=frozenset(on_file[path]))
+        if more := paths[MAX_SHOWN:]:
+            failing = frozenset(tile for path in more for tile in on_file[path])
+            yield Finding(f"{reason}: {len(more)} more files", fault=True, failing=failing)
 
 
 def _no_access(path: Location, stat: StatCache) -> str | None:
@@ -303,6 +307,9 @@ def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Finding:
     )
     if not coregistration.matters(shift, cell, scatter):
         return Finding(f"dop: {measured}: no significant shift")
+    if shift.confidence < coregistration.CLEAR:
+        line = f"dop seems to lie {measured}: too unclear to move it; compare it with the heights in a GIS"
+        return Finding(line, warning=True)
     return Finding(
         f"dop lies {measured}: move it, e.g. with gdal_translate -a_ullr, before it is used with them",
         fault=True,

@@ -15,6 +15,10 @@ class Finding:
     text: str
     fault: bool = False
     """Whether this should be corrected before a run."""
+    warning: bool = False
+    """Whether this is said as a warning though it may be right; a fault always is."""
+    failing: frozenset[str] = frozenset()
+    """Ids of the tiles that would fail in a run."""
 
 
 def evenly(tiles: Sequence[Tile], most: int) -> list[Tile]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from flexroad.catalog.text import count
-from flexroad.pipeline.graph.graph import TileGraph
+from flexroad.catalog.text import count, some
+from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus
@@ -51,8 +52,11 @@ def reason(run: Run, status: TileStatus) -> Reason:
         return Reason("failed last time", record.failures[0].line if record.failures else "")
     if status.done and status.sources_present:
         return Reason("up to date")
-    if missing := [path for path, file in graph.file_stats.items() if file is None]:
+    if missing := own_files_missing(graph):
         return Reason("file missing", _first(missing, ""))
+    # A file around the tile is left out, and the tile computed without it.
+    if missing := [path for path, file in graph.file_stats.items() if file is None]:
+        return Reason("source changed", _first(missing, ", which is missing,").removesuffix(","))
     if record.fingerprint == graph.fingerprint:
         return Reason("product missing")
     if _compared_otherwise(record, graph):
@@ -60,6 +64,14 @@ def reason(run: Run, status: TileStatus) -> Reason:
     if changed := _changed_sources(record, graph):
         return Reason("source changed", changed)
     return Reason("settings or version changed", _changed_stage(run, graph))
+
+
+def why_pending(run: Run, statuses: Iterable[TileStatus]) -> list[str]:
+    """Return why tiles without a result of the present files and options are computed, a line per reason."""
+    tiles: dict[str, list[str]] = defaultdict(list)
+    for status in statuses:
+        tiles[reason(run, status).line].append(status.graph.tile.id)
+    return [f"{some(ids)}: {line}" for line, ids in tiles.items()]
 
 
 def _first(names: Sequence[str], what: str) -> str:
@@ -70,7 +82,9 @@ def _first(names: Sequence[str], what: str) -> str:
 def _compared_otherwise(record: TileRecord, graph: TileGraph) -> bool:
     """Return whether files were compared by size and time then and are by content now, or vice versa."""
     before, now = _files(record.sources), _files(graph.sources)
-    return any(len(before[name]) != len(now[name]) for name in now if name in before)
+    shared = [(before[name], now[name]) for name in now if name in before]
+    # Of a missing file neither is known.
+    return any(len(one) != len(other) for one, other in shared if None not in (one[1], other[1]))
 
 
 def _changed_sources(record: TileRecord, graph: TileGraph) -> str:
@@ -85,8 +99,10 @@ def _changed_sources(record: TileRecord, graph: TileGraph) -> str:
         parts = [("now reads", more), ("no longer reads", less)]
         return ", ".join(f"{what} {', '.join(names)}" for what, names in parts if names)
     before, now = _files(record.sources), _files(graph.sources)
+    changed = [name for name in now if name in before and before[name] != now[name]]
     for names, what in (
-        ([name for name in now if name in before and before[name] != now[name]], ""),
+        ([name for name in changed if before[name][1] is None], ", which was missing,"),
+        (changed, ""),
         ([name for name in now if name not in before], ", which was not read before,"),
         ([name for name in before if name not in now], ", which is no longer read,"),
     ):
@@ -94,8 +110,8 @@ def _changed_sources(record: TileRecord, graph: TileGraph) -> str:
             return _first([name for _, name in names], what).removesuffix(",")
     # Their values of road and their CRS are from the catalog.
     described = {entry[0]: entry[2:] for entry in record.sources}
-    changed = [entry[0] for entry in graph.sources if entry[2:] != described[entry[0]]]
-    return f"values or CRS of {', '.join(changed)} in the catalog" if changed else ""
+    layers = [entry[0] for entry in graph.sources if entry[2:] != described[entry[0]]]
+    return f"values or CRS of {', '.join(layers)} in the catalog" if layers else ""
 
 
 def _files(sources: Sequence[Any]) -> dict[tuple[str, str], list[Any]]:

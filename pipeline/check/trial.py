@@ -81,11 +81,14 @@ def trials(
                 errors[str(error)].append(tile.id)
         else:
             read.append(found[0])
-    lines = [f"{some(ids)} would fail: {error}" for error, ids in errors.items()]
-    if len(lines) > MOST_ERRORS:
-        more = sum(len(ids) for ids in list(errors.values())[MOST_ERRORS:])
-        lines = [*lines[:MOST_ERRORS], f"{more} more tiles would fail like that"]
-    return read, [Finding(line, fault=True) for line in lines]
+    findings = [
+        Finding(f"{some(ids)} would fail: {error}", fault=True, failing=frozenset(ids))
+        for error, ids in errors.items()
+    ]
+    if more := frozenset(tile for ids in list(errors.values())[MOST_ERRORS:] for tile in ids):
+        line = f"{len(more)} more tiles would fail like that"
+        findings = [*findings[:MOST_ERRORS], Finding(line, fault=True, failing=more)]
+    return read, findings
 
 
 def _chains(config: Config) -> list[Mapping[str, Any]]:

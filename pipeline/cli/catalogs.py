@@ -246,9 +246,8 @@ def _write_catalog(result: TilingResult, output: Path, strict: bool, config: str
         echo(f"warning: {line}", err=True)
     if strict and result.left_out:
         raise CatalogError(f"{output} is not written, as files cannot be used and --strict is given")
-    catalog = Catalog(result.tiles)
-    catalog.write(output)
-    echo(f"{count(len(catalog.tiles), 'tile')} in {output}")
+    result.catalog.write(output)
+    echo(f"{count(len(result.tiles), 'tile')} in {output}")
     if result.left_out:
         echo("warning: the catalog lacks what was skipped; repair it, then repeat the command", err=True)
     echo(after_catalog(output, config))
@@ -329,7 +328,7 @@ def catalog_check(
     """
     catalog, faults = Catalog.read(path, allow or ()), 0
     for remark in check(catalog, load_config(config or fitting_config(catalog)), path, decks):
-        echo(f"warning: {remark.text}" if remark.fault else remark.text)
+        echo(f"warning: {remark.text}" if remark.fault or remark.warning else remark.text)
         faults += remark.fault
     if faults:
         raise typer.Exit(1)

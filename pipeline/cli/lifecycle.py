@@ -47,8 +47,17 @@ def format_summary(summary: Summary) -> str:
         parts.append(f"{summary.without_roads} without roads")
     states = f"{summary.done} done ({', '.join(parts)}), {summary.failed} failed, {summary.pending} pending"
     changes = f"{summary.new} new, {summary.changed} changed, {summary.vanished} vanished"
+    left_out = _left_out(summary)
     seconds = f"{summary.seconds:.0f} s{summary.to_look_at}"
-    return f"{count(summary.tiles, 'tile')}: {states}; {changes}; {seconds}"
+    return f"{count(summary.tiles, 'tile')}: {states}; {changes}{left_out}; {seconds}"
+
+
+def _left_out(summary: Summary) -> str:
+    """Return what the catalog skipped for that line, empty if it is nothing."""
+    if not summary.skipped:
+        return ""
+    lost = f", {count(summary.lost, 'tile')} lost" if summary.lost else ""
+    return f"; {count(summary.skipped, 'file')} skipped by the catalog{lost}"
 
 
 def warn(line: str, kind: str = "warning") -> None:

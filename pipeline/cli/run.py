@@ -7,6 +7,7 @@ import json
 import shlex
 from collections.abc import Iterator
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,9 +18,10 @@ from flexroad.catalog.area import Area
 from flexroad.catalog.storage.paths import parse_location
 from flexroad.catalog.text import count
 from flexroad.pipeline.check.heights import road_is_off, road_step
+from flexroad.pipeline.check.reasons import why_pending
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
-from flexroad.pipeline.cli.dry_run import plan
+from flexroad.pipeline.cli.dry_run import Verdict, plan
 from flexroad.pipeline.cli.lifecycle import Outcome, RunCommand, format_summary, report_outcome, warn
 from flexroad.pipeline.cli.limits import remedy
 from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
@@ -33,9 +35,9 @@ from flexroad.pipeline.run.lock import describe_owner, exit_reason, owner
 from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.progress import FIRST_S, ProgressDisplay, said_repeatedly
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import progress, summary
+from flexroad.pipeline.run.status import TileStatus, pending_tiles, progress, summary
 from flexroad.pipeline.run.summary import Summary
-from flexroad.pipeline.store.records import MetricsRow
+from flexroad.pipeline.store.records import MetricsRow, TileState
 from flexroad.pipeline.worker.tile import TileResult
 from flexroad.tasks.io.height_offset import is_offset, on_tiles
 
@@ -64,6 +66,9 @@ Scheduler = Annotated[
         callback=_address,
     ),
 ]
+REPAIR = "repair what was skipped, repeat the `flexroad catalog` command, then `flexroad run`"
+MOST_PENDING = 100
+"""Number of pending tiles of which the reasons are looked up."""
 StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export"]
 
 
@@ -136,10 +141,10 @@ def run(
         chosen = load_config(config, settings or ())
         selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
         tiles, selected = selection.of(path, source, allow or (), chosen)
-        planned = Run.planned(path, chosen, tiles, root, checksum)
-        for line in plan(planned, selected.tiles, verbose, workers):
+        planned, verdict = Run.planned(path, chosen, tiles, root, checksum), Verdict()
+        for line in plan(planned, selected.tiles, verdict, verbose, workers):
             echo(line)
-        return
+        raise typer.Exit(verdict.exit_code)
     with report_outcome(path, on_failure, prometheus) as outcome:
         chosen = load_config(config, settings or ())
         selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
@@ -284,6 +289,8 @@ def _process(prepared: Prepared, verify: bool, shown: Shown) -> None:
     echo(f"{outcome.text}; results in {prepared.run.path}")
     if shown.display and set(shown.display.status) == {"cached"}:
         echo("nothing had changed; `flexroad rerun RUN --from load` recomputes everything")
+    for line in summary.left_out:
+        warn(line)
     for line in on_tiles(shown.offsets, summary.tiles):
         warn(f"{line} `flexroad catalog check` compares them")
     main = prepared.run.config.export.variants[0]
@@ -294,16 +301,20 @@ def _process(prepared: Prepared, verify: bool, shown: Shown) -> None:
             "no tile of this run has a road that the filter keeps; if there are roads, check the road source "
             "of the catalog and the options of segment and ecsrc"
         )
-    _echo_next(summary, folder)
+    _echo_next(summary, folder, prepared.run)
 
 
-def _echo_next(summary: Summary, folder: str) -> None:
+def _echo_next(summary: Summary, folder: str, run: Run) -> None:
     if summary.failed:
         echo(f"next: flexroad status {folder}, then flexroad rerun {folder} --failed")
     elif summary.pending:
         # The exit code is 1 although the selected tiles are done.
+        for line in why_pending(run, islice(pending_tiles(run), MOST_PENDING)):
+            echo(f"  {line}")
         tiles, have = count(summary.pending, "tile"), "has" if summary.pending == 1 else "have"
         echo(f"{tiles} {have} no result of the present files and options; next: flexroad rerun {folder}")
+    if summary.skipped:
+        echo(f"the catalog lacks {count(summary.skipped, 'file')}; next: {REPAIR}")
     elif not summary.exit_code:
         echo(f"next: flexroad report {folder} --format html")
 
@@ -344,12 +355,22 @@ def _print_status(run: Run, as_json: bool) -> None:
         values["at_work"] = {"host": alive.host, "pid": alive.pid, "since": alive.since} if alive else None
         echo_document(json.dumps(values, indent=1))
         return
-    state, pace = progress(run, alive) if alive else (summary(run), "")
+    pending: list[TileStatus] = []
+
+    def keep(status: TileStatus, state: TileState) -> None:
+        if state == "pending" and len(pending) < MOST_PENDING:
+            pending.append(status)
+
+    state, pace = progress(run, alive) if alive else (summary(run, each=keep), "")
     echo(format_summary(state))
     if lock_owner:
         echo(describe_owner(lock_owner) + pace)
     for failure in state.failures:
         echo(f"  {failure.notice}")
+    for line in why_pending(run, pending):
+        echo(f"  {line}; `flexroad rerun {shlex.quote(str(run.path))}` computes it")
+    for line in state.left_out:
+        echo(f"  {line}; {REPAIR}")
     if state.flagged:
         rest = len(state.flagged) - SHOWN
         more = f" and {count(rest, 'other')}" if rest > 0 else ""

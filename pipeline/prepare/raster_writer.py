@@ -29,6 +29,7 @@ from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.rasters import opened, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
 from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.skipped import lines
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.text import some
 from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
@@ -234,7 +235,7 @@ class RasterWriter:
             f"the date of the survey is not known: {survey:%Y-%m-%d}, when its files were written, is used "
             "instead (--date sets it)"
         )
-        notes = (*self._notes, *notes, *far, *([undated] if date is None else []))
+        notes = (*self._notes, *notes, *lines(far), *([undated] if date is None else []))
         return PreparedDataset(self.out / CATALOG, len(tiles), notes)
 
     def _replace(self, names: list[str]) -> None:

@@ -43,7 +43,8 @@ class TilePictures:
 
 def markdown_page(content: Content) -> str:
     """Return the report as Markdown."""
-    parts = [f"# {marked(content.title)}", content.state + ".", marked(content.reference)]
+    left_out = [f"The catalog {marked(line)}." for line in content.counts.left_out]
+    parts = [f"# {marked(content.title)}", content.state + ".", *left_out, marked(content.reference)]
     for title, table, line in sections(content):
         parts += [f"## {title}", *([line] if line else []), markdown(table)]
     versions = marked(", ".join(f"{name} {version}" for name, version in content.versions.items()))

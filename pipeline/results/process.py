@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog import Catalog
 from flexroad.catalog.sources import rasters
 from flexroad.catalog.storage.paths import parse_location
 from flexroad.catalog.tiling import Conversion
@@ -84,7 +83,7 @@ def catalog_from(
     )
     for line in result.left_out:
         warnings.warn(line, stacklevel=2)
-    Catalog(result.tiles).write(Path(output))
+    result.catalog.write(Path(output))
     return Path(output)
 
 

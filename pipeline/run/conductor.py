@@ -19,6 +19,8 @@ from typing import Any, Literal
 from flexroad.catalog import Bounds, Catalog, Tile
 from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.area import Area
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.skipped import Skipped, lost
 from flexroad.catalog.storage.outputs import made_folder
 from flexroad.catalog.storage.paths import Location, exists
 from flexroad.catalog.text import printable
@@ -93,7 +95,8 @@ class Selection:
         if not selected.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
         some = self.tiles or self.bbox is not None or self.area
-        return _merged_catalog(path, whole, selected) if some else whole, selected
+        taken = _merged_catalog(path, whole, selected) if some else whole
+        return replace(taken, skipped=_with_lost(path, whole)), selected
 
 
 ALL = Selection()
@@ -272,7 +275,28 @@ def _merged_catalog(path: Location, whole: Catalog, wanted: Catalog) -> Catalog:
     record = path / "catalog.parquet"
     earlier = {tile.id for tile in Catalog.read(record).tiles} if exists(record) else set()
     ids = earlier | {tile.id for tile in wanted.tiles}
-    return Catalog(tuple(tile for tile in whole.tiles if tile.id in ids))
+    return replace(whole, tiles=tuple(tile for tile in whole.tiles if tile.id in ids))
+
+
+def _with_lost(path: Location, whole: Catalog) -> tuple[Skipped, ...]:
+    """Return what a catalog skipped, with the tiles of the run at ``path`` that are missing without it.
+
+    Tiles that an earlier execution lost with a file stay lost until the file is no longer skipped.
+    """
+    record = path / "catalog.parquet"
+    if not whole.skipped or not exists(record):
+        return whole.skipped
+    try:
+        before = Catalog.read(record)
+    except CatalogError:
+        # A run whose catalog is damaged is repaired.
+        return whole.skipped
+    present = {tile.id for tile in whole.tiles}
+    earlier = {file.path: [tile for tile in file.tiles if tile not in present] for file in before.skipped}
+    return tuple(
+        replace(file, tiles=tuple(dict.fromkeys([*file.tiles, *earlier.get(file.path, ())])))
+        for file in lost(before.usable, present, whole.skipped)
+    )
 
 
 def with_workers(run: Run, settings: Sequence[str]) -> Run:

@@ -38,7 +38,7 @@ from flexroad.pipeline.run.status import (
     tile_states,
     tile_statuses,
 )
-from flexroad.pipeline.run.summary import Summary, read_summary, summarise, write_summary
+from flexroad.pipeline.run.summary import Summary, read_summary, summarise, with_skipped, write_summary
 from flexroad.pipeline.store.database import RunDatabase
 from flexroad.pipeline.store.records import (
     DONE,
@@ -152,7 +152,8 @@ def plan_run(
         if status.last_record and status.last_record.state == "done":
             times.append(status.last_record.seconds)
         new += status.last_record is None
-        changed += status.last_record is not None and not status.up_to_date
+        # Of a tile whose neighbour lost a file the result is valid, and computed again all the same.
+        changed += status.last_record is not None and not (status.up_to_date and status.sources_present)
         state: TileState = "done" if status.done else "failed" if status.failed else "pending"
         if status.last_record and status.from_marker:
             database.record(status.last_record)
@@ -162,13 +163,34 @@ def plan_run(
         elif selected:
             todo.append(position)
         states.append(state)
-    if last_incomplete and incomplete == len(run.catalog.usable) > 1:
-        # One error for the run: if each tile failed by itself, all existing results would be lost.
-        raise ConfigError(_all_incomplete(run, last_incomplete))
+    refuse_incomplete(run, incomplete, last_incomplete)
     database.flush()
     ids = (tile.id for tile in run.catalog.tiles)
-    vanished = database.set_states(zip(ids, states, strict=True))
+    lost = {tile for file in run.catalog.skipped for tile in file.tiles}
+    lost = {tile for tile in lost if database.get(tile)}
+    vanished = database.set_states(zip(ids, states, strict=True)) - len(lost)
     return Plan(todo, statistics.median(times) if times else None, new, changed, vanished)
+
+
+def refuse_incomplete(run: Run, number: int, last: TileGraph | None) -> None:
+    """Check that not each of several tiles lacks a file.
+
+    One error for the run: if each tile failed by itself, all existing results would be lost.
+
+    Parameters
+    ----------
+    number : int
+        Number of tiles that lack a file.
+    last : TileGraph, optional
+        The last of them.
+
+    Raises
+    ------
+    ConfigError
+        If all do.
+    """
+    if last and number == len(run.catalog.usable) > 1:
+        raise ConfigError(_all_incomplete(run, last))
 
 
 def _all_incomplete(run: Run, graph: TileGraph) -> str:
@@ -266,6 +288,7 @@ def _close(
         interrupted=interrupted,
         refused=refused,
     )
+    summary = with_skipped(summary, run.catalog.skipped)
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
         if plan.todo:

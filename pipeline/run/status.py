@@ -24,7 +24,7 @@ from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
 from flexroad.pipeline.graph.sources import Stat
 from flexroad.pipeline.run.lock import Owner, owner
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.summary import MAX_FAILURES, Summary, read_summary, summarise
+from flexroad.pipeline.run.summary import MAX_FAILURES, Summary, read_summary, summarise, with_skipped
 from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.database import NAME, RunDatabase
 from flexroad.pipeline.store.products import TileProducts
@@ -248,6 +248,13 @@ def recorded(run: Run, database: RunDatabase) -> Iterator[tuple[str, TileState, 
         yield status.graph.tile.id, state, status.last_record
 
 
+def pending_tiles(run: Run) -> Iterator[TileStatus]:
+    """Yield the current state of each tile that the last execution left pending."""
+    with open_database(run) as database:
+        states = {tile for tile, state, _ in recorded(run, database) if state == "pending"}
+        yield from tile_statuses(run, database, (tile for tile in run.catalog.tiles if tile.id in states))
+
+
 def summary(
     run: Run, track: Track = untracked, each: Callable[[TileStatus, TileState], object] = ignored
 ) -> Summary:
@@ -259,7 +266,8 @@ def summary(
         current = _checked(run, database, track=track, each=each)[0]
     last = read_summary(run.path)
     names = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
-    return replace(current, **{name: last[name] for name in names if name in last})
+    current = replace(current, **{name: last[name] for name in names if name in last})
+    return with_skipped(current, run.catalog.skipped)
 
 
 def recorded_summary(run: Run, database: RunDatabase, since: str) -> tuple[Summary, int]:
@@ -307,6 +315,7 @@ def progress(run: Run, owner: Owner) -> tuple[Summary, str]:
     """
     with open_database(run) as database:
         summary, finished = recorded_summary(run, database, owner.since)
+    summary = with_skipped(summary, run.catalog.skipped)
     minutes = (time.time() - datetime.fromisoformat(owner.since).timestamp()) / 60
     if not finished or minutes <= 0:
         return summary, ""

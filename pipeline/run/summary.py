@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from typing import Any
 
+from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.storage.paths import Location, read, write
 from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.records import Failure, TileState
@@ -47,6 +48,12 @@ class Summary:
     """Done tiles that have no road: their surface is that of the terrain."""
     flagged: tuple[str, ...] = ()
     """Ids of the done tiles to look at: those with flags in the variant exported first, but for no-road."""
+    skipped: int = 0
+    """Files that the catalog left out because they cannot be used."""
+    lost: int = 0
+    """Tiles of earlier executions that the catalog lacks because their file was skipped."""
+    left_out: tuple[str, ...] = ()
+    """What the catalog skipped, one line per reason, the first `MAX_FAILURES`."""
     failures: tuple[Failure, ...] = ()
     """The first `MAX_FAILURES` failures, in the catalog's order."""
 
@@ -57,10 +64,13 @@ class Summary:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command: 0 if all tiles are done, 1 if not, 2 if refused, 130 if interrupted."""
+        """Exit code of the command.
+
+        0: all tiles are done; 1: not all, or the catalog skipped files; 2: refused; 130: interrupted.
+        """
         if self.interrupted:
             return 130
-        return 2 if self.refused else int(self.failed + self.pending > 0)
+        return 2 if self.refused else int(self.failed + self.pending + self.skipped > 0)
 
 
 def summarise(
@@ -83,6 +93,13 @@ def summarise(
         flagged=flagged,
         failures=first,
     )
+
+
+def with_skipped(summary: Summary, skipped: Sequence[Skipped]) -> Summary:
+    """Return the summary with what the run's catalog skipped."""
+    lost = {tile for file in skipped for tile in file.tiles}
+    told = tuple(islice(lines(skipped), MAX_FAILURES))
+    return replace(summary, skipped=len(skipped), lost=len(lost), left_out=told)
 
 
 def write_summary(run: Location, summary: Summary, flushed: bool = False, **about: Any) -> None:

@@ -45,7 +45,8 @@ DETAIL_M = 4.0
 APART_M = 2.0
 """Smallest distance of a second peak from the best one (m)."""
 CLEAR = 0.3
-"""Smallest confidence at which the shift of a single tile is used."""
+"""Smallest confidence at which a shift is taken for one. Photos of other places reach 0.25 over five
+synthetic tiles; a tile's own photo has 0.28 to 0.6."""
 SMALLEST_M = 1.0
 """Smaller shifts (m), and those below half a cell of the heights, give no warning."""
 

@@ -14,6 +14,7 @@ import shapely
 
 from flexroad.catalog import LAYERS, Catalog, CatalogError, Grid, Layer, Tile, geoparquet
 from flexroad.catalog.area import Area
+from flexroad.catalog.skipped import Skipped, lines, lost
 
 
 def tile(east: int, root, layers=("dsm", "dtm"), crs="EPSG:25832") -> Tile:
@@ -298,3 +299,51 @@ def test_parquet_rows_equal_those_of_stac_geoparquet(tmp_path):
     expected = TileReader(str(tmp_path), allowed, "row", "c.parquet").tiles(stac_table_to_items(table))
     assert Catalog.read(tmp_path / "c.parquet").tiles == expected
     assert not any(tile.fault for tile in expected)
+
+
+@pytest.mark.parametrize("name", ["c.parquet", "c.json"])
+def test_skipped_files_round_trip_and_move_with_the_catalog(tmp_path, name):
+    file = Skipped("dsm/a.tif", "dsm", "not a raster", f"{tmp_path}/data")
+    outside = Skipped("/else/b.tif", "dtm", "not a raster", str(tmp_path), ("one", "two"))
+    catalog = Catalog((tile(295500, tmp_path),), (file, outside))
+    catalog.write(tmp_path / "run" / name, movable=False)
+    assert Catalog.read(tmp_path / "run" / name) == catalog
+    catalog.write(tmp_path / "data" / name)
+    moved = shutil.move(tmp_path / "data", tmp_path / "moved") / name
+    read = Catalog.read(moved)
+    assert read.skipped == (
+        replace(file, root=f"{tmp_path}/moved"),
+        replace(outside, root=f"{tmp_path}/moved"),
+    )
+    assert [one.path for one in read.skipped] == [f"{tmp_path}/moved/dsm/a.tif", "/else/b.tif"]
+    assert read.select(ids=[read.tiles[0].id]).skipped == read.skipped
+    Catalog(catalog.tiles).write(moved)
+    assert Catalog.read(moved).skipped == ()
+    assert b"skipped" not in moved.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "damaged", ["x", [1], [{"file": "a"}], [{"file": "", "layer": "", "reason": "", "root": "", "tiles": []}]]
+)
+def test_damaged_list_of_skipped_files_is_no_catalog(tmp_path, damaged):
+    Catalog((tile(295500, tmp_path),)).write(path := tmp_path / "c.json")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"flexroad:skipped": damaged}))
+    with pytest.raises(CatalogError, match=r"c\.json is not a .* its list of skipped files cannot be read"):
+        Catalog.read(path)
+
+
+def test_tiles_lost_with_a_skipped_file_or_folder_are_those_it_lay_on(tmp_path):
+    """Another tile left the area: no skipped file lay on it, only near it."""
+    dsm = (("a/1.tif", 295500.0), ("b/2.tif", 295750.0), ("3.tif", 296000.0))
+    extents = tuple((west, 5629250.0, west + 250, 5629500.0) for _, west in dsm)
+    layer = Layer("dsm", tuple(name for name, _ in dsm), extents=extents)
+    before = [replace(tile(int(west), tmp_path), layers=(layer,)) for _, west in dsm]
+    one, two, three = (tile.id for tile in before)
+    skipped = [Skipped("a/1.tif", "dsm", "bad", str(tmp_path)), Skipped("b/", "dsm", "shut", str(tmp_path))]
+    found = lost(before, set(), skipped)
+    assert [file.tiles for file in found] == [(one,), (two,)]
+    assert [file.tiles for file in lost(before, {one, three}, skipped)] == [(), (two,)]
+    assert lines(found) == [
+        f"skipped a/1.tif (dsm): bad; the run lost 1 tile with that: {one}",
+        f"skipped folder b (dsm): shut; the run lost 1 tile with that: {two}",
+    ]

@@ -198,10 +198,12 @@ class Statement:
     """The next command, ready to be pasted; empty if nothing has to be done."""
 
 
-def headline(table: TileTable) -> str:
-    """Return the answer in one sentence."""
+def headline(table: TileTable, skipped: int = 0) -> str:
+    """Return the answer in one sentence; ``skipped`` is the number of files that the catalog lacks."""
     n, total = table.counts, len(table.tiles)
     done = n["fine"] + n["flagged"] + n["no-road"]
+    if done == total and skipped:
+        return f"In part: {_all(total)} done, but the catalog skipped {count(skipped, 'file')}."
     if done == total:
         flagged = _are(n["flagged"], "flagged")
         return f"Yes: {_all(total)} done{f', {flagged}' if flagged else ', none is flagged'}."
@@ -241,6 +243,7 @@ def statements(content: Content, table: TileTable, failed: Mapping[str, str], ru
     run = shlex.quote(run)
     return [
         *_last_run(content, run),
+        *_skipped(content),
         *_failures(table.counts["failed"], failed, run),
         *_pending(table.counts["pending"], run, content.running),
         *_flagged(table),
@@ -256,6 +259,20 @@ def _last_run(content: Content, run: str) -> Iterator[Statement]:
     if content.counts.interrupted:
         text = "The last run was interrupted; its tiles are kept."
         yield Statement("pending", text, f"flexroad rerun {run}")
+
+
+def _skipped(content: Content) -> Iterator[Statement]:
+    """Say which files the catalog lacks: no tile tells."""
+    counts = content.counts
+    if not counts.skipped:
+        return
+    more = len(counts.left_out) - MOST
+    told = "; ".join([*map(printable, counts.left_out[:MOST]), *([f"{more} more"] if more > 0 else [])])
+    text = (
+        f"The catalog lacks {count(counts.skipped, 'file')} that cannot be used: {told}. Repair what was "
+        "skipped, repeat the `flexroad catalog` command, then `flexroad run`."
+    )
+    yield Statement("failed", text)
 
 
 def _failures(number: int, failed: Mapping[str, str], run: str) -> Iterator[Statement]:

@@ -111,7 +111,7 @@ def html_page(
         script=Markup(script),
         script_hash=f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}",
         data=Markup(as_script(data)),
-        headline=headline(table),
+        headline=headline(table, content.counts.skipped),
         cards=cards(table),
         statements=statements(content, table, failed, str(run.path)),
         crs=_crs_name(table.crs),

@@ -99,9 +99,9 @@ def test_expected_failures_follow_min_valid_of_the_configuration(survey, tmp_pat
 
 def test_dry_run_and_check_say_what_would_fail(survey, flexroad, tmp_path):
     change(Catalog.read(survey).tiles[1], "dsm", empty)
-    said = flexroad("run", "--catalog", survey, "--out", tmp_path / "run", "--dry-run").expected(0)
+    said = flexroad("run", "--catalog", survey, "--out", tmp_path / "run", "--dry-run").expected(1)
     line = f"warning: 1 of 4 tiles would fail: {FEW}: {Catalog.read(survey).tiles[1].id}"
-    assert said.out.splitlines()[-1] == line
+    assert said.out.splitlines()[-2:] == [line, "expected exit code: 1 (1 tile would fail)"]
     assert line in flexroad("catalog", "check", survey).expected(1).out.splitlines()
 
 
@@ -155,3 +155,18 @@ def test_check_shifted_photo_and_missing_file_are_faults(tmp_path):
     ]
     assert any(f"missing: {missing} (1 tile)" in text for text in faults)
     assert any("dop lies 2.0 m east" in text for text in faults)
+
+
+def test_unclear_shift_of_the_photo_is_a_warning_without_advice(tmp_path, flexroad):
+    """Each tile has the photo of another one: no shift is right, and the best one has a low confidence."""
+    path = write_scenes(tmp_path, 9, seed=3, size_m=60, dop=True)
+    photos = sorted((tmp_path / "dop").glob("*.tif"))
+    pictures = [open_alone(photo).read() for photo in photos]
+    for photo, picture in zip(photos, [*pictures[1:], pictures[0]], strict=True):
+        with rasterio.open(photo, "r+") as raster:
+            raster.write(picture)
+    said = flexroad("catalog", "check", path).expected(0)
+    (line,) = [line for line in said.out.splitlines() if "dop seems to lie" in line]
+    assert line.startswith("warning: dop seems to lie 1.4 m west and 6.0 m south of the heights ")
+    assert "confidence 0.10): too unclear to move it; " in line
+    assert "gdal_translate" not in said.out

@@ -29,7 +29,7 @@ def reasons(run):
     """The reasons in a dry run, in the order of the tiles, and its line of totals."""
 
     def call(*words) -> tuple[list[str], str]:
-        lines = run("--dry-run", *words).expected(0).out.splitlines()
+        lines = run("--dry-run", *words).out.splitlines()
         return [line.partition(": ")[2] for line in lines[:4]], lines[4]
 
     return call
@@ -62,11 +62,70 @@ def test_reasons_name_changed_files_and_failures(run, reasons, survey, tmp_path)
     dtm = path(failing, "dtm")
     kept = dtm.rename(tmp_path / "kept.tif")
     assert reasons()[0][3] == f"file missing: {dtm}"
+    run("--dry-run").expected(1)
     run().expected(1)
     assert reasons()[0][3].startswith("failed last time: load: TaskError: ")
     shutil.move(kept, dtm)
     assert reasons()[0][3].startswith("failed last time: ")
     assert computed(run().expected(0)) == 1
+
+
+def last_line(said) -> str:
+    return said.out.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_file_that_comes_and_goes_is_told_by_dry_run_counts_and_rerun(survey, flexroad, tmp_path):
+    """In production a file also belongs to the neighbours: only the tile that it lies on fails."""
+    out = tmp_path / "run"
+    words = ("run", "--catalog", survey, "--out", out)
+    run = (*words, "--executor", "serial")
+    assert last_line(flexroad(*words, "--dry-run").expected(0)) == "expected exit code: 0"
+    flexroad(*run).expected(0)
+    first, *others = (tile.id for tile in Catalog.read(survey).tiles)
+    file = survey.parent / "dsm" / f"{first}.tif"
+    kept = file.rename(tmp_path / "kept.tif")
+
+    dry = flexroad(*words, "--dry-run").expected(1)
+    lines = dry.out.splitlines()
+    beside = f"source changed: {file}, which is missing"
+    assert lines[:4] == [f"{first}: file missing: {file}", *(f"{other}: {beside}" for other in others)]
+    assert lines[4] == "4 tiles: 3 source changed, 1 file missing"
+    assert last_line(dry) == "expected exit code: 1 (1 tile would fail)"
+    said = flexroad(*run).expected(1)
+    assert "4 tiles: 3 done (0 cached), 1 failed, 0 pending; 0 new, 4 changed, 0 vanished; " in said.out
+    said = flexroad(*run).expected(1)
+    assert "4 tiles: 3 done (3 cached), 1 failed, 0 pending; 0 new, 0 changed, 0 vanished; " in said.out
+
+    shutil.move(kept, file)
+    assert last_line(flexroad(*words, "--dry-run").expected(0)) == "expected exit code: 0"
+    said = flexroad("rerun", out, "--tile", first, "--executor", "serial").expected(1)
+    assert "4 tiles: 1 done (0 cached), 0 failed, 3 pending; 0 new, 4 changed, 0 vanished; " in said.out
+    why = f"  {', '.join(others)}: source changed: dsm/{file.name}, which was missing"
+    assert said.out.splitlines()[1:] == [
+        why,
+        f"3 tiles have no result of the present files and options; next: flexroad rerun {out}",
+    ]
+    assert f"{why}; `flexroad rerun {out}` computes it" in flexroad("status", out).expected(0).out
+    dry = flexroad(*words, "--tile", first, "--dry-run").expected(1)
+    assert last_line(dry) == "expected exit code: 1 (3 other tiles pending or failed)"
+    flexroad("rerun", out, "--executor", "serial").expected(0)
+
+    (survey.parent / "dsm").rename(tmp_path / "unmounted")
+    for command in ((*words, "--dry-run"), run):
+        (error,) = flexroad(*command).expected(2).errors
+        assert error.startswith("error: each of the 4 tiles lacks a file, for example ")
+
+
+def test_missing_file_that_is_back_is_no_change_of_checksum(run, reasons, survey):
+    """Size and time of a missing file are not recorded: two values in place of three, as with --checksum."""
+    tile = Catalog.read(survey).tiles[0]
+    dsm = path(tile, "dsm")
+    kept = dsm.rename(survey.parent / "kept.tif")
+    run().expected(1)
+    shutil.move(kept, dsm)
+    settings = reasons("--set", "load.halo_m=10")[0]
+    assert not [line for line in settings if "checksum" in line]
 
 
 @pytest.mark.parametrize(

@@ -49,11 +49,26 @@ def run(tmp_path, made_survey):
     return made_run(tmp_path / "my run", made_survey / "catalog.parquet", IDS)
 
 
-def said(run, rows):
+def said(run, rows, **counts):
     content = made_content(run, rows)
+    content = replace(content, counts=replace(content.counts, **counts))
     table = tile_table(run.catalog.tiles, content)
     lines = statements(content, table, errors(content), str(run.path))
-    return headline(table), [(line.kind, line.text, line.command) for line in lines]
+    return headline(table, content.counts.skipped), [(line.kind, line.text, line.command) for line in lines]
+
+
+def test_files_that_the_catalog_skipped_are_told_first(tmp_path, made_survey):
+    run = made_run(tmp_path / "run", made_survey / "catalog.parquet", ["a"])
+    rows = [made_row("a", 0.02)]
+    assert said(run, rows)[0] == "Yes: the tile is done, none is flagged."
+    lines = ("skipped x.tif (dsm): it is damaged",)
+    answer, told = said(run, rows, skipped=1, left_out=lines)
+    assert answer == "In part: the tile is done, but the catalog skipped 1 file."
+    text = (
+        "The catalog lacks 1 file that cannot be used: skipped x.tif (dsm): it is damaged. Repair what was "
+        "skipped, repeat the `flexroad catalog` command, then `flexroad run`."
+    )
+    assert told[0] == ("failed", text, "")
 
 
 def test_all_columns_of_the_metrics_have_a_label():
