@@ -40,7 +40,7 @@ def told(flexroad, tmp_path):
         check = flexroad("catalog", "check", catalog, "--config", config).expected(1)
         (line,) = (line for line in check.out.splitlines() if line.startswith("warning: "))
         arguments = ["--config", config, "--catalog", catalog, "--out", tmp_path / "run"]
-        dry = flexroad("run", *arguments, "--dry-run").expected(0)
+        dry = flexroad("run", *arguments, "--dry-run").expected(1)
         assert line in dry.out.splitlines()
         run = flexroad("run", *arguments, "--executor", "serial").expected(1)
         ids, _, message = line.removeprefix("warning: ").partition(" would fail: ")

@@ -166,7 +166,8 @@ def test_run_dry_run_prints_a_line_per_tile_and_writes_nothing(made_survey, tmp_
     assert not (tmp_path / "r").exists()
     ids = [tile.id for tile in Catalog.read(made_survey / "catalog.parquet").tiles]
     assert said[:5] == [*(f"{name}: new" for name in ids), "4 tiles: 4 new"]
-    assert "12 to do" in said[-1]
+    assert "12 to do" in said[-2]
+    assert said[-1] == "expected exit code: 0"
     graph = flexroad("run", *words, "--dry-run", "--verbose")
     assert graph.count("fit ") == 4 * 3 + 1
     assert "(plane, rgt, flexroad)" in graph
