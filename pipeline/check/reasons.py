@@ -18,6 +18,7 @@ Kind = Literal[
     "new",
     "failed last time",
     "file missing",
+    "file left out",
     "product missing",
     "source changed",
     "settings or version changed",
@@ -53,6 +54,8 @@ def reason(run: Run, status: TileStatus) -> Reason:
         return Reason("up to date")
     if missing := [path for path, file in graph.file_stats.items() if file is None]:
         return Reason("file missing", _first(missing, ""))
+    if status.done:
+        return Reason("file left out", _first(record.left_out, " could not be used"))
     if record.fingerprint == graph.fingerprint:
         return Reason("product missing")
     if _compared_otherwise(record, graph):
