@@ -194,7 +194,7 @@ def _source(path: Path, allowed: AllowedFolders | None, depth: int) -> bool:
         driver, alone = _checked(path, allowed, depth - 1)
         if driver != "VRT":
             stats = path.stat()
-            _require_plain(path, driver, stats.st_size, stats.st_mtime_ns)
+            _require_plain_once(path, driver, stats.st_size, stats.st_mtime_ns)
     except FileNotFoundError:
         # GDAL reports it when it needs the file.
         return True
@@ -204,8 +204,12 @@ def _source(path: Path, allowed: AllowedFolders | None, depth: int) -> bool:
 
 
 @lru_cache(maxsize=16384)
-def _require_plain(path: Path, driver: str, size: int, mtime_ns: int) -> None:
+def _require_plain_once(path: Path, driver: str, size: int, mtime_ns: int) -> None:
     """Check the metadata of a file; cached by size and time."""
+    _require_plain(path, driver)
+
+
+def _require_plain(path: Path, driver: str) -> None:
     try:
         env = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="TRUE", **OFFLINE)
         with env, rasterio.open(str(path), driver=driver) as dataset:
@@ -307,10 +311,19 @@ def _check_side_car(side: Path) -> None:
         if _driver(side) != "GTiff":
             raise Refused("is no TIFF; remove it")
         _side_cars(side)
-        stats = side.stat()
-        _require_plain(side, "GTiff", stats.st_size, stats.st_mtime_ns)
+        # Not cached: GDAL takes a raster without a mask that it cannot read.
+        _require_plain(side, "GTiff")
+    elif suffix == ".xml":
+        _require_xml(side)
     elif suffix == ".aux" and head(side).startswith(b"EHFA_HEADER_TAG"):
         raise Refused("is of Erdas Imagine and may name other files; remove it")
+
+
+def _require_xml(side: Path) -> None:
+    """Raise an error if a file is cut off or has zeros: GDAL then takes a raster without its nodata value."""
+    data = side.read_bytes()
+    if b"\0" in data or not data.rstrip().endswith(b">"):
+        raise Refused("is damaged; fetch it again, or remove it")
 
 
 @lru_cache(maxsize=65536)

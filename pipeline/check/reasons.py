@@ -19,6 +19,7 @@ Kind = Literal[
     "new",
     "failed last time",
     "file missing",
+    "file left out",
     "product missing",
     "source changed",
     "settings or version changed",
@@ -57,6 +58,8 @@ def reason(run: Run, status: TileStatus) -> Reason:
     # A file around the tile is left out, and the tile computed without it.
     if missing := [path for path, file in graph.file_stats.items() if file is None]:
         return Reason("source changed", _first(missing, ", which is missing,").removesuffix(","))
+    if status.done:
+        return Reason("file left out", _first(record.left_out, " could not be used"))
     if record.fingerprint == graph.fingerprint:
         return Reason("product missing")
     if _compared_otherwise(record, graph):

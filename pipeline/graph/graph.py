@@ -13,6 +13,9 @@ mtime), or by their bytes; files that only the options name, such as a model (th
 hashed by their bytes. Of the rasters that `load` reads, only the files that reach the tile or its halo count.
 Variants with equal options up to a stage share its node, so it is computed once; a
 node whose artefact is in the store is not computed.
+
+A result that was computed without a file that could not be used has another name, and so have the results
+that follow from it (`TileGraph.renamed`): they are used again only while the file cannot be used.
 """
 
 from __future__ import annotations
@@ -42,7 +45,7 @@ from flexroad.tasks.border import ENDS, BorderTask
 from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.options import Options, stage_function, stage_module
 
-ITEM_VERSION = 2
+ITEM_VERSION = 3
 """Raised when the STAC item of a tile changes for the same result."""
 PHOTO = "texture"
 """Start of the names of the options of the photo on the mesh."""
@@ -108,6 +111,46 @@ class TileGraph:
         """The tile with only the layers that its stages read: those of other layers may lie anywhere."""
         reads = self._stage_reads
         return replace(self.tile, layers=tuple(layer for layer in self.tile.layers if layer.name in reads))
+
+    def renamed(self, names: Mapping[str, str]) -> TileGraph:
+        """Return the graph of results of which some were computed without a file that could not be used.
+
+        Parameters
+        ----------
+        names : mapping of str
+            The names of these results, by fingerprint here (`Evaluator.renamed`).
+        """
+        if not names:
+            return self
+
+        def new(fingerprints: Iterable[str]) -> tuple[str, ...]:
+            return tuple(names.get(name, name) for name in fingerprints)
+
+        nodes = [
+            replace(node, fingerprint=name, inputs=new(node.inputs), frame=new(node.frame))
+            for name, node in zip(new(self.nodes), self.nodes.values(), strict=True)
+        ]
+        return replace(
+            self,
+            nodes={node.fingerprint: node for node in nodes},
+            variants={
+                variant: dict(zip(stages, new(stages.values()), strict=True))
+                for variant, stages in self.variants.items()
+            },
+            fingerprint=hashed(to_json([self.fingerprint, names])),
+        )
+
+    def in_catalog(self, path: str) -> str:
+        """Return layer and name in the catalog of a source file, by its full name."""
+        tile, reads = self.around, self.reads
+        names = (
+            f"{layer.name} {file}"
+            for layer in tile.all_layers
+            if layer.name in reads
+            for file in layer.files
+            if str(tile.path(layer.name, file)) == path
+        )
+        return next(names, path)
 
     @property
     def product_sources(self) -> tuple[Layer, ...]:

@@ -37,7 +37,7 @@ from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.record import Run, check_folder, check_links
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.run.status import Folders
+from flexroad.pipeline.run.status import Folders, open_database, recorded
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import FAILED
 
@@ -249,6 +249,8 @@ def stages_from(stage: str | None) -> frozenset[str]:
 def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile], bool]:
     """Return a filter for the tiles of a rerun: the given tiles, the failed ones, both, or all.
 
+    With the failed ones go the tiles that were made without a file.
+
     Raises
     ------
     CatalogError
@@ -256,12 +258,17 @@ def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile
     """
     folders = Folders(run.path)
     ids = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
+    without_file = set[str]()
+    if failed:
+        with open_database(run) as database:
+            records = (record for _, _, record in recorded(run, database) if record)
+            without_file = {record.tile_id for record in records if record.left_out}
 
     def selected(tile: Tile) -> bool:
         if tile.id in ids or not (ids or failed):
             return True
         # The marker is enough, even if it is of other sources: a corrected file is a reason to rerun.
-        return failed and FAILED in folders(tile.id)
+        return tile.id in without_file or (failed and FAILED in folders(tile.id))
 
     return selected
 

@@ -21,17 +21,16 @@ from numpy.typing import NDArray
 from flexroad.catalog import Grid, Tile
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.source_files import source_stat
-from flexroad.catalog.storage.paths import Location, parse_location, read, stat
+from flexroad.catalog.storage.paths import Location, parse_location, stat
 from flexroad.catalog.text import count, some
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing, product_layers
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Folders, TileStatus, peek_statuses
-from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.store.products import TileProducts
-from flexroad.pipeline.store.records import DONE, MarkerStat, distances_of, from_item
+from flexroad.pipeline.store.products import DAMAGED, TileProducts
+from flexroad.pipeline.store.records import DONE, MarkerStat, TileRecord, distances_of, from_item
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.quality import assess
@@ -189,20 +188,22 @@ class RunPlace:
             If the tile has another graph now.
         """
         graph = self.pattern.graph(tile, self.checksum)
-        if graph.fingerprint != snapshot.fingerprint and any_file_missing(graph):
-            graph = self.pattern.graph(tile, self.checksum, source_stat, self._recorded(tile.id))
+        if graph.fingerprint != snapshot.fingerprint and (record := self._record(tile.id)):
+            if any_file_missing(graph):
+                graph = self.pattern.graph(tile, self.checksum, source_stat, record.sources)
+            graph = graph.renamed(record.renamed)
         if graph.fingerprint != snapshot.fingerprint:
             raise ConfigError(
                 f"its sources have changed; run `flexroad rerun {self.path}`, then export again"
             )
         return graph
 
-    def _recorded(self, tile_id: str) -> list[object]:
+    def _record(self, tile_id: str) -> TileRecord | None:
+        content = self._folder(tile_id).marker(DONE)
         try:
-            content = checked_json.loads(read(self._folder(tile_id).file(DONE)))
-            return from_item(content, None).sources
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            return []
+            return from_item(content, None) if content else None
+        except DAMAGED:
+            return None
 
     def _folder(self, tile_id: str) -> TileProducts:
         return TileProducts.of(parse_location(self.path), tile_id)

@@ -19,15 +19,14 @@ from typing import Any
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.listed_files import ListedFiles
-from flexroad.catalog.storage.paths import FileStat, Location, entries, read, refresh
+from flexroad.catalog.storage.paths import FileStat, Location, entries, refresh
 from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
 from flexroad.pipeline.graph.sources import Stat
 from flexroad.pipeline.run.lock import Owner, owner
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.summary import MAX_FAILURES, Summary, read_summary, summarise, with_skipped
-from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.database import NAME, RunDatabase
-from flexroad.pipeline.store.products import TileProducts
+from flexroad.pipeline.store.products import DAMAGED, TileProducts
 from flexroad.pipeline.store.records import (
     DONE,
     FAILED,
@@ -40,7 +39,6 @@ from flexroad.pipeline.store.records import (
 )
 from flexroad.pipeline.worker.tile import marker_stat
 
-DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
 Track = Callable[[Iterable[Any], str, int], Iterable[Any]]
 """Returns the items of a step, whose name and number it takes; it may show how many are done."""
 
@@ -71,7 +69,7 @@ class TileStatus:
     up_to_date: bool
     """Whether that result has the graph's fingerprint and its products exist."""
     sources_present: bool
-    """Whether it is up to date and all its source files exist."""
+    """Whether it is up to date, all its source files exist, and none was left out."""
     from_marker: bool
     """Whether the record was read from the marker, because the database does not have it."""
 
@@ -141,11 +139,15 @@ def _status(
     """Return the state of one tile that has this entry in the database and whose folder has ``files``."""
     record = last_record(run.folder(tile.id), entry, files)
     graph = run.graph(tile, stat_file)
-    current, from_marker = matches(record, graph, files), record is not entry
-    if record is None or current or not any_file_missing(graph):
-        return TileStatus(graph, record, current, current, from_marker)
-    graph = run.graph(tile, stat_file, record.sources)
-    return TileStatus(graph, record, matches(record, graph, files), False, from_marker)
+    from_marker, renamed = record is not entry, record.renamed if record else {}
+    made = graph.renamed(renamed)
+    current = matches(record, made, files)
+    if current:
+        return TileStatus(made, record, True, not renamed, from_marker)
+    if record is None or not any_file_missing(graph):
+        return TileStatus(graph, record, False, False, from_marker)
+    made = run.graph(tile, stat_file, record.sources).renamed(renamed)
+    return TileStatus(made, record, matches(record, made, files), False, from_marker)
 
 
 def last_record(
@@ -161,8 +163,10 @@ def last_record(
 
 
 def _from_marker(folder: TileProducts, marker: MarkerStat) -> TileRecord | None:
+    content = folder.marker(marker[0])
+    if content is None:
+        return None
     try:
-        content = checked_json.loads(read(folder.file(marker[0])))
         return (from_item if marker[0] == DONE else from_failed)(content, marker)
     except DAMAGED:
         return None

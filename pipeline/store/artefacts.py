@@ -22,8 +22,20 @@ from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.graph import Node
 from flexroad.pipeline.store import codec
+from flexroad.tasks.spline.frame import Corner, Edge
+from flexroad.tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask, Surface
 
-DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
+DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
+RESULTS: dict[str, tuple[type, ...]] = {
+    "segment": (RoadMask,),
+    "ecsrc": (RoadClusters,),
+    "border": (Corner, Edge),
+    "fit": (Surface,),
+    "sample": (Mesh,),
+    "evaluate": (Metrics,),
+    "assess": (Quality,),
+}
+"""The types of result of each stage."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +51,15 @@ class ArtefactStore:
     def find(self, stage: str, fingerprint: str) -> codec.Stored | None:
         """Return what `get` returns, for a node of which only stage and fingerprint are known."""
         try:
-            return codec.decode(paths.read(self._path(stage, fingerprint)))
+            found = codec.decode(paths.read(self._path(stage, fingerprint)), fingerprint)
         except DAMAGED:
             # A damaged artefact counts as missing: it is computed and written again.
             return None
+        return found if isinstance(found.value, RESULTS[stage]) else None
 
     def put(self, node: Node, value: Any, seconds: Mapping[str, float], notes: Sequence[str]) -> int:
         """Store a result with the seconds of each stage and the notes up to it; return the size in bytes."""
-        data = codec.encode(value, seconds, notes)
+        data = codec.encode(value, seconds, notes, node.fingerprint)
         paths.write(self._path(node.stage, node.fingerprint), data)
         return len(data)
 

@@ -1,7 +1,7 @@
 """Lossless conversion of a stage's result to bytes and back: one npz with the arrays and a JSON header.
 
-The SHA-256 of the npz is appended to it, where npz readers ignore it; it detects damage on reading. No pickle
-is used, because a store may be shared.
+The SHA-256 of the npz and of its fingerprint is appended to it, where npz readers ignore it. On reading it
+detects damage, and a file under the name of another. No pickle is used, because a store may be shared.
 """
 
 from __future__ import annotations
@@ -46,33 +46,40 @@ class Stored(NamedTuple):
     """Notes on the sources of all stages up to it."""
 
 
-def encode(value: Any, seconds: Mapping[str, float], notes: Sequence[str] = ()) -> bytes:
+def encode(
+    value: Any, seconds: Mapping[str, float], notes: Sequence[str] = (), fingerprint: str = ""
+) -> bytes:
     """Return the bytes of a result, of the seconds of each stage and of the notes up to it (`Stored`)."""
     arrays: dict[str, Any] = {}
     plain = _fields(value, "", arrays)
     header = {"type": type(value).__name__, "seconds": dict(seconds), "notes": list(notes), "fields": plain}
     arrays[HEADER] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     payload = npz(arrays)
-    return payload + hashlib.sha256(payload).digest()
+    return payload + _checksum(payload, fingerprint)
 
 
-def decode(data: bytes) -> Stored:
+def decode(data: bytes, fingerprint: str = "") -> Stored:
     """Return the result, the seconds of each stage and the notes up to it.
 
     Raises
     ------
     ValueError, KeyError, OSError, zipfile.BadZipFile, zlib.error
-        If the bytes are damaged or of an unknown type.
+        If the bytes are damaged, of an unknown type, or were encoded with another fingerprint.
     """
     payload, checksum = data[:-SHA256_BYTES], data[-SHA256_BYTES:]
-    if hashlib.sha256(payload).digest() != checksum:
-        raise ValueError("the checksum does not match the data")
+    if _checksum(payload, fingerprint) != checksum:
+        raise ValueError("the checksum does not match the data and its fingerprint")
     with np.load(io.BytesIO(payload), allow_pickle=False) as archive:
         arrays = dict(_arrays(archive))
     header = json.loads(arrays.pop(HEADER).tobytes())
-    # Stores of earlier versions have no notes.
-    notes = tuple(header.get("notes", ()))
-    return Stored(_result(header["type"], header["fields"], "", arrays), header["seconds"], notes)
+    value = _result(header["type"], header["fields"], "", arrays)
+    return Stored(value, header["seconds"], tuple(header["notes"]))
+
+
+def _checksum(payload: bytes, fingerprint: str) -> bytes:
+    checksum = hashlib.sha256(payload)
+    checksum.update(fingerprint.encode())
+    return checksum.digest()
 
 
 def _fields(value: Any, prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:

@@ -407,5 +407,6 @@ def _record(tile_id: str, finished: Any, text: Any, checksum: Any) -> TileRecord
             "failures": tuple(Failure(**failure) for failure in content["failures"]),
             "marker": (marker[0], marker[1], marker[2]) if marker else None,
             "stale": tuple(content.get("stale", ())),
+            "left_out": tuple(content.get("left_out", ())),
         }
     )

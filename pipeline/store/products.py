@@ -15,6 +15,9 @@ from flexroad.catalog.storage.paths import FileStat, Location
 from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.records import DONE, FAILED
 
+DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
+"""What reading a damaged marker raises."""
+
 
 @dataclass(frozen=True)
 class TileProducts:
@@ -42,9 +45,18 @@ class TileProducts:
         linked = isinstance(self.path, Path) and self.path.is_symlink()
         return {} if linked else paths.listing(self.path)
 
+    def marker(self, name: str) -> dict[str, Any] | None:
+        """Return the content of a marker; None if it is missing or damaged, or of another tile."""
+        try:
+            content = checked_json.loads(paths.read(self.file(name)))
+            own = safe_name(content["id" if name == DONE else "tile"]) == self.path.name
+        except DAMAGED:
+            return None
+        return content if own else None
+
     def nodes(self, variant: str) -> dict[str, str]:
         """Return the fingerprint of each stage of a variant when the tile was last finished."""
-        item = self._read(DONE) or {}
+        item = self.marker(DONE) or {}
         try:
             return dict(item["properties"]["flexroad:nodes"][variant])
         except (KeyError, TypeError, ValueError):
@@ -52,7 +64,7 @@ class TileProducts:
 
     def verified(self) -> bool:
         """Return whether every product named by the item has the checksum it was written with."""
-        item = self._read(DONE) or {}
+        item = self.marker(DONE) or {}
         try:
             return all(
                 _checksum(paths.read(self.file(asset["href"]))) == asset["file:checksum"]
@@ -98,12 +110,6 @@ class TileProducts:
         if flushed:
             # The tile's folder and the folder of all tiles may be new.
             paths.flush_names(self.path, self.path.parent, self.path.parent.parent)
-
-    def _read(self, name: str) -> dict[str, Any] | None:
-        try:
-            return checked_json.loads(paths.read(self.file(name)))
-        except (OSError, ValueError):
-            return None
 
 
 def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:

@@ -73,6 +73,10 @@ class TileRecord:
     """None if the marker could not be written, for example on a full disk."""
     stale: tuple[str, ...] = ()
     """Names of the products of an earlier result that a failed tile still has."""
+    renamed: dict[str, str] = field(default_factory=dict)
+    """Names of results that were made without a file, by fingerprint (`TileGraph.renamed`)."""
+    left_out: tuple[str, ...] = ()
+    """These files, by layer and name in the catalog: they could not be used when the tile was finished."""
 
     @property
     def has_products(self) -> bool:
@@ -115,6 +119,8 @@ def from_item(item: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
         finished=properties.get("created", ""),
         seconds=properties.get("flexroad:seconds", 0.0),
         marker=marker,
+        renamed=dict(properties.get("flexroad:renamed") or {}),
+        left_out=tuple(properties.get("flexroad:left_out", ())),
     )
 
 

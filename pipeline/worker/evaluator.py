@@ -11,7 +11,7 @@ import resource
 import traceback
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -22,9 +22,11 @@ from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.borders import STAGE
 from flexroad.pipeline.graph.graph import Node, TileGraph, files_read
+from flexroad.pipeline.graph.sources import hashed, to_json
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.records import Failure, utc_now
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.left_out import recorded
 from flexroad.tasks.options import Options, stage_function
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, Surface, TileData
@@ -106,6 +108,10 @@ class Evaluator:
     """Fingerprint -> stage -> computing time (s) of the node and the nodes it depends on."""
     notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Fingerprint -> notes on the sources of the node and of the nodes it depends on."""
+    renamed: dict[str, str] = field(default_factory=dict)
+    """Fingerprint -> name of the result, if a file was left out of it, or of what it was computed from."""
+    left_out: dict[str, None] = field(default_factory=dict)
+    """These files, by layer and name in the catalog."""
     spans: defaultdict[str, StageCost] = field(default_factory=lambda: defaultdict(StageCost))
     """Cost of each stage in this process."""
     errors: dict[str, StageError] = field(default_factory=dict)
@@ -123,21 +129,49 @@ class Evaluator:
             raise self.errors[fingerprint]
         if fingerprint not in self.results:
             node = self.graph.nodes[fingerprint]
-            artefact = self.store.get(node) if node.stored and node.stage not in self.force else None
-            if artefact is None:
+            if not self._restore(node):
                 self._compute(node)
-            else:
-                self.results[fingerprint], self.chain_seconds[fingerprint], self.notes[fingerprint] = artefact
-                self.spans[node.stage].reused += 1
         return self.results[fingerprint]
+
+    def _restore(self, node: Node) -> bool:
+        """Read a result from the store, by its name; return whether it is there."""
+        if not node.stored or node.stage in self.force:
+            return False
+        artefact = self.store.get(self._named(node))
+        if artefact is None:
+            return False
+        name = node.fingerprint
+        self.results[name], self.chain_seconds[name], self.notes[name] = artefact
+        self.spans[node.stage].reused += 1
+        return True
+
+    def _named(self, node: Node) -> Node:
+        """Return a node with the name of its result."""
+        name = self.renamed.get(node.fingerprint)
+        return replace(node, fingerprint=name) if name else node
+
+    def rename(self, name: str, left_out: Iterable[tuple[str, str]], inputs: Iterable[str] = ()) -> None:
+        """Name a result also by the files that are left out of it (`LeftOut`) and of its inputs.
+
+        Of missing files the fingerprint itself knows.
+        """
+        missing = self.graph.tile.missing or ()
+        own = sorted((self.graph.in_catalog(file), cells) for file, cells in left_out if file not in missing)
+        self.left_out |= dict.fromkeys(file for file, _ in own)
+        before = [[other, self.renamed[other]] for other in inputs if other in self.renamed]
+        if own or before:
+            self.renamed[name] = hashed(to_json([name, own, before]))
 
     def _compute(self, node: Node) -> None:
         inputs = [self(fingerprint) for fingerprint in node.inputs]
         frame = [self(fingerprint) for fingerprint in node.frame]
+        self.rename(node.fingerprint, (), (*node.inputs, *node.frame))
+        if node.fingerprint in self.renamed and self._restore(node):
+            return
         span = self.spans[node.stage]
         before = span.seconds
         try:
-            with span.measure():
+            with span.measure(), recorded() as left_out:
                 result = self._run_stage(node, inputs, frame)
         except Exception as error:
             failed = StageError(failure_of(self.graph.tile, node.stage, error))
@@ -147,7 +181,8 @@ class Evaluator:
         seconds = self._seconds_before(node)
         seconds[node.stage] = span.seconds - before
         self.results[node.fingerprint], self.chain_seconds[node.fingerprint] = result, seconds
-        own = result.notes if node.stage in WITH_NOTES else ()
+        self.rename(node.fingerprint, left_out, (*node.inputs, *node.frame))
+        own = (*(result.notes if node.stage in WITH_NOTES else ()), *left_out.values())
         self.notes[node.fingerprint] = tuple(dict.fromkeys((*self._notes_before(node), *own)))
         if node.stored and self.keep:
             self._store(node, result, seconds)
@@ -180,7 +215,7 @@ class Evaluator:
     def _store(self, node: Node, result: Any, seconds: Mapping[str, float]) -> None:
         try:
             self.spans[node.stage].bytes += self.store.put(
-                node, result, seconds, self.notes[node.fingerprint]
+                self._named(node), result, seconds, self.notes[node.fingerprint]
             )
         except OSError as error:
             # The error names the store, not the file, so that a full disk is one failure for all variants.

@@ -34,6 +34,7 @@ from flexroad.pipeline.store.records import (
 from flexroad.pipeline.worker.evaluator import Evaluator, StageCost, StageError, failure_of
 from flexroad.pipeline.worker.exports import EXTENSIONS, Product, assets, links, product_names, products
 from flexroad.pipeline.worker.texture import tile_texture
+from flexroad.tasks.io.left_out import recorded
 from flexroad.tasks.types import Metrics, Quality
 
 QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")
@@ -236,11 +237,13 @@ def _finish(
     """Write the products and the item of a finished tile; return its record and all notes."""
     span = evaluator.spans["export"]
     with span.measure():
-        texture, note = tile_texture(job.graph)
+        with recorded() as left_out:
+            texture, note = tile_texture(job.graph)
+        evaluator.rename("export", left_out)
         files = products(job.graph, evaluator, job.origin, texture)
-        notes = (*notes, note) if note else notes
+        notes = tuple(dict.fromkeys((*notes, *left_out.values(), *([note] if note else ()))))
         seconds = round(_seconds(evaluator), 4)
-        written = _item(job, rows, files, notes, seconds)
+        written = _item(job, evaluator, rows, files, notes, seconds)
         job.folder.finish(written, {name: file.data for name, file in files.items()}, job.flushed)
     span.computed += 1
     span.bytes += sum(len(file.data) for file in files.values())
@@ -249,12 +252,13 @@ def _finish(
 
 def _item(
     job: TileJob,
+    evaluator: Evaluator,
     rows: list[MetricsRow],
     files: Mapping[str, Product],
     notes: tuple[str, ...],
     seconds: float,
 ) -> dict[str, Any]:
-    graph = job.graph
+    graph = job.graph.renamed(evaluator.renamed)
     content = item(graph.tile)
     content["collection"] = job.collection
     content["links"] = links(job.collection)
@@ -268,6 +272,8 @@ def _item(
         "flexroad:notes": list(notes),
         "flexroad:nodes": graph.variants,
         "flexroad:sources": graph.sources,
+        "flexroad:left_out": list(evaluator.left_out),
+        "flexroad:renamed": evaluator.renamed,
         "flexroad:versions": _versions(graph),
         "flexroad:seconds": seconds,
     }

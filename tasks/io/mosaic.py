@@ -27,6 +27,7 @@ from flexroad.tasks.io.height_units import (
     smaller_unit_fault,
     with_unit,
 )
+from flexroad.tasks.io.left_out import leave_out
 from flexroad.tasks.io.raster import RasterWindow, misalignment, read_raster, read_window
 from flexroad.tasks.io.raster_header import header
 from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights, reach_m
@@ -143,12 +144,12 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
         values = lay_heights(patches, grid)
     else:
         wide = grid.buffered(margin_m)
-        more, _, _ = _read(tile, layer, files, wide, core, around=True)
+        more, beyond, _ = _read(tile, layer, files, wide, core, around=True)
         values = lay_heights([patch for _, patch in more], wide)[wide.window(grid)]
+        _notes_left_out(more, beyond)
     notes = _notes(layer, patches, grid)
-    notes += [f"a file that the tile does not need was left out: {error}" for _, error in left_out]
+    notes += _notes_left_out(read, left_out)
     in_part = [(file, patch.fault) for file, patch in read if patch.fault]
-    notes += [f"a part of a file that the tile does not need was left out: {error}" for _, error in in_part]
     if absurd_cells:
         notes.append(absurd_note(layer.name, absurd_cells))
     return Mosaic(values, grid, layer, files, tuple(patches), tuple(notes), (*left_out, *in_part))
@@ -182,6 +183,16 @@ def _read(
         if file is not files[-1] and coverage.completed_by(patch):
             break
     return read, left_out, absurd_cells
+
+
+def _notes_left_out(
+    read: Iterable[tuple[SourceFile, RasterWindow]], left_out: Iterable[tuple[SourceFile, Unusable]]
+) -> list[str]:
+    """Record the files that are left out, and those of which a part is; return a note on each."""
+    return [
+        *(leave_out(error) for _, error in left_out),
+        *(leave_out(patch.fault, patch.unreadable) for _, patch in read if patch.fault),
+    ]
 
 
 def _files(tile: Tile, layer: Layer) -> tuple[SourceFile, ...]:

@@ -21,6 +21,7 @@ from flexroad.catalog.headers.valid_cells import color_kinds
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import LayerMissing, TaskError, Unusable
+from flexroad.tasks.io.left_out import leave_out
 from flexroad.tasks.io.raster import read_raster
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.io.raster_header import place
@@ -69,6 +70,7 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None, finest_m:
                 part = _read(path, source, grid, gsd_m, finest_m)
             except Unusable as error:
                 unusable.append(error)
+                leave_out(error)
                 continue
             if part is None:
                 continue

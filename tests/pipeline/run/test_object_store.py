@@ -102,7 +102,8 @@ def assert_files_complete(run):
     """All artefacts can be decoded; done tiles have all products with correct checksums."""
     for name in paths.listing(run.store):
         if name.endswith(".npz"):
-            assert codec.decode(paths.read(run.store / name))
+            fingerprint = name.rpartition("/")[2].removesuffix(".npz")
+            assert codec.decode(paths.read(run.store / name), fingerprint)
     for tile in run.catalog.tiles:
         folder = run.folder(tile.id)
         assert folder.verified() == paths.exists(folder.path / "item.json")

@@ -8,6 +8,8 @@ import errno
 import io
 import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -21,12 +23,17 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.headers import kept_rasters, open_raster
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.cli.dry_run import plan
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.graph import sources
 from flexroad.pipeline.graph.graph import Pattern
+from flexroad.pipeline.run.conductor import rerun_filter
+from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.status import open_database, tile_states
+from flexroad.pipeline.store import checked_json, codec
 from flexroad.tasks.export import npz
 from flexroad.tasks.io import vectors
 from tests.make_rasters import damage, write
@@ -38,6 +45,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 SIZE_M = 40
 LIGHT = ["fit.spacing_m=8"]
 NAMES = ("dsm", "dtm", "road_mask")
+NODATA = '<PAMDataset><PAMRasterBand band="1"><NoDataValue>{}</NoDataValue></PAMRasterBand></PAMDataset>'
 
 
 @pytest.fixture(scope="module")
@@ -243,9 +251,7 @@ def test_side_car_unreadable_for_one_night_leaves_no_trace(survey, tmp_path):
     """GDAL takes a raster without a side-car file that it may not open: here, without its nodata value."""
     path = one_file(survey, "dtm")
     side = path.with_name(f"{path.name}.aux.xml")
-    side.write_text(
-        '<PAMDataset><PAMRasterBand band="1"><NoDataValue>-9999</NoDataValue></PAMRasterBand></PAMDataset>'
-    )
+    side.write_text(NODATA.format(-9999))
     try:
         catalog = catalog_of(survey)
         assert night(tmp_path / "scratch", catalog)[0].exit_code == 0
@@ -318,11 +324,7 @@ def test_damaged_pixels_fail_only_their_tile(survey, tmp_path):
 
 
 def test_damaged_block_of_a_sheet_fails_only_the_tile_it_lies_on(survey, scratch, tmp_path):
-    files = sorted((survey / "dsm").glob("*.tif"))
-    heights, transform = merge(files)
-    sheet = survey / "sheet.tif"
-    form = {"tiled": True, "blockxsize": 16, "blockysize": 16, "compress": "deflate"}
-    write(sheet, heights[0], transform=transform, crs="EPSG:25832", **form)
+    sheet = sheet_of(survey)
     catalog = catalog_of(survey, "sheet.json", dsm="sheet.tif")
     # Of the north-western tile, 8 m from its neighbours.
     damage(sheet, 20, 20)
@@ -352,3 +354,166 @@ def test_file_that_cannot_be_hashed_counts_as_missing(survey):
     assert unreadable.file_stats[str(path)] is None
     assert str(path) in unreadable.tile.missing
     assert unreadable.fingerprint != readable.fingerprint
+
+
+class zeroed:
+    """A file whose bytes are zeros behind the first ones, with the same size and time.
+
+    So are pages of a network cache, a restored backup, or an ``rsync --inplace -t`` that was interrupted.
+    """
+
+    def __init__(self, path, start=8):
+        self.path, self.start = path, start
+
+    def __enter__(self):
+        self.data, self.stat = self.path.read_bytes(), self.path.stat()
+        self._write(self.data[: self.start] + bytes(len(self.data) - self.start))
+
+    def __exit__(self, *error):
+        self._write(self.data)
+
+    def _write(self, data):
+        self.path.write_bytes(data)
+        os.utime(self.path, ns=(self.stat.st_atime_ns, self.stat.st_mtime_ns))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_file_zeroed_for_one_night_leaves_no_trace(name, survey, scratch, tmp_path):
+    path, catalog = one_file(survey, name), catalog_of(survey)
+    with zeroed(path):
+        summary, failures = night(tmp_path / "run", catalog)
+    assert (summary.done, summary.failed) == (3, 1)
+    assert {failure.file for failure in failures} == {str(path)}
+    summary, _ = night(tmp_path / "run", catalog)
+    assert (summary.exit_code, summary.cached) == (0, 0)
+    assert_equal(tmp_path / "run", scratch)
+    assert night(tmp_path / "run", catalog)[0].cached == 4
+
+
+def test_member_of_vrt_zeroed_for_one_night_leaves_no_trace(survey, tmp_path):
+    catalog = catalog_of(survey, "vrt.json", dsm=vrt_of(survey, "dsm").name)
+    assert night(tmp_path / "scratch", catalog)[0].exit_code == 0
+    with zeroed(one_file(survey)):
+        assert night(tmp_path / "run", catalog)[0].failed > 0
+    assert night(tmp_path / "run", catalog)[0].exit_code == 0
+    assert_equal(tmp_path / "run", tmp_path / "scratch")
+
+
+@pytest.mark.parametrize("end", [".aux.xml", ".msk"])
+def test_side_car_zeroed_for_one_night_leaves_no_trace(end, survey, tmp_path):
+    """GDAL takes a raster without a damaged side-car file, here with ground of 7 m in place of nodata."""
+    path, catalog = one_file(survey, "dtm"), catalog_of(survey)
+    side, data = path.with_name(path.name + end), path.read_bytes()
+    with rasterio.open(path) as raster:
+        values, profile = raster.read(), raster.profile | {"nodata": None}
+    values[0, :10, :10] = 7
+    # rasterio would write into the file that is there.
+    path.unlink()
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK="NO"),
+        rasterio.open(path, "w", **profile) as raster,
+    ):
+        raster.write(values)
+        if end == ".msk":
+            raster.write_mask(values[0] != 7)
+        else:
+            side.write_text(NODATA.format(7))
+    try:
+        assert night(tmp_path / "scratch", catalog)[0].exit_code == 0
+        with zeroed(side):
+            summary, failures = night(tmp_path / "run", catalog)
+        assert (summary.done, summary.failed) == (3, 1)
+        assert f"has the side-car file {side.name}, which" in failures[0].message
+        assert night(tmp_path / "run", catalog)[0].exit_code == 0
+        assert_equal(tmp_path / "run", tmp_path / "scratch")
+    finally:
+        side.unlink()
+        path.write_bytes(data)
+
+
+def sheet_of(survey):
+    """Write the DSM of all tiles as one sheet of blocks; return its path."""
+    heights, transform = merge(sorted((survey / "dsm").glob("*.tif")))
+    form = {"tiled": True, "blockxsize": 16, "blockysize": 16, "compress": "deflate"}
+    return write(survey / "sheet.tif", heights[0], transform=transform, crs="EPSG:25832", **form)
+
+
+def test_blocks_damaged_for_some_nights_leave_no_trace(survey, tmp_path):
+    """What was computed without other blocks of the same file is another result, with another name."""
+    sheet, out = sheet_of(survey), tmp_path / "run"
+    catalog = catalog_of(survey, "sheet.json", dsm="sheet.tif")
+    assert night(tmp_path / "scratch", catalog)[0].exit_code == 0
+    data, stat, loads = sheet.read_bytes(), sheet.stat(), []
+    for cells in ([(20, 20)], [(20, 20)], [(4, 4), (20, 20)], []):
+        sheet.write_bytes(data)
+        for cell in cells:
+            damage(sheet, *cell)
+        os.utime(sheet, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+        assert night(out, catalog)[0].failed == len(cells[:1])
+        item = checked_json.loads((out / "tiles" / "500040_5600040" / "item.json").read_bytes())
+        loads.append(item["properties"]["flexroad:nodes"]["flexroad"]["load"])
+    assert loads[0] == loads[1]
+    assert len(set(loads)) == 3
+    assert_equal(out, tmp_path / "scratch")
+
+
+def test_damaged_file_is_named_by_every_command(survey, tmp_path):
+    path, catalog = one_file(survey), catalog_of(survey)
+    name = f"dsm dsm/{path.name}"
+    with zeroed(path):
+        night(tmp_path / "run", catalog)
+        again, _ = night(tmp_path / "run", catalog)
+        assert (again.done, again.cached, again.failed) == (3, 0, 1)
+        run = Run.open(tmp_path / "run")
+        with open_database(run) as database:
+            states = list(tile_states(run, database))
+        assert [state for _, state in states] == ["failed" if s.failed else "done" for s, _ in states]
+        assert [status.last_record.left_out for status, _ in states if status.done] == [(name,)] * 3
+        lines = list(plan(run, run.catalog.tiles))
+        assert sum(f"file left out: {name} could not be used" in line for line in lines) == 3
+        # A thread keeps sources open, as they were.
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(assert_computed_as_stored, run, tmp_path / "empty").result()
+
+
+def assert_computed_as_stored(run, empty):
+    """Tiles are read from the store, or computed again without the file: to the same surface."""
+    stored = RunPlace.of(run)
+    for tile, snapshot in snapshots(run, run.catalog.tiles, "flexroad"):
+        if snapshot:
+            places = stored, replace(stored, store=str(empty))
+            one, other = (FinishedTile(tile, "flexroad", snapshot, place) for place in places)
+            assert codec.encode(one.surface, {}) == codec.encode(other.surface, {})
+            assert one.graph.fingerprint == snapshot.fingerprint
+
+
+def test_rerun_of_failed_tiles_takes_those_without_the_file(survey, scratch, tmp_path):
+    path, catalog = one_file(survey), catalog_of(survey)
+    with zeroed(path):
+        night(tmp_path / "run", catalog)
+    run = Run.open(tmp_path / "run")
+    failed = rerun_filter(run, (), failed=True)
+    assert all(map(failed, run.catalog.tiles))
+    assert run_tiles(run, SerialExecutor(), failed).exit_code == 0
+    assert_equal(tmp_path / "run", scratch)
+    assert not any(map(rerun_filter(run, (), failed=True), run.catalog.tiles))
+
+
+def test_photo_zeroed_for_one_night_leaves_no_trace(tmp_path):
+    """A second file covers the tile, so that the first one is left out without an error."""
+    survey = tmp_path / "survey"
+    write_scenes(survey, 2, seed=5, size_m=SIZE_M, dop=True)
+    path = one_file(survey, "dop")
+    with rasterio.open(path) as raster:
+        colour, profile = raster.read(), raster.profile
+    with rasterio.open(path.with_name(f"z{path.name}"), "w", **profile) as raster:
+        raster.write(255 - colour)
+    catalog = catalog_of(survey, dop="dop/*.tif")
+    settings = [*LIGHT, "export.texture=true"]
+    night(tmp_path / "scratch", catalog, settings=settings)
+    with zeroed(path):
+        summary, _ = night(tmp_path / "run", catalog, settings=settings)
+    assert summary.exit_code == 0
+    assert products(tmp_path / "run") != products(tmp_path / "scratch")
+    night(tmp_path / "run", catalog, settings=settings)
+    assert_equal(tmp_path / "run", tmp_path / "scratch")

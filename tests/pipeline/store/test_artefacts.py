@@ -1,7 +1,7 @@
 """Artefacts and products are read back exactly as written; damaged ones count as missing."""
 
 import hashlib
-import io
+import itertools
 import json
 from dataclasses import fields
 
@@ -17,7 +17,7 @@ from flexroad.pipeline.store import codec
 from flexroad.pipeline.store.artefacts import DAMAGED, ArtefactStore
 from flexroad.pipeline.store.products import TileProducts, file_entry
 from flexroad.pipeline.worker.evaluator import Evaluator
-from flexroad.tasks.types import Mesh
+from flexroad.tasks.io.archive import npz
 
 CONFIG = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 5},
@@ -66,28 +66,6 @@ def test_codec_restores_every_result_exactly(evaluator):
     }  # fmt: skip
 
 
-def test_decode_reads_faces_of_earlier_versions():
-    """Earlier versions stored faces as they are, in archives of NumPy's own."""
-    rng = np.random.default_rng(5)
-    faces = rng.integers(0, 2**31, (40, 3)).astype(np.int32)
-    vertices = rng.normal(size=(50, 3))
-    mesh = Mesh("EPSG:25832", (1.0, 2.0, 0.0), vertices, faces, rng.random(40) < 0.5)
-    plain = {"origin": [1.0, 2.0, 0.0], "crs": "EPSG:25832"}
-    header = json.dumps({"type": "Mesh", "seconds": {"sample": 0.5}, "fields": plain})
-    arrays = {name: getattr(mesh, name) for name in ("vertices", "faces", "road")}
-    arrays[codec.HEADER] = np.frombuffer(header.encode(), np.uint8)
-    earlier = io.BytesIO()
-    np.savez_compressed(earlier, **arrays)
-    data = earlier.getvalue()
-    for stored in (
-        codec.decode(data + hashlib.sha256(data).digest()),
-        codec.decode(codec.encode(mesh, {"sample": 0.5})),
-    ):
-        assert stored.seconds == {"sample": 0.5}
-        for field in fields(mesh):
-            assert same(getattr(mesh, field.name), getattr(stored.value, field.name)), field.name
-
-
 def test_get_damaged_artefact_returns_none(evaluator):
     fingerprint = evaluator.graph.variants["flexroad"]["fit"]
     node = evaluator.graph.nodes[fingerprint]
@@ -108,12 +86,72 @@ def test_decode_any_damaged_byte_or_truncation_raises(evaluator):
     evaluator(node.fingerprint)
     (path,) = evaluator.store.root.rglob(f"{node.fingerprint}.npz")
     whole = path.read_bytes()
-    assert codec.decode(whole)
+    assert codec.decode(whole, node.fingerprint)
     flips = (whole[:i] + bytes([whole[i] ^ 1 << i % 8]) + whole[i + 1 :] for i in range(len(whole)))
     cuts = (whole[:i] for i in range(len(whole)))
     for damaged in (*flips, *cuts, whole + b"0"):
         with pytest.raises(DAMAGED):
-            codec.decode(damaged)
+            codec.decode(damaged, node.fingerprint)
+
+
+def test_artefact_under_another_name_is_missing(evaluator):
+    """Also one of the same type, which no error would betray."""
+    nodes = [node for node in evaluator.graph.nodes.values() if node.stored]
+    for node in nodes:
+        evaluator(node.fingerprint)
+    paths = {path.stem: path for path in evaluator.store.root.rglob("*.npz")}
+    contents = {name: path.read_bytes() for name, path in paths.items()}
+    assert all(evaluator.store.get(node) for node in nodes)
+    for node, other in itertools.product(nodes, repeat=2):
+        paths[node.fingerprint].write_bytes(contents[other.fingerprint])
+        assert (evaluator.store.get(node) is None) == (node is not other)
+
+
+def test_artefact_of_another_type_is_computed_again(evaluator):
+    graph, store = evaluator.graph, evaluator.store
+    nodes = [node for node in graph.nodes.values() if node.stored]
+    right = {node.fingerprint: evaluator(node.fingerprint) for node in nodes}
+    for node in nodes:
+        of_other = next(value for value in right.values() if type(value) is not type(right[node.fingerprint]))
+        if node.stage == "fit":
+            of_other = right[graph.variants["plane"]["evaluate"]]
+        store.put(node, of_other, {}, ())
+        assert store.get(node) is None, node.stage
+    again = Evaluator(graph, store)
+    for node in nodes:
+        assert type(again(node.fingerprint)) is type(right[node.fingerprint])
+
+
+EMPTY = {"type": "Metrics", "seconds": {}, "notes": []}
+
+
+@pytest.mark.parametrize("header", [[], {"type": "Metrics"}, EMPTY, EMPTY | {"fields": []}])
+def test_artefact_with_another_header_is_missing(header, evaluator):
+    node = evaluator.graph.nodes[evaluator.graph.variants["plane"]["evaluate"]]
+    payload = npz({codec.HEADER: np.frombuffer(json.dumps(header).encode(), np.uint8)})
+    checksum = hashlib.sha256(payload + node.fingerprint.encode()).digest()
+    write(
+        evaluator.store.root / node.stage / node.fingerprint[:2] / f"{node.fingerprint}.npz",
+        payload + checksum,
+    )
+    assert evaluator.store.get(node) is None
+
+
+def test_marker_of_another_tile_is_none(tmp_path):
+    one, other = (TileProducts.of(tmp_path, name) for name in ("1_1", "1_2"))
+    item = {"id": "1_1", "properties": {"flexroad:nodes": {"flexroad": {"fit": "abc"}}}, "assets": {}}
+    one.finish(item, {})
+    assert one.marker("item.json") == item
+    assert one.nodes("flexroad") == {"fit": "abc"}
+    other.path.mkdir()
+    (one.path / "item.json").rename(other.path / "item.json")
+    assert other.marker("item.json") is None
+    assert other.nodes("flexroad") == {}
+    assert not other.verified()
+    other.fail({"tile": "1_2"})
+    assert other.marker("failed.json") == {"tile": "1_2"}
+    (other.path / "failed.json").rename(one.path / "failed.json")
+    assert one.marker("failed.json") is None
 
 
 def test_artefact_opens_with_numpy(evaluator):
@@ -126,7 +164,7 @@ def test_artefact_opens_with_numpy(evaluator):
 
 def test_verified_changed_product_is_false(tmp_path):
     folder = TileProducts(tmp_path / "tile")
-    item = {"assets": {"mesh.glb": file_entry("mesh.glb", b"abc", "model/gltf-binary")}}
+    item = {"id": "tile", "assets": {"mesh.glb": file_entry("mesh.glb", b"abc", "model/gltf-binary")}}
     folder.finish(item, {"mesh.glb": b"abc"})
     assert folder.verified()
     for damaged in (b"abd", b"ab", b""):
