@@ -6,6 +6,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from flexroad.catalog.gdal_options import use_own_values
+
 ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -25,6 +27,9 @@ ONE_THREAD = dict.fromkeys(
 if "numpy" not in sys.modules:
     for name, value in ONE_THREAD.items():
         os.environ.setdefault(name, value)
+
+IGNORED = use_own_values()
+"""A line on settings of GDAL and PROJ that this process ignores, empty if there are none."""
 
 
 def _writable(folder: Path) -> bool:

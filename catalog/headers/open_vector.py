@@ -24,6 +24,7 @@ from urllib.parse import quote
 from weakref import finalize
 from xml.parsers import expat
 
+from flexroad.catalog.gdal_options import settle_vectors
 from flexroad.catalog.headers.refused import Refused, archive_note, head, require_beside
 from flexroad.catalog.headers.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, source_stat
 from flexroad.catalog.lazy import lazy
@@ -73,6 +74,7 @@ def vector_name(path: Path) -> str:
     OSError
         If it does not exist or cannot be read.
     """
+    settle_vectors()
     path = path.absolute()
     data = head(path)
     text = data.removeprefix(b"\xef\xbb\xbf").lstrip()
