@@ -1,9 +1,9 @@
 """Options of GDAL and PROJ on which results depend: neither environment nor configuration files change them.
 
-GDAL's list has about 1,100 options (``port/cpl_known_config_options.h``). Here are those of its core and of the
-formats that are read and written here that change cells, places, features or text. Those that set limits,
-speed, messages and access to the web are left to the user. GDAL takes an option from the first of: the
-program, its environment, ``GDAL_CONFIG_FILE`` or ``~/.gdal/gdalrc``.
+GDAL's list has about 1,100 options (``port/cpl_known_config_options.h``). Here are those of its core, and of
+formats read or written here, that change cells, places, features or text. Those for limits, speed, messages
+and access to the web are left to the user. GDAL takes an option from the program, else from the environment,
+else from ``GDAL_CONFIG_FILE`` or ``~/.gdal/gdalrc``.
 """
 
 from __future__ import annotations

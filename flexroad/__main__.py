@@ -6,7 +6,7 @@ if not sys.flags.safe_path:
     # The current folder, which may have a module with the name of a library's.
     del sys.path[0]
 
-from flexroad.pipeline.cli.main import main  # noqa: E402 after the line above
+from flexroad.pipeline.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -109,7 +109,8 @@ def test_ascii_grid_keeps_decimals_though_a_variable_wants_whole_numbers(tmp_pat
     grid = "ncols 3\nnrows 3\nxllcorner 0\nyllcorner 0\ncellsize 1\n" + "1.75 1.5 1.25\n" * 3
     (tmp_path / "a.asc").write_text(grid)
     code = (
-        "import flexroad.pipeline\nfrom pathlib import Path\nfrom flexroad.catalog.headers.rasters import quiet\n"
+        "import flexroad.pipeline\nfrom pathlib import Path\n"
+        "from flexroad.catalog.headers.rasters import quiet\n"
         "from flexroad.catalog.headers.open_raster import open_raster\n"
         f"with quiet(), open_raster(Path({str(tmp_path / 'a.asc')!r})) as raster: print(raster.read(1)[0])"
     )
