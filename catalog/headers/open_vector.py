@@ -27,7 +27,7 @@ from xml.parsers import expat
 from flexroad.catalog.gdal_options import settle_vectors
 from flexroad.catalog.headers.refused import Refused, archive_note, head, require_beside
 from flexroad.catalog.headers.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, source_stat
-from flexroad.catalog.headers.sqlite_views import require_queries_that_end
+from flexroad.catalog.headers.sqlite_contents import require_sound_contents
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.storage.scratch import ScratchFolder
@@ -91,7 +91,7 @@ def vector_name(path: Path) -> str:
         if not (is_geopackage or _is_spatialite(path)):
             raise Refused(UNKNOWN)
         _require_own_tables(path)
-        require_queries_that_end(path, _state(path))
+        require_sound_contents(path, _state(path))
         if not is_geopackage:
             # The prefix selects the driver, whatever the file's name ends in.
             return f"SQLITE:{path}"

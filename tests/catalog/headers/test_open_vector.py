@@ -188,7 +188,7 @@ ENDLESS = "WITH c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x AS fid
 CROSS = ", ".join(f"gpkg_spatial_ref_sys s{number}" for number in range(30))
 REMOVE = (
     "; write its result to a table, or remove it: python -c 'import sqlite3; "
-    """sqlite3.connect("{}").execute("DROP VIEW [v]")'"""
+    """sqlite3.connect("{}", isolation_level=None).execute("DROP VIEW [v]")'"""
 )
 REFUSED = {
     "repeats itself": ([f"CREATE VIEW v AS {ENDLESS}"], "does not end"),
@@ -266,6 +266,29 @@ def test_column_that_is_computed_when_it_is_read_is_refused_with_the_remedy(tmp_
     command = str(error.value).rpartition("remove it: ")[2].replace("python", sys.executable, 1)
     subprocess.run(command, shell=True, check=True)
     assert len(pyogrio.read_dataframe(vector_name(path), layer="v")) == 1
+
+
+@pytest.mark.parametrize("kind", ["gpkg", "sqlite"])
+def test_more_features_than_stated_are_refused_with_the_remedy(tmp_path, kind):
+    """As programs leave them that add features without the file's triggers; pyogrio reads the first ones."""
+    path = tmp_path / f"roads.{kind}"
+    lines = geopandas.GeoDataFrame(geometry=[LineString([(0, n), (9, n)]) for n in range(5)], crs=UTM)
+    lines.to_file(
+        path, engine="pyogrio", **({"driver": "SQLite", "SPATIALITE": "YES"} if kind == "sqlite" else {})
+    )
+    table, column = {
+        "gpkg": ("gpkg_ogr_contents", "feature_count"),
+        "sqlite": ("geometry_columns_statistics", "row_count"),
+    }[kind]
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as file:
+        file.execute(f"UPDATE {table} SET {column} = 2")
+    with pytest.raises(
+        Refused, match="states 2 features of 'roads', which has 5; have them counted"
+    ) as error:
+        vector_name(path)
+    command = str(error.value).rpartition("again: ")[2].replace("python", sys.executable, 1)
+    subprocess.run(command, shell=True, check=True)
+    assert len(pyogrio.read_dataframe(vector_name(path))) == 5
 
 
 def test_geopackage_with_a_table_of_another_file_is_refused(tmp_path):

@@ -1,6 +1,7 @@
-"""Trial of the views of an SQLite file, whose queries GDAL runs when it lists the layers, without any limit.
+"""Checks of an SQLite file before GDAL sees it: views, computed columns, and stated numbers of features.
 
-Each is run once by Python's SQLite, with limits, before GDAL sees the file.
+GDAL runs the queries of all views when it lists the layers, without any limit. Here each is run once by
+Python's SQLite, with limits. pyogrio reads as many features as the file states, and no more.
 """
 
 from __future__ import annotations
@@ -34,12 +35,22 @@ FUNCTIONS = frozenset(
 """Functions that a query may call: their result is the same each time, and no longer than what they get."""
 NO_ROWS = re.compile(r"no such (table|column)|circularly defined|no such function: XB_", re.IGNORECASE)
 """Errors of queries that GDAL cannot run, either; the last one is of views that SpatiaLite makes itself."""
+COUNTS = (
+    ("gpkg_ogr_contents", "table_name", "feature_count", "DELETE FROM gpkg_ogr_contents"),
+    (
+        "geometry_columns_statistics",
+        "f_table_name",
+        "row_count",
+        "UPDATE geometry_columns_statistics SET row_count = NULL",
+    ),
+)
+"""Tables with numbers of features, their columns, and a statement after which GDAL counts by itself."""
 VIRTUAL_COLUMN = 2
 """Mark of columns that are computed when they are read, in SQLite's table of columns."""
 
 
-def require_queries_that_end(path: Path, state: FileStat) -> None:
-    """Raise an error if to read a view or a column of an SQLite file may need endless time or memory.
+def require_sound_contents(path: Path, state: FileStat) -> None:
+    """Raise an error if an SQLite file may need endless time or memory, or hides features.
 
     Parameters
     ----------
@@ -51,8 +62,8 @@ def require_queries_that_end(path: Path, state: FileStat) -> None:
     Raises
     ------
     Refused
-        If a view does not end within the limits or calls another function than `FUNCTIONS`, or a table has
-        columns that are computed.
+        If a view does not end within the limits or calls another function than `FUNCTIONS`, if a table has
+        columns that are computed, or more features than the file states.
     """
     if fault := _fault(path, state):
         raise Refused(fault)
@@ -63,11 +74,14 @@ def _fault(path: Path, state: FileStat) -> str:
     """Return what is wrong, to follow the name of the file; empty if nothing is."""
     try:
         with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as file:
-            names = file.execute("SELECT type, name FROM sqlite_master WHERE type IN ('table', 'view')")
-            for kind, name in names.fetchall():
+            names = file.execute(
+                "SELECT type, name FROM sqlite_master WHERE type IN ('table', 'view')"
+            ).fetchall()
+            for kind, name in names:
                 fault = _of_view(file, name, path, state) if kind == "view" else _of_table(file, name, path)
                 if fault:
                     return fault
+            return _of_counts(file, {name.lower() for kind, name in names if kind == "table"}, path)
     except sqlite3.Error as error:
         if "malformed database schema" in str(error):
             return f"has a schema that SQLite {sqlite3.sqlite_version} cannot read: {one_line(error)}"
@@ -86,6 +100,23 @@ def _of_table(file: sqlite3.Connection, name: str, path: Path) -> str:
         return ""
     remedy = _command(path, f"ALTER TABLE {_bracketed(name)} DROP COLUMN {_bracketed(computed[0])}")
     return f"has the computed column {computed[0]!r}, whose values may have no end; remove it: {remedy}"
+
+
+def _of_counts(file: sqlite3.Connection, tables: set[str], path: Path) -> str:
+    for statistics, name, number, statement in COUNTS:
+        if statistics not in tables:
+            continue
+        stated = file.execute(
+            f"SELECT {name}, {number} FROM {statistics} WHERE {number} IS NOT NULL"
+        ).fetchall()
+        for table, features in stated:
+            if str(table).lower() not in tables:
+                continue
+            ((rows,),) = file.execute(f"SELECT count(*) FROM {_quoted(table)}").fetchall()
+            if rows > features:
+                remedy = f"have them counted again: {_command(path, statement)}"
+                return f"states {features:,} features of {table!r}, which has {rows:,}; {remedy}"
+    return ""
 
 
 def _of_view(file: sqlite3.Connection, name: str, path: Path, state: FileStat) -> str:
@@ -135,5 +166,5 @@ def _bracketed(name: str) -> str:
 
 def _command(path: Path, statement: str) -> str:
     """Return a shell command that changes an SQLite file; it needs nothing but Python."""
-    code = f"import sqlite3; sqlite3.connect({json.dumps(str(path))}).execute({json.dumps(statement)})"
-    return f"python -c {shlex.quote(code)}"
+    connection = f"sqlite3.connect({json.dumps(str(path))}, isolation_level=None)"
+    return f"python -c {shlex.quote(f'import sqlite3; {connection}.execute({json.dumps(statement)})')}"
