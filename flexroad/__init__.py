@@ -11,6 +11,8 @@ The names below are imported on first use: ``import flexroad`` alone loads no nu
 
 import importlib
 import importlib.metadata
+import sys
+import warnings
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -63,6 +65,8 @@ def __getattr__(name: str) -> Any:
         value: Any = importlib.metadata.version("flexroad")
     elif name in _HOME:
         value = getattr(importlib.import_module(f"flexroad.{_HOME[name]}"), name)
+        if ignored := getattr(sys.modules.get("flexroad.pipeline"), "IGNORED", ""):
+            warnings.warn(ignored, stacklevel=2)
     else:
         raise AttributeError(f"module 'flexroad' has no attribute {name!r}")
     globals()[name] = value

@@ -1,5 +1,11 @@
 """``python -m flexroad``: the command line."""
 
+import sys
+
+if not sys.flags.safe_path:
+    # The current folder, which may have a module with the name of a library's.
+    del sys.path[0]
+
 from flexroad.pipeline.cli.main import main
 
 if __name__ == "__main__":

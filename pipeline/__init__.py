@@ -6,6 +6,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from flexroad.catalog.gdal_options import use_own_values
+
 ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -18,6 +20,9 @@ ONE_THREAD = dict.fromkeys(
     "1",
 )
 """Environment of every process: on a tile's arrays two BLAS threads are up to 400 times slower than one."""
+OF_WORKERS = ONE_THREAD | {"PYTHONSAFEPATH": "1"}
+"""Environment of worker processes. They start as ``python -c`` or ``-m``, which would import modules of the
+current folder in place of Python's own: a folder of downloads would run code."""
 
 # Libraries read these variables once, on import, so they are set before any import. Values set by the user
 # are kept. If NumPy is already imported (as in a notebook), nothing is changed: numba raises an error when
@@ -25,6 +30,9 @@ ONE_THREAD = dict.fromkeys(
 if "numpy" not in sys.modules:
     for name, value in ONE_THREAD.items():
         os.environ.setdefault(name, value)
+
+IGNORED = use_own_values()
+"""A line on settings of GDAL and PROJ that this process ignores, empty if there are none."""
 
 
 def _writable(folder: Path) -> bool:

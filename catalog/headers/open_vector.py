@@ -24,8 +24,10 @@ from urllib.parse import quote
 from weakref import finalize
 from xml.parsers import expat
 
+from flexroad.catalog.gdal_options import settle_vectors
 from flexroad.catalog.headers.refused import Refused, archive_note, head, require_beside
 from flexroad.catalog.headers.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, source_stat
+from flexroad.catalog.headers.sqlite_contents import require_sound_contents
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.storage.scratch import ScratchFolder
@@ -46,15 +48,13 @@ CRS = re.compile(rb"""["'](?:c|\\u00[46]3)(?:r|\\u00[57]2)(?:s|\\u00[57]3)["']\s
 OTHER_THAN_OSM = re.compile(
     rb"\0|<(?!/?(?:osm|bounds?|node|way|relation|tag|nd|member|note|meta)[\s/>]|\?xml\s)"
 )
-WITH = re.compile(r"\bwith\b", re.IGNORECASE)
-"""Word with which recursive queries begin; SQLite does not require the word RECURSIVE."""
-VIRTUAL = re.compile(r"\bvirtual\b", re.IGNORECASE)
+VIRTUAL = re.compile(r"create(\s|/\*.*?\*/|--.*?\n)+virtual\b", re.IGNORECASE | re.DOTALL)
 INDEX = re.compile(
     r"""CREATE VIRTUAL TABLE\s+("[^"]*"|'[^']*'|\w+)\s+USING\s+"""
-    r"(rtree|VirtualSpatialIndex|VirtualElementary|VirtualKNN2?)\s*(\(|$)",
+    r"(rtree|fts[345]|VirtualSpatialIndex|VirtualElementary|VirtualKNN2?)\s*(\(|$)",
     re.IGNORECASE,
 )
-"""Virtual tables of SpatiaLite that are made of the file's own tables."""
+"""Virtual tables that are made of the file's own tables."""
 MAX_CRS_BYTES = 65536
 """Longest text of a CRS in GeoJSON."""
 ERRORS = (RuntimeError, ValueError, OSError, UnboundLocalError)
@@ -73,6 +73,7 @@ def vector_name(path: Path) -> str:
     OSError
         If it does not exist or cannot be read.
     """
+    settle_vectors()
     path = path.absolute()
     data = head(path)
     text = data.removeprefix(b"\xef\xbb\xbf").lstrip()
@@ -86,15 +87,14 @@ def vector_name(path: Path) -> str:
         _require_own_parts(path, (path.with_suffix(end) for s in SHAPEFILE_PARTS for end in (s, s.upper())))
     elif data.startswith(SQLITE):
         path = _complete(path, data)
-        if data[68:72] in GEOPACKAGES:
-            _require_queries_that_end(path)
-        elif _is_spatialite(path):
-            _require_queries_that_end(path)
-            _require_own_tables(path)
+        is_geopackage = data[68:72] in GEOPACKAGES
+        if not (is_geopackage or _is_spatialite(path)):
+            raise Refused(UNKNOWN)
+        _require_own_tables(path)
+        require_sound_contents(path, _state(path))
+        if not is_geopackage:
             # The prefix selects the driver, whatever the file's name ends in.
             return f"SQLITE:{path}"
-        else:
-            raise Refused(UNKNOWN)
     elif not (
         data.startswith(b"fgb\x03") or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader") or _is_osm(text)
     ):
@@ -121,7 +121,7 @@ def _is_spatialite(path: Path) -> bool:
 def _require_own_tables(path: Path) -> None:
     """Raise an error if an SQLite file has a table that may be made of another file."""
     for name, statement in _objects(path, "sql LIKE '%virtual%'"):
-        if VIRTUAL.search(statement) and not INDEX.match(statement):
+        if VIRTUAL.match(statement) and not INDEX.match(statement):
             raise Refused(
                 f"has the virtual table {name!r}, which may be made of another file; convert it with ogr2ogr"
             )
@@ -133,10 +133,14 @@ def _complete(path: Path, data: bytes) -> Path:
     _require_own_parts(path, [*parts, path.with_name(path.name + "-shm")])
     if data[18:20] != WAL_MODE and not any(part.exists() for part in parts):
         return path
+    return _copied(path, _state(path)).path
+
+
+def _state(path: Path) -> FileStat:
     state = source_stat(path)
     if state is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
-    return _copied(path, state).path
+    return state
 
 
 def in_its_encoding(read: Callable[..., T]) -> tuple[T, str]:
@@ -193,15 +197,6 @@ class _Copy:
 def _copied(path: Path, state: FileStat) -> _Copy:
     """Return a copy, as SQLite would write the changes into the file that it reads; cached by its state."""
     return _Copy(path)
-
-
-def _require_queries_that_end(path: Path) -> None:
-    """Raise an error if a GeoPackage has a view that repeats itself: its rows may have no end."""
-    for name, query in _objects(path, "sql LIKE '%view%'"):
-        if WITH.search(str(query)):
-            raise Refused(
-                f"has the view {name!r} with a query WITH, which may never end; write its result to a table"
-            )
 
 
 def _is_osm(text: bytes) -> bool:

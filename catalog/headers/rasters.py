@@ -26,6 +26,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from flexroad.catalog.crs import bounds_in, height_unit, in_plan, plan_unit, short, utm_of
 from flexroad.catalog.crs_checks import angle_fault, crs_of, require_scale
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.gdal_options import CHOSEN, DEFAULTS
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.refused import Refused
@@ -36,19 +37,6 @@ from flexroad.catalog.text import access_reason, some
 from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
 from flexroad.catalog.trust import AllowedFolders
 
-GDAL = {
-    # Do not list the folder for every file (it may hold 10,000); side-car files are still opened.
-    "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",
-    # Otherwise GDAL does not report the vertical CRS of GeoTIFF 1.0 files.
-    "GTIFF_REPORT_COMPD_CS": "YES",
-    # The defaults, whatever an environment variable or GDAL's configuration file says: the first two move
-    # rasters, the last one hides side-car files.
-    "GTIFF_POINT_GEO_IGNORE": "FALSE",
-    "GTIFF_HONOUR_NEGATIVE_SCALEY": "NO",
-    "GDAL_PAM_ENABLED": "YES",
-    # Do not write a file with the unpacked size beside a .gz file.
-    "CPL_VSIL_GZIP_WRITE_PROPERTIES": "NO",
-}
 DATE_TAGS = ("ACQUISITIONDATETIME", "ACQUISITIONDATE", "ACQUISITION_DATE", "TIFFTAG_DATETIME")
 """Tags with a date, the first one with a value wins."""
 AGAIN = "give it its georeference with gdal_translate -a_ullr"
@@ -119,16 +107,13 @@ class _Hooks:
 _hooks = _Hooks()
 
 
-_hooks = _Hooks()
-
-
 @contextmanager
 def quiet() -> Iterator[None]:
     """Set GDAL's options for catalog and tasks; suppress what is printed about files that are damaged.
 
     That is warnings about files without a georeference, and messages that are no text.
     """
-    with rasterio.Env(**GDAL, **gdal_options()), warnings.catch_warnings(), _hooks:
+    with rasterio.Env(**CHOSEN, **DEFAULTS, **gdal_options()), warnings.catch_warnings(), _hooks:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         yield
 

@@ -20,6 +20,7 @@ from flexroad.catalog.grid import Bounds, union
 from flexroad.catalog.headers.open_vector import ERRORS, layer_info, vector_name
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.headers.spatial_index import real_bounds
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.skipped import Skipped
 from flexroad.catalog.text import access_reason, count, reason
@@ -119,6 +120,7 @@ def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFi
         no_bounds = any(info["driver"] == "OSM" for info in infos)
         if not no_bounds:
             infos = [layer_info(file, name, force_total_bounds=True) for name in names]
+            infos = [info | {"total_bounds": real_bounds(file, info)} for info in infos]
     except Refused as error:
         raise CatalogError(f"--roads {path} {error}") from error
     except ERRORS as error:

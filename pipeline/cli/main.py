@@ -14,8 +14,8 @@ from typer.core import TyperCommand, TyperGroup
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.text import one_line
+from flexroad.pipeline import IGNORED
 from flexroad.pipeline.cli import limits
-from flexroad.pipeline.cli.environment import drop_foreign
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
@@ -77,9 +77,8 @@ app = typer.Typer(
 def main() -> None:
     """Run the command line; a user error is printed as one line, with exit code 2."""
     limits.raise_open_files()
-    # Before GDAL and PROJ are loaded; workers inherit the environment.
-    if line := drop_foreign():
-        echo(f"warning: {line}", err=True)
+    if IGNORED:
+        echo(f"warning: {IGNORED}", err=True)
     # Rasterio loads boto3 where it is installed, for a tenth of the time of a short command. It uses it only
     # for credentials, which GDAL reads by itself.
     sys.modules.setdefault("boto3", None)  # type: ignore[arg-type]

@@ -21,7 +21,7 @@ from distributed.security import Security
 from distributed.utils import silence_logging_cmgr
 
 from flexroad.catalog.storage.scratch import ScratchFolder
-from flexroad.pipeline import ONE_THREAD
+from flexroad.pipeline import OF_WORKERS
 from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.slurm import slurm
@@ -158,7 +158,7 @@ def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
             scheduler_kwargs={"dashboard": dashboard},
             worker_dashboard_address=None,
             local_directory=scratch,
-            env=ONE_THREAD,
+            env=OF_WORKERS,
             silence_logs=logging.CRITICAL,
             security=certificates(cluster),
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import importlib
+import os
 import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,7 +17,7 @@ from dask.system import CPU_COUNT
 from distributed.security import Security
 from distributed.system import MEMORY_LIMIT
 
-from flexroad.pipeline import ONE_THREAD
+from flexroad.pipeline import OF_WORKERS
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.memory import MOUNT, OWN, group_limits
@@ -35,7 +36,7 @@ SETTINGS = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.log-length": 1000,
     "distributed.admin.system-monitor.log-length": 240,
-    "distributed.nanny.pre-spawn-environ": ONE_THREAD,
+    "distributed.nanny.pre-spawn-environ": OF_WORKERS,
 }
 """Dask settings of all workers. Dask's defaults suit data frames that are kept in workers. A tile leaves
 nothing that could be spilled to disk, and a paused worker would wait forever for its only tile to free
@@ -72,7 +73,7 @@ def web_address(dashboard: bool) -> str:
 def environment(cluster: Cluster, dashboard: bool) -> dict[str, str]:
     """Return the environment of workers, and of a scheduler that is started elsewhere."""
     values = settings(cluster, dashboard).items()
-    return ONE_THREAD | {_variable(key): str(value) for key, value in values}
+    return OF_WORKERS | {_variable(key): str(value) for key, value in values}
 
 
 def certificates(cluster: Cluster) -> Any:
@@ -139,6 +140,8 @@ def opened(make: Callable[[], T]) -> Iterator[T]:
 
 
 def _block_signals() -> None:
+    # A process, too, which Dask would start before it sets the environment.
+    os.environ.update(OF_WORKERS)
     # Its start would allow the signals again.
     resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})

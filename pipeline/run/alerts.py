@@ -88,13 +88,15 @@ def _run_command(command: str, text: str) -> str | None:
         with ScratchFolder() as folder:
             path = Path(folder) / "summary.json"
             path.write_text(text)
+            # The user's program may import modules beside it; the variable is for workers.
+            variables = {key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"}
             # Its output goes to standard error, with the messages of the run.
             process = subprocess.Popen(
                 command,
                 shell=True,
                 stdin=subprocess.PIPE,
                 stdout=2,
-                env={**os.environ, "FLEXROAD_SUMMARY": str(path)},
+                env={**variables, "FLEXROAD_SUMMARY": str(path)},
                 start_new_session=True,
             )
             return _wait(process, text, _program(command))

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog import Grid
+from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.ids import safe_name
-from flexroad.catalog.lazy import lazy
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store.products import file_entry
 from flexroad.tasks.export import cog, glb, npz, ply
@@ -29,8 +29,6 @@ from flexroad.tasks.roads.level_numbers import HIGHEST
 from flexroad.tasks.spline.levelled import LevelledSurface, top_of
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Quality
-
-rasterio = lazy("rasterio")
 
 CLASSIFICATION = "https://stac-extensions.github.io/classification/v2.0.0/schema.json"
 FILE = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
@@ -167,7 +165,7 @@ def _cog(
     support = quality.support
     others: dict[Kind, bytes] = {}
     # Without a common one, GDAL's environment is set up and cleared for each call.
-    with rasterio.Env():
+    with quiet():
         if isinstance(surface, LevelledSurface):
             support, others = _of_levels(core, road.outside[window], surface, quality, vertical)
         return {

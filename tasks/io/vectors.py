@@ -1,8 +1,8 @@
 """Read the features of a vector file near a tile; a file is read and indexed once per process, not per tile.
 
-Files with a spatial index (GeoPackage, FlatGeobuf) are read by large squares, of which a process keeps a few,
-so that memory does not grow with the file. Others (GeoJSON, OSM) are read once, as a whole. A file in a
-bucket is copied once per process, because reading a GeoPackage in place takes hundreds of requests.
+Files with a spatial index that has all features (GeoPackage, FlatGeobuf) are read by large squares, of which
+a process keeps a few, so that memory does not grow with the file. Others are read once, as a whole. A file in
+a bucket is copied once per process, because reading a GeoPackage in place takes hundreds of requests.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from flexroad.catalog.headers.open_vector import (
 )
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.headers.source_files import source_stat
+from flexroad.catalog.headers.spatial_index import has_complete_index
 from flexroad.catalog.headers.vectors import bounds_of, listed
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch
@@ -178,7 +179,10 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
         # Only where the file's CRS may be replaced: the bounds of a GeoJSON take a reading of all of it.
         bounds = bool(request.bare_crs) and set(names) != set(OSM)
         infos = (layer_info(file, name, force_total_bounds=bounds) for name in names)
-        return tuple(_described(request, name, info) for name, info in zip(names, infos, strict=True))
+        return tuple(
+            _described(request, name, info, _indexed(request, version, file, info))
+            for name, info in zip(names, infos, strict=True)
+        )
     except ERRORS as error:
         raise _error(request, f"cannot be read as vectors: {reason(error)}") from error
 
@@ -217,7 +221,21 @@ def _copied(path: UPath, version: FileStat) -> _Copy:
     return _Copy(path)
 
 
-def _described(request: Query, name: str, info: Any) -> _Layer:
+def _indexed(request: Query, version: FileStat, file: str, info: Any) -> bool:
+    """Return whether the features of a square can be read alone; all others are read as a whole."""
+    if has_complete_index(file, info):
+        return True
+    if info["capabilities"]["fast_spatial_filter"]:
+        memory.check(
+            WHOLE * version.size,
+            f"{request.path}, read as a whole because its spatial index may lack features,",
+            f"write layer {info['layer_name']!r} to a new GeoPackage with ogr2ogr",
+            str(request.path),
+        )
+    return False
+
+
+def _described(request: Query, name: str, info: Any, indexed: bool) -> _Layer:
     crs = crs_of(info["crs"], request.bare_crs, bounds_of(info))
     if crs is None:
         remedy = f"give it one, e.g. ogr2ogr -a_srs {short(request.crs)} NEW {request.path.name}"
@@ -231,7 +249,7 @@ def _described(request: Query, name: str, info: Any) -> _Layer:
     return _Layer(
         name=name,
         crs=crs,
-        indexed=info["capabilities"]["fast_spatial_filter"],
+        indexed=indexed,
         fields=tuple(info["fields"]),
         columns=read,
         where=where,

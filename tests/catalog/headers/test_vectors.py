@@ -1,6 +1,8 @@
 """Tiles list the vector files of roads that reach them."""
 
+import contextlib
 import json
+import sqlite3
 
 import numpy as np
 import pytest
@@ -47,6 +49,16 @@ def test_roads_file_is_listed_by_tiles_in_reach(survey, tmp_path):
     (again, *_) = Catalog.read(survey / "catalog.parquet").tiles
     assert again.layer("roads").files == ("a.gpkg",)
     assert again.paths(again.layer("roads"))[0].is_file()
+
+
+def test_roads_outside_of_the_extent_that_a_geopackage_states_are_listed(survey):
+    """A program has moved the second road and not the extent."""
+    lines = [LineString([(x, 5_629_300), (x + 20, 5_629_310)]) for x in (295_510, 296_200)]
+    path = write_roads(survey / "a.gpkg", lines)
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        file.execute("UPDATE gpkg_contents SET max_x = 295530")
+        file.commit()
+    assert named(indexed(survey, path)) == [["a.gpkg"], ["a.gpkg"], ["a.gpkg"]]
 
 
 @pytest.mark.parametrize("suffix", ["shp", "gpkg", "fgb", "geojson"])

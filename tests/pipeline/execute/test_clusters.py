@@ -371,7 +371,8 @@ def test_slurm_options_write_job_script(tmp_path):
     assert {
         "#SBATCH -p night", "#SBATCH -A roads", "#SBATCH -n 1", "#SBATCH --cpus-per-task=3",
         "#SBATCH --mem=6G", "#SBATCH -t 02:30:00", "#SBATCH --exclusive", "module load gdal",
-        "export OMP_NUM_THREADS=1", "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False",
+        "export OMP_NUM_THREADS=1", "export PYTHONSAFEPATH=1",
+        "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False",
         "export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES='[]'",
         f"#SBATCH -e {tmp_path}/flexroad-%J.err",
     } <= set(lines)  # fmt: skip

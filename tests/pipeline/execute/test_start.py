@@ -37,6 +37,25 @@ def test_run_interrupted_while_workers_start_says_so_in_one_line(made_survey, qu
     ), lines
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [["run.py"], ["-m", "flexroad"]])
+def test_workers_import_no_module_of_the_current_folder(command, made_survey, quick_config, tmp_path):
+    """A folder of downloads has files with the names of modules that the start of workers imports."""
+    downloads, marks = tmp_path / "downloads", tmp_path / "marks"
+    downloads.mkdir()
+    for name in ("multiprocessing", "pickle", "distributed", "numpy", "rasterio"):
+        line = f"open({str(marks)!r}, 'a').write({name!r}); raise ImportError"
+        (downloads / f"{name}.py").write_text(line)
+    program = tmp_path / "run.py"
+    program.write_text("from flexroad.pipeline.cli.main import main\nif __name__ == '__main__': main()\n")
+    words = [str(program) if word == "run.py" else word for word in command]
+    words += ["run", "--catalog", str(made_survey / "catalog.parquet"), "--out", str(tmp_path / "run")]
+    words += ["--config", str(quick_config), "--executor", "dask", "--workers", "1"]
+    ended = subprocess.run([sys.executable, *words], cwd=downloads, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    assert not marks.exists()
+
+
 def test_extra_keeps_the_handler_of_interrupts(monkeypatch):
     """The module dask_jobqueue.runner replaces it."""
     pytest.importorskip("dask_jobqueue")

@@ -1,6 +1,7 @@
 """Notifications: summaries sent to a command or a web address; failures return a reason."""
 
 import json
+import sys
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
@@ -45,6 +46,14 @@ def server():
 def test_notify_command_gets_summary_on_stdin_and_in_file(tmp_path):
     assert notify(f"cat > {tmp_path}/a; cp $FLEXROAD_SUMMARY {tmp_path}/b", SUMMARY) is None
     assert [json.loads((tmp_path / name).read_text()) for name in "ab"] == [SUMMARY, SUMMARY]
+
+
+def test_command_in_python_imports_modules_beside_it(tmp_path, monkeypatch):
+    """Dask sets the variable of the workers in this process, too."""
+    monkeypatch.setenv("PYTHONSAFEPATH", "1")
+    (tmp_path / "beside.py").write_text("")
+    (tmp_path / "notify.py").write_text("import beside")
+    assert notify(f"{sys.executable} {tmp_path}/notify.py", SUMMARY) is None
 
 
 def test_notify_command_fails_or_hangs_returns_reason(tmp_path):

@@ -1,5 +1,10 @@
 """Features from others: a coordinate that is no place costs its feature, nothing more."""
 
+import contextlib
+import shutil
+import sqlite3
+from dataclasses import replace
+
 import geopandas
 import numpy as np
 import pytest
@@ -40,6 +45,87 @@ def test_file_to_be_read_as_a_whole_is_compared_with_memory(tmp_path, monkeypatc
         TaskError, match=r"a.fgb, read as a whole, would need .*remove features with infinite"
     ):
         read_near(query, BOUNDS)
+
+
+ROADS = [shapely.box(399_000 + x, 5_699_500, 399_004 + x, 5_699_510) for x in range(0, 1000, 10)]
+AROUND = (398_990.0, 5_699_400.0, 399_500.0, 5_699_600.0)
+STALE = {
+    "rows are missing": ["DELETE FROM {index} WHERE {id} > 20"],
+    "rows are missing and others are too many": [
+        "UPDATE {index} SET {id} = {id} + 1000 WHERE {id} BETWEEN 20 AND 40"
+    ],
+    "rows are elsewhere": [
+        "CREATE TEMP TABLE old AS SELECT * FROM {index} WHERE {id} > 20",
+        "DELETE FROM {index} WHERE {id} > 20",
+        "INSERT INTO {index} SELECT {id}, 0, 1, 0, 1 FROM old",
+    ],
+    "is empty": ["DELETE FROM {index}"],
+}
+
+
+def roads(path, **options):
+    table = geopandas.GeoDataFrame({"id": range(len(ROADS))}, geometry=ROADS, crs=CRS)
+    table.to_file(path, layer="roads", engine="pyogrio", SPATIAL_INDEX="YES", **options)
+    return Query(path, None, None, ("id",), None, CRS)
+
+
+def change(path, statements):
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        for statement in statements:
+            file.execute(statement)
+        file.commit()
+
+
+@pytest.mark.parametrize("statements", STALE.values(), ids=STALE)
+@pytest.mark.parametrize("kind", ["gpkg", "sqlite"])
+def test_roads_that_an_index_hides_are_read(tmp_path, statements, kind):
+    path = tmp_path / f"a.{kind}"
+    query = roads(path, **({"driver": "SQLite", "SPATIALITE": "YES"} if kind == "sqlite" else {}))
+    names = {"gpkg": ("rtree_roads_geom", "id"), "sqlite": ("idx_roads_GEOMETRY", "pkid")}
+    index, key = names[kind]
+    change(path, [statement.format(index=index, id=key) for statement in statements])
+    assert sorted(read_near(query, AROUND)["id"]) == list(range(51))
+
+
+def test_roads_of_a_view_that_an_index_hides_are_read(tmp_path):
+    query = roads(tmp_path / "a.gpkg")
+    copied = "SELECT 'v', {} FROM {} WHERE table_name = 'roads'"
+    columns = "column_name, geometry_type_name, srs_id, z, m"
+    statements = [
+        *STALE["rows are missing"],
+        "CREATE VIEW v AS SELECT fid, geom, id FROM roads",
+        "INSERT INTO gpkg_contents (table_name, data_type, identifier, srs_id) "
+        + copied.format("'features', 'v', srs_id", "gpkg_contents"),
+        "INSERT INTO gpkg_geometry_columns " + copied.format(columns, "gpkg_geometry_columns"),
+    ]
+    change(query.path, [statement.format(index="rtree_roads_geom", id="id") for statement in statements])
+    assert sorted(read_near(replace(query, layer="v"), AROUND)["id"]) == list(range(51))
+
+
+def test_roads_of_a_shapefile_with_an_old_index_are_read(tmp_path):
+    """The index is of roads elsewhere: other programs do not remove it when they edit the Shapefile."""
+    other = tmp_path / "other.shp"
+    moved = geopandas.GeoSeries(ROADS).translate(5000, 5000)
+    geopandas.GeoDataFrame({"id": range(len(ROADS))}, geometry=moved, crs=CRS).to_file(
+        other, SPATIAL_INDEX="YES"
+    )
+    query = roads(tmp_path / "a.shp")
+    shutil.copyfile(other.with_suffix(".qix"), tmp_path / "a.qix")
+    assert sorted(read_near(query, AROUND)["id"]) == list(range(51))
+
+
+def test_file_with_an_index_that_lacks_roads_is_compared_with_memory(tmp_path, monkeypatch):
+    query = roads(tmp_path / "a.gpkg")
+    change(query.path, ["DELETE FROM rtree_roads_geom WHERE id = 1"])
+    monkeypatch.setattr(memory, "limit", lambda: 100)
+    with pytest.raises(TaskError, match=r"a.gpkg, read as a whole because its spatial index may lack"):
+        read_near(query, BOUNDS)
+
+
+def test_complete_index_is_used(tmp_path, monkeypatch):
+    query = roads(tmp_path / "a.gpkg")
+    monkeypatch.setattr(memory, "limit", lambda: 100)
+    assert sorted(read_near(query, AROUND)["id"]) == list(range(51))
 
 
 def test_has_place_looks_at_every_coordinate():
