@@ -59,6 +59,11 @@ class Catalog:
         """The tiles without a `Tile.fault`; only these have a position."""
         return tuple(tile for tile in self.tiles if not tile.fault)
 
+    @cached_property
+    def lost(self) -> frozenset[str]:
+        """Ids of the tiles of a run that the catalog lacks because their files were skipped."""
+        return frozenset(tile for file in self.skipped for tile in file.tiles)
+
     @classmethod
     def read(cls, path: Location | str, allow: Sequence[str | Path] = ()) -> Catalog:
         """Read a catalog written by `write`, from disk or a bucket.

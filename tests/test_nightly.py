@@ -105,6 +105,8 @@ def test_nights_with_new_damaged_and_repaired_files_say_what_happened(machine):
     assert [summary[name] for name in names] == [2, 0, 1, 1, 0, 2, 1, 1, [told]]
 
     # Nothing was repaired, and nothing is forgotten.
+    subprocess.run([machine.folder / "bin" / "flexroad", "clean", machine.run], check=True)
+    assert (machine.run / "tiles" / tile / "item.json").exists()
     code, log, mail = machine.night()
     assert code == 1
     again = f"2 tiles: 2 done (2 cached), 0 failed, 0 pending; 0 new, 0 changed, 0 vanished; {LOST}; "

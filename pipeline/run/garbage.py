@@ -1,7 +1,7 @@
 """``flexroad clean``: find and delete files that are no longer needed; files of other programs are kept.
 
-Needed are: artefacts in the current graph of any run of the store; tiles in the run's catalog; products in
-the tiles' items or in the export options.
+Needed are: artefacts in the current graph of any run of the store; tiles in the run's catalog, or lost with
+a file that it skipped; products in the tiles' items or in the export options.
 """
 
 from __future__ import annotations
@@ -157,6 +157,7 @@ def _in_store(store: Location, needed: set[bytes]) -> Iterator[Garbage]:
 
 def _in_tiles(run: Run) -> Iterator[Garbage]:
     tiles = {safe_name(tile.id): tile for tile in run.catalog.tiles}
+    lost = set(map(safe_name, run.catalog.lost))
     current = _ends(run.config.export.variants, run.config.export.formats)
     ever = _ends(run.exported, KINDS) | current
     ever |= {f"_{variant}{kind.suffix}" for variant in run.exported for kind in LEVEL_KINDS}
@@ -165,6 +166,9 @@ def _in_tiles(run: Run) -> Iterator[Garbage]:
             yield from _temporary(folder, files)
             products = [folder.name + end for end in sorted(ever) if folder.name + end in files]
             tile = tiles.get(folder.name)
+            if folder.name in lost:
+                # Its results are the last ones until its file is repaired.
+                continue
             if tile is None:
                 # Markers come last, so that an interrupted deletion is continued by the next clean.
                 markers = [name for name in (DONE, FAILED) if name in files]

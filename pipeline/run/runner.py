@@ -166,9 +166,8 @@ def plan_run(
     refuse_incomplete(run, incomplete, last_incomplete)
     database.flush()
     ids = (tile.id for tile in run.catalog.tiles)
-    lost = {tile for file in run.catalog.skipped for tile in file.tiles}
-    lost = {tile for tile in lost if database.get(tile)}
-    vanished = database.set_states(zip(ids, states, strict=True)) - len(lost)
+    lost = sum(database.get(tile) is not None for tile in run.catalog.lost)
+    vanished = database.set_states(zip(ids, states, strict=True)) - lost
     return Plan(todo, statistics.median(times) if times else None, new, changed, vanished)
 
 
@@ -288,7 +287,7 @@ def _close(
         interrupted=interrupted,
         refused=refused,
     )
-    summary = with_skipped(summary, run.catalog.skipped)
+    summary = with_skipped(summary, run.catalog)
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
         if plan.todo:

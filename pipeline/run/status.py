@@ -271,7 +271,7 @@ def summary(
     last = read_summary(run.path)
     names = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
     current = replace(current, **{name: last[name] for name in names if name in last})
-    return with_skipped(current, run.catalog.skipped)
+    return with_skipped(current, run.catalog)
 
 
 def recorded_summary(run: Run, database: RunDatabase, since: str) -> tuple[Summary, int]:
@@ -319,7 +319,7 @@ def progress(run: Run, owner: Owner) -> tuple[Summary, str]:
     """
     with open_database(run) as database:
         summary, finished = recorded_summary(run, database, owner.since)
-    summary = with_skipped(summary, run.catalog.skipped)
+    summary = with_skipped(summary, run.catalog)
     minutes = (time.time() - datetime.fromisoformat(owner.since).timestamp()) / 60
     if not finished or minutes <= 0:
         return summary, ""

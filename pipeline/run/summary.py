@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from typing import Any
 
-from flexroad.catalog.skipped import Skipped, lines
+from flexroad.catalog import Catalog
+from flexroad.catalog.skipped import lines
 from flexroad.catalog.storage.paths import Location, read, write
 from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.records import Failure, TileState
@@ -95,11 +96,10 @@ def summarise(
     )
 
 
-def with_skipped(summary: Summary, skipped: Sequence[Skipped]) -> Summary:
+def with_skipped(summary: Summary, catalog: Catalog) -> Summary:
     """Return the summary with what the run's catalog skipped."""
-    lost = {tile for file in skipped for tile in file.tiles}
-    told = tuple(islice(lines(skipped), MAX_FAILURES))
-    return replace(summary, skipped=len(skipped), lost=len(lost), left_out=told)
+    told = tuple(islice(lines(catalog.skipped), MAX_FAILURES))
+    return replace(summary, skipped=len(catalog.skipped), lost=len(catalog.lost), left_out=told)
 
 
 def write_summary(run: Location, summary: Summary, flushed: bool = False, **about: Any) -> None:
