@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import signal
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli.command import Command
+from flexroad.pipeline.cli.signals import INTERRUPTED, signals_interrupt
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.alerts import notify
@@ -24,7 +24,6 @@ from flexroad.pipeline.run.prometheus import Textfile
 from flexroad.pipeline.run.summary import Summary, read_summary
 
 CANNOT_START = 2
-INTERRUPTED = 130
 
 
 @dataclass
@@ -68,12 +67,13 @@ def report_outcome(run: Location, on_failure: str | None, prometheus: Path | Non
     """
     before = read_summary(run)
     outcome = Outcome()
-    with signals_interrupt(), contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
         # The stack is left in reverse order: the notification follows the Prometheus file.
         stack.callback(_notify, outcome, run, before, on_failure)
         try:
-            outcome.textfile = _textfile(stack, run, prometheus)
-            yield outcome
+            with signals_interrupt():
+                outcome.textfile = _textfile(stack, run, prometheus)
+                yield outcome
         except KeyboardInterrupt:
             outcome.exit_code = INTERRUPTED
             outcome.text = "interrupted; the same command goes on from here"
@@ -101,32 +101,6 @@ class RunCommand(Command):
                 run = params.get("out") or params.get("path") or Path()
                 _notify(Outcome(CANNOT_START, text), run, {}, target)
             raise
-
-
-@contextlib.contextmanager
-def signals_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt at the first SIGINT, SIGTERM or SIGHUP; ignore further ones."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    interrupted = False
-
-    def interrupt(*_: object) -> None:
-        nonlocal interrupted
-        interrupted = True
-        for number in before:
-            # Shutdown takes seconds. A second signal would interrupt it and leave workers running.
-            signal.signal(number, lambda *_: None)
-        raise KeyboardInterrupt
-
-    for number, handler in before.items():
-        # Background processes and nohup ignore SIGINT or SIGHUP: these stay ignored.
-        if number == signal.SIGTERM or handler is not signal.SIG_IGN:
-            signal.signal(number, interrupt)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            # After an interruption a late signal must not change the exit code.
-            signal.signal(number, signal.SIG_IGN if interrupted else handler)
 
 
 def _textfile(stack: contextlib.ExitStack, run: Location, path: Path | None) -> Textfile | None:
