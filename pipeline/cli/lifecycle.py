@@ -14,7 +14,7 @@ import typer
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute
-from flexroad.catalog.text import count
+from flexroad.catalog.text import count, without_credentials
 from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.signals import INTERRUPTED, signals_interrupt
 from flexroad.pipeline.cli.stdio import echo
@@ -126,10 +126,10 @@ def _notify(outcome: Outcome, run: Location, before: dict[str, Any], target: str
     after = read_summary(run)
     message = {
         # Chat services show this key.
-        "text": f"flexroad {run} on {socket.gethostname()}: {outcome.text}",
+        "text": without_credentials(f"flexroad {run} on {socket.gethostname()}: {outcome.text}"),
         # An unchanged summary belongs to an earlier run.
         **(after if after != before else {}),
-        "run": str(run),
+        "run": without_credentials(str(run)),
         "host": socket.gethostname(),
         "flexroad": importlib.metadata.version("flexroad"),
         "exit_code": outcome.exit_code,
