@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
+from flexroad.catalog.headers.refused import require_regular
 from flexroad.catalog.storage.outputs import atomic_path
 from flexroad.catalog.text import one_line
 
@@ -102,6 +103,7 @@ def _spacing(axis: Floats) -> float:
 def _arrays(source: Path) -> dict[str, NDArray[np.generic]]:
     """Return the numeric arrays of an archive whose size was checked before any is read."""
     try:
+        require_regular(source)
         with zipfile.ZipFile(source) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
         if size > MAX_BYTES:

@@ -25,7 +25,14 @@ LATTICE_TOLERANCE = 0.01
 
 def overlap(a: Bounds, b: Bounds, tolerance: float = 0.0) -> bool:
     """Return whether two areas overlap by more than a tolerance (m) from west to east and south to north."""
-    return min(a[2], b[2]) - max(a[0], b[0]) > tolerance and min(a[3], b[3]) - max(a[1], b[1]) > tolerance
+    # Most areas lie beside each other, and one comparison tells.
+    return (
+        a[2] - b[0] > tolerance
+        and b[2] - a[0] > tolerance
+        and a[3] - b[1] > tolerance
+        and b[3] - a[1] > tolerance
+        and min(a[2] - a[0], b[2] - b[0], a[3] - a[1], b[3] - b[1]) > tolerance
+    )
 
 
 def is_whole(number: float) -> bool:

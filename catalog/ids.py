@@ -15,7 +15,7 @@ from flexroad.catalog.text import shown
 MAX_BYTES = 100
 """Longest id (bytes in UTF-8). In a file name of 255 bytes, the mark of a changed id (9) and the one of a
 temporary file (38) leave 108 for the variant and the ending."""
-SAFE = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
+SAFE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
 def problem(tile_id: object) -> str:
@@ -56,9 +56,14 @@ def check(ids: Sequence[str]) -> None:
 # The name of a tile is needed for each of its files.
 @lru_cache(maxsize=1024)
 def safe_name(tile_id: str) -> str:
-    """Return the name of a tile's folder and files: its id, changed if it is not a valid file name."""
-    safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
-    return safe if safe and safe == tile_id else f"{safe}-{hashlib.sha256(tile_id.encode()).hexdigest()[:8]}"
+    """Return the name of a tile's folder and files: its id, changed if it is not a valid file name.
+
+    Programs take a name that begins with a minus for an option.
+    """
+    safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".-")
+    if safe and safe == tile_id:
+        return safe
+    return f"{safe}-{hashlib.sha256(tile_id.encode()).hexdigest()[:8]}".lstrip("-")
 
 
 def _equal(ids: Iterable[str], key: Callable[[str], str]) -> list[list[str]]:

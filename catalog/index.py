@@ -32,7 +32,7 @@ from flexroad.catalog.grid import Bounds, Grid, overlap
 from flexroad.catalog.skipped import Skipped, from_fields, to_fields
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
-from flexroad.catalog.text import edges, printable
+from flexroad.catalog.text import edges, printable, some
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.trust import AllowedFolders
 
@@ -180,6 +180,14 @@ class Catalog:
             if not tiles:
                 raise area.none_touched()
         return replace(self, tiles=tuple(tiles))
+
+    def same_places(self) -> str:
+        """Return a note on tiles that lie on the same place, empty if there are none."""
+        ids: dict[tuple[str, Bounds], list[str]] = defaultdict(list)
+        for tile in self.usable:
+            ids[tile.grid.crs, tile.grid.bounds].append(tile.id)
+        shared = [" and ".join(same) for same in ids.values() if len(same) > 1]
+        return f"tiles on the same place: {some(shared)}; their results cover each other" if shared else ""
 
     def _check_bbox(self, bbox: Bounds) -> None:
         west, south, east, north = bbox

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from flexroad.catalog.storage.paths import read
 from flexroad.catalog.text import access_reason, one_line, some
 from flexroad.catalog.tile import LAYERS
 
@@ -198,7 +199,7 @@ def _strata(root: Path, names: Sequence[str]) -> tuple[dict[str, str], list[str]
 
 
 def _parsed(path: Path) -> Any:
-    text = path.read_text(encoding="utf-8-sig")
+    text = read(path).decode("utf-8-sig")
     if path.suffix.lower() == ".csv":
         # One separator for all: ids and strata have neither.
         return [row for line in csv.reader(text.splitlines()) for row in [";".join(line).split(";")]]

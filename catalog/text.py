@@ -16,6 +16,8 @@ MAX_LINE = 200
 FORMULA = ("=", "+", "-", "@", "\t", "\n")
 """Starts of texts that spreadsheets take for formulas."""
 _NUMBER = re.compile(r"[+-][\d.,_]*(?:[eE][+-]?\d+)?%?(?: [a-z][^=@(|!]*)?")
+_CREDENTIALS = re.compile(r"(:/{1,2})(?:[^/\s@:]*:\S*|[^/\s@]+)@|^[^/\s@:]*:[^/\s]\S*@")
+_SIGNATURE = re.compile(r"(https?:/\S*\?)\S+")
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 
@@ -27,6 +29,13 @@ def printable(text: str) -> str:
     a tag may have them, and a terminal would obey them.
     """
     return text if text.isprintable() else "".join(map(_escaped, text))
+
+
+def without_credentials(text: str) -> str:
+    """Return a text with ``***`` for the user and password, and the query, of each address in it."""
+    if "@" not in text and "?" not in text:
+        return text
+    return _SIGNATURE.sub(r"\1***", _CREDENTIALS.sub(r"\1***@", text))
 
 
 def no_formula(value: Any) -> Any:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from itertools import combinations
+from functools import lru_cache
+from itertools import islice
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid, overlap
@@ -80,7 +81,7 @@ class Layer:
             return self
         return self.part(numbers) if numbers else None
 
-    def in_common_order(self, bounds: Bounds) -> list[int]:
+    def in_common_order(self, bounds: Bounds) -> Sequence[int]:
         """Return the numbers of the files that overlap an area, in the order that all tiles agree on.
 
         The files are sorted by name, but of two that overlap the first one stays first, because its values
@@ -90,11 +91,12 @@ class Layer:
         if len(numbers) < 2 or not self.extents:
             return numbers
         left = sorted(numbers, key=self.files.__getitem__)
-        if not any(self._touch(one, other) for one, other in combinations(numbers, 2)):
+        before = _overlapped(self.extents)
+        if not any(before[number].intersection(numbers) for number in numbers):
             return left
         order = []
         while left:
-            first = next(k for k in left if not any(j < k and self._touch(j, k) for j in left))
+            first = next(number for number in left if before[number].isdisjoint(left))
             left.remove(first)
             order.append(first)
         return order
@@ -105,13 +107,30 @@ class Layer:
         extents = tuple(self.extents[number] for number in numbers) if self.extents else ()
         return replace(self, files=files, extents=extents)
 
-    def _overlapping(self, bounds: Bounds) -> list[int]:
-        if not self.extents:
-            return list(range(len(self.files)))
-        return [number for number, extent in enumerate(self.extents) if overlap(extent, bounds, TOUCH_M)]
+    def _overlapping(self, bounds: Bounds) -> Sequence[int]:
+        return _reaching(self.extents, bounds) if self.extents else range(len(self.files))
 
-    def _touch(self, one: int, other: int) -> bool:
-        return overlap(self.extents[one], self.extents[other], TOUCH_M)
+
+# The layers of a tile share their extents: what follows from these is found once for all of them.
+@lru_cache(maxsize=64)
+def _reaching(extents: tuple[Bounds, ...], bounds: Bounds) -> tuple[int, ...]:
+    """Return the numbers of the files that overlap an area."""
+    return tuple(number for number, extent in enumerate(extents) if overlap(extent, bounds, TOUCH_M))
+
+
+@lru_cache(maxsize=16)
+def _overlapped(extents: tuple[Bounds, ...]) -> list[set[int]]:
+    """Return for each file the numbers of the files before it that overlap it."""
+    before: list[set[int]] = [set() for _ in extents]
+    eastward = sorted(range(len(extents)), key=extents.__getitem__)
+    for start, one in enumerate(eastward, 1):
+        for other in islice(eastward, start, None):
+            if extents[one][2] - extents[other][0] <= TOUCH_M:
+                # All further ones begin farther east.
+                break
+            if overlap(extents[one], extents[other], TOUCH_M):
+                before[max(one, other)].add(min(one, other))
+    return before
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +248,7 @@ class Tile:
         return replace(self, grid=grid, layers=layers, nearby=())
 
 
-def files_around(layers: Iterable[Layer], bounds: Bounds, reach: Bounds) -> list[tuple[Layer, list[int]]]:
+def files_around(layers: Iterable[Layer], bounds: Bounds, reach: Bounds) -> list[tuple[Layer, Sequence[int]]]:
     """Return the layers with files that reach other ground, and the numbers of these files (`Tile.around`).
 
     Parameters

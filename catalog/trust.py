@@ -21,6 +21,7 @@ from pathlib import Path
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location, resolved
+from flexroad.catalog.text import without_credentials
 
 ADDRESS = re.compile(r"(?!(?i:s3):)[a-zA-Z][a-zA-Z0-9+.-]*:/|/+vsi")
 LONGEST_SHOWN = 500
@@ -74,7 +75,8 @@ class AllowedFolders:
             )
         if ADDRESS.match(name):
             return CatalogError(
-                f"{subject} names {name}; only files on disk and in s3:// are read: fetch it first"
+                f"{subject} names {without_credentials(name)}; only files on disk and in s3:// are read: "
+                "fetch it first"
             )
         name, target = normalise(name), resolved(name)
         options = " ".join(

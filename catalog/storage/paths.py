@@ -26,7 +26,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import atomic_path, flush_path
 from flexroad.catalog.storage.settings import s3_options
-from flexroad.catalog.text import printable
+from flexroad.catalog.text import printable, without_credentials
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -80,8 +80,10 @@ def parse_location(where: str | Location) -> Location:
     if bucket is None:
         if _SCHEME.match(text):
             reason = "is neither a path on disk nor s3://BUCKET/NAME"
-            raise CatalogError(f"{printable(text)} {reason}; fetch it first, or give its path")
+            address = printable(without_credentials(text))
+            raise CatalogError(f"{address} {reason}; fetch it first, or give its path")
         return Path(where)
+    name = normalise(text)
     try:
         remote: UPath = upath.UPath("s3://" + text[bucket.end() :], **s3_options())
         remote.fs.retries = ROUNDS
@@ -89,7 +91,7 @@ def parse_location(where: str | Location) -> Location:
         raise OSError(
             errno.ENOTSUP,
             "object storage needs s3fs; install it with pip install 'flexroad[s3]'",
-            normalise(text),
+            name,
         ) from error
     return remote
 
@@ -110,10 +112,21 @@ def join(folder: str, name: str) -> str:
 
 
 def normalise(name: str) -> str:
-    """Return an absolute path or address without ``..``; links are not followed."""
+    """Return an absolute path or address without ``..``; links are not followed.
+
+    Raises
+    ------
+    CatalogError
+        If it is an address with a user or password: it would be stored, and shown in messages.
+    """
     bucket = _BUCKET.match(name)
     if bucket is None:
         return os.path.normpath(name if name.startswith("/") else Path(name).absolute())
+    if (hidden := without_credentials(name)) != name:
+        raise CatalogError(
+            f"{printable(hidden)} has credentials; give s3://BUCKET/NAME, and set AWS_ACCESS_KEY_ID and "
+            "AWS_SECRET_ACCESS_KEY"
+        )
     return "s3:/" + os.path.normpath("/" + name[bucket.end() :])
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.text import shown
+from flexroad.catalog.text import shown, without_credentials
 
 TRIES = 5
 """Attempts per request before it fails, unless AWS_MAX_ATTEMPTS is set."""
@@ -83,11 +83,14 @@ def _endpoint() -> str:
             try:
                 parts = urlsplit(address)
                 fine = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
+                fine = fine and parts.username is None
             except ValueError:
                 fine = False
             if not fine:
                 remedy = "set it to the server's address, as http://localhost:9000 or https://HOST"
-                raise CatalogError(f"{name} is {shown(address)}; {remedy}")
+                raise CatalogError(
+                    f"{name} is {shown(without_credentials(address))}; {remedy}, without credentials"
+                )
             return address
     return ""
 

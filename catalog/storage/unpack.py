@@ -75,6 +75,9 @@ def unpack(archive: Path, sha256: str, progress: Progress, told: Callable[[str],
 
 def _entries(archive: Path) -> list[zipfile.ZipInfo]:
     """Return the files of an archive, checked."""
+    if archive.exists() and not archive.is_file():
+        # To open a pipe would wait for a writer.
+        raise CatalogError(f"{archive} is not a regular file; replace it by one")
     try:
         size = archive.stat().st_size
         with zipfile.ZipFile(archive) as opened:

@@ -110,6 +110,8 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
     if more := frozenset(tile.id for tile in unusable[MAX_SHOWN:]):
         yield Finding(f"{len(more)} more entries cannot be used", fault=True, failing=more)
     usable = [tile for tile in tiles if not tile.fault]
+    if note := Catalog(tuple(usable)).same_places():
+        yield Finding(note)
     named = set[str]()
     for layer, stage, ids in lacking(usable, config):
         yield _would_fail(ids, usable, f"no {layer}, which {stage} needs")

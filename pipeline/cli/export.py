@@ -15,7 +15,7 @@ from flexroad.catalog.storage.paths import Location, parse_location
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
-from flexroad.pipeline.cli.lifecycle import INTERRUPTED, signals_interrupt
+from flexroad.pipeline.cli.signals import INTERRUPTED
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ClusterLost, ConfigError
@@ -94,25 +94,24 @@ def export(
     check_formats(names, chosen)
     track = StepProgress(Console(stderr=True))
     runner = SerialExecutor() if executor == "serial" else DaskExecutor(workers)
-    with signals_interrupt():
-        try:
-            source = select(
-                parse_location(path),
-                tile or (),
-                bbox,
-                allow=[str(place) for place in allow or ()],
-                area=Area.read(area, area_layer) if area else None,
-                track=track,
-            )
-            if source.left_out:
-                _note(f"left out {count(len(source.left_out), 'unfinished tile')}")
-            manifest = write(source, folder, names, chosen, runner, track, _note)
-        except KeyboardInterrupt:
-            echo("interrupted; the same command goes on from here", err=True)
-            raise typer.Exit(INTERRUPTED) from None
-        except ClusterLost as error:
-            echo(f"error: {error}; the same command goes on from here", err=True)
-            raise typer.Exit(1) from None
+    try:
+        source = select(
+            parse_location(path),
+            tile or (),
+            bbox,
+            allow=[str(place) for place in allow or ()],
+            area=Area.read(area, area_layer) if area else None,
+            track=track,
+        )
+        if source.left_out:
+            _note(f"left out {count(len(source.left_out), 'unfinished tile')}")
+        manifest = write(source, folder, names, chosen, runner, track, _note)
+    except KeyboardInterrupt:
+        echo("interrupted; the same command goes on from here", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    except ClusterLost as error:
+        echo(f"error: {error}; the same command goes on from here", err=True)
+        raise typer.Exit(1) from None
     written = {name: manifest["formats"][name] for name in names}
     for name in names:
         _say(name, written[name], folder / name)

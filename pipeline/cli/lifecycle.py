@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import signal
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,8 +14,9 @@ import typer
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute
-from flexroad.catalog.text import count
+from flexroad.catalog.text import count, without_credentials
 from flexroad.pipeline.cli.command import Command
+from flexroad.pipeline.cli.signals import INTERRUPTED, signals_interrupt
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.alerts import notify
@@ -24,7 +24,6 @@ from flexroad.pipeline.run.prometheus import Textfile
 from flexroad.pipeline.run.summary import Summary, read_summary
 
 CANNOT_START = 2
-INTERRUPTED = 130
 
 
 @dataclass
@@ -78,12 +77,13 @@ def report_outcome(run: Location, on_failure: str | None, prometheus: Path | Non
     """
     before = read_summary(run)
     outcome = Outcome()
-    with signals_interrupt(), contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
         # The stack is left in reverse order: the notification follows the Prometheus file.
         stack.callback(_notify, outcome, run, before, on_failure)
         try:
-            outcome.textfile = _textfile(stack, run, prometheus)
-            yield outcome
+            with signals_interrupt():
+                outcome.textfile = _textfile(stack, run, prometheus)
+                yield outcome
         except KeyboardInterrupt:
             outcome.exit_code = INTERRUPTED
             outcome.text = "interrupted; the same command goes on from here"
@@ -113,32 +113,6 @@ class RunCommand(Command):
             raise
 
 
-@contextlib.contextmanager
-def signals_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt at the first SIGINT, SIGTERM or SIGHUP; ignore further ones."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    interrupted = False
-
-    def interrupt(*_: object) -> None:
-        nonlocal interrupted
-        interrupted = True
-        for number in before:
-            # Shutdown takes seconds. A second signal would interrupt it and leave workers running.
-            signal.signal(number, lambda *_: None)
-        raise KeyboardInterrupt
-
-    for number, handler in before.items():
-        # Background processes and nohup ignore SIGINT or SIGHUP: these stay ignored.
-        if number == signal.SIGTERM or handler is not signal.SIG_IGN:
-            signal.signal(number, interrupt)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            # After an interruption a late signal must not change the exit code.
-            signal.signal(number, signal.SIG_IGN if interrupted else handler)
-
-
 def _textfile(stack: contextlib.ExitStack, run: Location, path: Path | None) -> Textfile | None:
     if path is None:
         return None
@@ -162,10 +136,10 @@ def _notify(outcome: Outcome, run: Location, before: dict[str, Any], target: str
     after = read_summary(run)
     message = {
         # Chat services show this key.
-        "text": f"flexroad {run} on {socket.gethostname()}: {outcome.text}",
+        "text": without_credentials(f"flexroad {run} on {socket.gethostname()}: {outcome.text}"),
         # An unchanged summary belongs to an earlier run.
         **(after if after != before else {}),
-        "run": str(run),
+        "run": without_credentials(str(run)),
         "host": socket.gethostname(),
         "flexroad": importlib.metadata.version("flexroad"),
         "exit_code": outcome.exit_code,

@@ -16,6 +16,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.text import one_line
 from flexroad.pipeline import IGNORED
 from flexroad.pipeline.cli import limits
+from flexroad.pipeline.cli.signals import INTERRUPTED, signals_interrupt
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
@@ -83,15 +84,18 @@ def main() -> None:
     # for credentials, which GDAL reads by itself.
     sys.modules.setdefault("boto3", None)  # type: ignore[arg-type]
     try:
-        app()
+        with signals_interrupt():
+            app()
     except (CatalogError, ConfigError) as error:
         for line in str(error).splitlines():
             echo(f"error: {line}", err=True)
         sys.exit(2)
-    except SystemExit as end:
+    except (SystemExit, KeyboardInterrupt) as end:
         # typer ends with 130 without a word. Commands that notice an interruption themselves have said so.
-        if isinstance(getattr(end.__context__, "__cause__", None), KeyboardInterrupt):
+        cause = getattr(end.__context__, "__cause__", None)
+        if isinstance(end, KeyboardInterrupt) or isinstance(cause, KeyboardInterrupt):
             echo("interrupted; repeat the command", err=True)
+            sys.exit(INTERRUPTED)
         raise
     except Exception as error:
         reason = _reason(error)

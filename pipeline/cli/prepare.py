@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.next_step import after_catalog
+from flexroad.pipeline.cli.signals import INTERRUPTED
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import GROUND, RASTERS, RECONSTRUCTION, option
 from flexroad.pipeline.errors import ConfigError
@@ -91,8 +91,7 @@ def _held(out: Path) -> Iterator[None]:
 
 
 def _run(out: Path, make: Callable[[], PreparedDataset]) -> None:
-    """Run a command and print its result; SIGTERM is handled like Ctrl-C, and leaves no files behind."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    """Run a command and print its result; an interruption leaves no files behind."""
     try:
         with _held(out):
             dataset = make()
@@ -100,7 +99,7 @@ def _run(out: Path, make: Callable[[], PreparedDataset]) -> None:
         raise ConfigError(str(error)) from error
     except KeyboardInterrupt:
         echo("interrupted; nothing was written", err=True)
-        raise typer.Exit(130) from None
+        raise typer.Exit(INTERRUPTED) from None
     for note in dataset.notes:
         echo(f"note: {note}", err=True)
     echo(f"{count(dataset.tiles, 'tile')} in {dataset.catalog}")

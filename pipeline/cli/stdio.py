@@ -13,12 +13,15 @@ from typing import IO, Any
 
 import typer
 
-from flexroad.catalog.text import printable
+from flexroad.catalog.text import printable, without_credentials
 
 
 def echo(line: str, err: bool = False) -> None:
-    """Print one line to standard output or error; characters that cannot be printed are escaped."""
-    typer.echo(printable(line), err=err)
+    """Print one line to standard output or error; characters that cannot be printed are escaped.
+
+    Standard error shows no credentials of addresses. Data on standard output stays as it is.
+    """
+    typer.echo(printable(without_credentials(line) if err else line), err=err)
 
 
 def echo_document(text: str) -> None:

@@ -13,6 +13,7 @@ from flexroad.catalog.storage.paths import is_remote, parse_location
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
+from flexroad.pipeline.cli.signals import signals_interrupt
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import OUTPUTS
 from flexroad.pipeline.errors import ConfigError
@@ -101,6 +102,7 @@ def _serve(folder: Path, port: int) -> None:
     with web:
         echo(f"http://127.0.0.1:{web.server_address[1]}/  (Ctrl-C stops)")
         try:
-            web.serve_forever()
+            with signals_interrupt():
+                web.serve_forever()
         except KeyboardInterrupt:
             echo("stopped")

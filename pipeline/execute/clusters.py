@@ -82,6 +82,10 @@ def open_cluster(
     """
     if scheduler:
         _check_certificates(scheduler)
+        if not scheduler.startswith(("tls://", "wss://")):
+            say(
+                "a scheduler without tls:// is open to everyone who reaches it, and runs programs as its user"
+            )
         yield ClusterTarget(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S, cluster.patience_s)
         return
     if workers:

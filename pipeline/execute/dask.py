@@ -10,12 +10,13 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
+from flexroad.catalog.text import without_credentials
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.executor import Executor, J, Probe, R
 
 LOCAL = Cluster()
-ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?([^\s:/\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}")
+ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?([^\s:/@\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}")
 """Address of a scheduler."""
 
 
@@ -29,8 +30,8 @@ def check_address(address: str) -> None:
     """
     if not ADDRESS.fullmatch(address):
         raise ConfigError(
-            f"{address!r} is no address of a Dask scheduler; give its host and port, as tcp://host:8786 or "
-            "tls://host:8786"
+            f"{without_credentials(address)!r} is no address of a Dask scheduler; give its host and port, as "
+            "tcp://host:8786 or tls://host:8786"
         )
 
 

@@ -82,7 +82,7 @@ class BorderPart:
     task: BorderTask
     place: str
     """Its position as JSON, without the closing bracket."""
-    layers: list[tuple[Layer, list[int]]]
+    layers: list[tuple[Layer, Sequence[int]]]
     """The layers of `BorderTask.ground`, and the numbers of their files."""
 
 

@@ -156,6 +156,8 @@ def created(
     observer = observer or Observer()
     with observer.working(f"reading {catalog}"):
         tiles, selected = selection.of(path, catalog, allow, config)
+    if note := tiles.same_places():
+        observer.note(note)
     with _locked(path, observer, create=True) as died:
         with observer.working(f"preparing {path}"):
             run = Run.create(path, config, tiles, store, checksum)

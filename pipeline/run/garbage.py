@@ -101,11 +101,12 @@ def find_garbage(runs: Sequence[Run]) -> Iterator[Garbage]:
         If a model of a run is missing, so that its needed artefacts are unknown.
     """
     first = runs[0]
-    needed = _needed(runs)
-    yield from _in_store(first.store, needed)
+    # Before the needed ones are known: other commands may write to the store meanwhile, and that stays.
+    unneeded = {name for name, _ in _in_store(first.store)}
+    unneeded -= _needed(runs)
+    yield from (garbage for name, garbage in _in_store(first.store) if name in unneeded)
     yield from _in_tiles(first)
-    for folder in (first.path, first.store):
-        yield from _temporary(folder, hidden_files(folder))
+    yield from _temporary(first.path, hidden_files(first.path))
 
 
 def delete(garbage: Iterable[Garbage]) -> Iterator[Garbage]:
@@ -145,14 +146,20 @@ def _needed(runs: Iterable[Run]) -> set[bytes]:
     return needed
 
 
-def _in_store(store: Location, needed: set[bytes]) -> Iterator[Garbage]:
+def _in_store(store: Location) -> Iterator[tuple[bytes, Garbage]]:
+    """Yield the artefacts and temporary files of a store, each with its fingerprint or its name."""
     for stage in (*STAGE_NAMES, BORDER):
         for folder, files in _folders(store / stage):
-            yield from _temporary(folder, files)
+            yield from _named(_temporary(folder, files))
             for name, size in files.items():
                 artefact = ARTEFACT.fullmatch(name)
-                if artefact and name[:2] == folder.name and bytes.fromhex(artefact[1]) not in needed:
-                    yield Garbage("artefacts", folder / name, size)
+                if artefact and name[:2] == folder.name:
+                    yield bytes.fromhex(artefact[1]), Garbage("artefacts", folder / name, size)
+    yield from _named(_temporary(store, hidden_files(store)))
+
+
+def _named(files: Iterable[Garbage]) -> Iterator[tuple[bytes, Garbage]]:
+    return ((file.path.name.encode(), file) for file in files)
 
 
 def _in_tiles(run: Run) -> Iterator[Garbage]:

@@ -84,6 +84,8 @@ class RunDatabase:
         self._recover = recover
         self._pending: dict[str, TileRecord] = {}
         self._flushed = time.monotonic()
+        self._lost = False
+        """Whether the file is damaged and could not be made anew."""
 
     @classmethod
     def open(cls, path: Location, recover: Recover = lambda tile_id: None) -> RunDatabase:
@@ -367,13 +369,17 @@ class RunDatabase:
         """Write in one transaction, into a new and empty file if the old one turns out to be damaged."""
         try:
             try:
-                with self._connection:
-                    return change()
+                if not self._lost:
+                    with self._connection:
+                        return change()
             except Damage as error:
                 if not is_damage(error):
                     raise
             self._connection.close()
+            # A full disk takes no new file: each later write tries again.
+            self._lost = True
             self._connection = create(self._staged.path, TABLES, VERSION)
+            self._lost = False
             with self._connection:
                 return change()
         except Damage as error:

@@ -51,9 +51,12 @@ def is_damage(error: BaseException, readonly: bool = False) -> bool:
 
 def os_error(error: BaseException, path: Location) -> OSError:
     """Return an error of SQLite as an error of the file."""
-    full = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
-    number, reason = (errno.ENOSPC, os.strerror(errno.ENOSPC)) if full else (errno.EIO, str(error))
-    return OSError(number, reason, str(path))
+    if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL:
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    # The connection is closed after a new file could not be made.
+    closed = isinstance(error, sqlite3.ProgrammingError)
+    reason = "it is damaged and could not be made anew" if closed else str(error)
+    return OSError(errno.EIO, reason, str(path))
 
 
 def open_writable(path: Path, tables: tuple[str, ...], version: int) -> sqlite3.Connection:
@@ -109,6 +112,8 @@ def create(path: Path, tables: tuple[str, ...], version: int) -> sqlite3.Connect
     # A journal that is left behind would be applied to the new file.
     for end in ("", "-journal", "-wal", "-shm"):
         path.with_name(path.name + end).unlink(missing_ok=True)
+    # SQLite would leave others without the rights that the umask gives them.
+    path.touch()
     return _with_tables(_connect(path, "rwc"), tables, version)
 
 

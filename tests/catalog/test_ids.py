@@ -53,6 +53,15 @@ def test_equal_ids_are_named_with_a_remedy():
         check(["a/b", safe_name("a/b")])
 
 
+@pytest.mark.parametrize("tile_id", ["-500_5600", "--help", "-", "/x", ".-a", "."])
+def test_no_folder_begins_like_an_option_or_is_hidden(tile_id):
+    name = safe_name(tile_id)
+    assert name[0] not in "-."
+    check([tile_id, "500_5600"])
+    with pytest.raises(CatalogError, match="give the same file names"):
+        check([tile_id, name])
+
+
 def test_longest_id_gives_file_names_below_255_bytes():
     names = [safe_name(tile_id) for tile_id in ("x" * MAX_BYTES, "/" * MAX_BYTES, "道" * (MAX_BYTES // 3))]
     ends = [kind.suffix for several in KINDS.values() for kind in several]

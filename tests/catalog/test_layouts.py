@@ -1,6 +1,7 @@
 """Files of GeRoD are found in any of the layouts that the published archive may have."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,17 @@ def test_strata_of_a_table_are_found(tmp_path, name):
     found, notes = layouts.find(root)
     assert notes == []
     assert {file.tile: file.stratum for file in found} == IDS
+
+
+def test_pipes_among_the_files_are_left_out(tmp_path):
+    root = make(tmp_path / "data", LAYOUTS["points"])
+    for name in ("strata.csv", "rural/381250_5759750.npz", "rural/381250_5759500_dsm.tif"):
+        os.mkfifo(root / name)
+    result = index(root, LAYOUT, GEROD, derived=tmp_path / "points")
+    assert [tile.id for tile in result.tiles] == sorted(IDS)
+    assert any(note.startswith("strata.csv was not read: cannot be read: not a reg") for note in result.notes)
+    assert len(result.left_out) == 2
+    assert all("is not a regular file; replace it by one" in line for line in result.left_out)
 
 
 def test_strata_of_a_damaged_table_are_a_note(tmp_path):

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexroad.catalog import LAYERS, Grid, Layer, Tile
+from flexroad.catalog.grid import overlap
 from flexroad.catalog.tile import BORDER_LAYERS, LOADED, by_cover
 from flexroad.tasks import load
 
@@ -125,3 +126,23 @@ def test_common_order_is_by_name_unless_files_overlap(first, second):
         assert touched.files == ("c_2022",)
     assert orders[0] == orders[1]
     assert orders[0].files == ("a", "c_2022", "b_2020", "b_2018", "d")
+
+
+def test_files_around_a_tile_are_compared_once_for_all_layers(monkeypatch):
+    compared, side = [], 15
+
+    def counted(one, other, tolerance=0.0):
+        compared.append(one)
+        return overlap(one, other, tolerance)
+
+    monkeypatch.setattr("flexroad.catalog.tile.overlap", counted)
+    corners = [(20.0 * col, 20.0 * row) for col in range(side) for row in range(side)]
+    extents = tuple((west, south, west + 20, south + 20) for west, south in corners)
+    names = tuple(f"{number:03}" for number in reversed(range(len(extents))))
+    for layer in (Layer(name, names, (), None, extents) for name in LAYERS[:4]):
+        for place in range(8):
+            west = 100.0 + 20 * place
+            numbers = layer.in_common_order((west - 30, 100.0, west + 30, 120.0))
+            found = [(west + step, 100.0) for step in (20, 0, -20, -40)]
+            assert [corners[number] for number in numbers] == found
+    assert len(compared) < 20 * len(extents)

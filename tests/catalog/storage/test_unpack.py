@@ -1,6 +1,7 @@
 """A zip archive is unpacked beside itself if it is complete, has its checksum, and is no bomb."""
 
 import hashlib
+import os
 import shutil
 import zipfile
 from collections import namedtuple
@@ -105,6 +106,12 @@ def test_archive_damaged_as_published_is_one_line_and_leaves_nothing(tmp_path):
     ):
         unpack(archive, sha256(archive), quietly, lambda line: None)
     assert [path.name for path in tmp_path.iterdir()] == ["GeRoD.zip"]
+
+
+def test_pipe_with_the_name_of_an_archive_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "GeRoD.zip")
+    with pytest.raises(CatalogError, match=r"GeRoD.zip is not a regular file; replace it by one"):
+        unpack(tmp_path / "GeRoD.zip", "0000", quietly, lambda line: None)
 
 
 def test_archive_larger_than_the_free_disk_is_refused_before_its_checksum(tmp_path, monkeypatch):

@@ -105,6 +105,18 @@ def test_dry_run_and_check_say_what_would_fail(survey, flexroad, tmp_path):
     assert line in flexroad("catalog", "check", survey).expected(1).out.splitlines()
 
 
+def test_tiles_on_the_same_place_are_named_by_check_and_run(survey, flexroad, tmp_path):
+    catalog = Catalog.read(survey)
+    assert catalog.same_places() == ""
+    twin = replace(catalog.tiles[0], id="twin")
+    Catalog((*catalog.tiles, twin)).write(survey)
+    note = f"tiles on the same place: {catalog.tiles[0].id} and twin; their results cover each other"
+    assert note in flexroad("catalog", "check", survey).out.splitlines()
+    words = ("--config", "paper", "--catalog", survey, "--out", tmp_path / "run", "--tile", twin.id)
+    said = flexroad("run", *words, catalog.tiles[0].id, "--set", "fit.iterations=2")
+    assert f"note: {note}" in said.err.splitlines()
+
+
 def test_dsm_of_several_tiles_is_opened_once(tmp_path, monkeypatch):
     for name in ("dsm", "dtm", "road_mask"):
         write(tmp_path / f"{name}.tif", np.ones((250, 1000), np.float32), 295500)

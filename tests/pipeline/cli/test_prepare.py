@@ -156,7 +156,7 @@ def test_prepare_misspelt_option_suggests_the_right_one(cloud, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_prepare_interrupted_leaves_no_folder(cloud, tmp_path, number):
     out = tmp_path / "out"
     with subprocess.Popen(

@@ -120,7 +120,7 @@ def test_killed_export_goes_on_to_the_same_bytes(made_city, whole, tmp_path, nam
         goes_on(made_city, name, out, folder)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("name", FORMATS)
 def test_interrupted_export_has_exit_code_130_and_goes_on(made_city, whole, tmp_path, name, number):
     folder, numbers = whole

@@ -12,6 +12,7 @@ from flexroad.catalog.storage.paths import listing
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run import garbage
 from flexroad.pipeline.run.garbage import delete, exclusive, find_garbage
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
@@ -147,6 +148,34 @@ def test_clean_keeps_foreign_files_and_deletes_temporary_files(made, tmp_path):
     assert all(path.exists() for path in foreign)
     assert not any(path.exists() for path in killed)
     assert len(deleted["temporary files"]) == len(killed)
+
+
+def test_clean_keeps_what_is_written_to_the_store_meanwhile(made, tmp_path, monkeypatch):
+    run = made(tmp_path / "run", (QUICK, 1), (LATER, 1))
+    unneeded = clean(run)["artefacts"]
+    name = f"{'ab' * 16}"
+    old, new = (tmp_path / "run" / "store" / "fit" / name[:2] / f"{name[:-1]}{end}.npz" for end in "01")
+    temporaries = [path.with_name(f".{path.name}.{'0' * 32}.tmp") for path in (old, new)]
+    needed = garbage._needed
+
+    def written(runs):
+        for path in (new, temporaries[1]):
+            path.write_bytes(b"")
+        return needed(runs)
+
+    old.parent.mkdir(exist_ok=True)
+    for path in (old, temporaries[0]):
+        path.write_bytes(b"")
+    monkeypatch.setattr(garbage, "_needed", written)
+    assert clean(run) == {
+        "artefacts": {str(old.relative_to(tmp_path))},
+        "temporary files": {str(temporaries[0].relative_to(tmp_path))},
+    }
+    assert unneeded
+    assert new.exists()
+    assert temporaries[1].exists()
+    monkeypatch.undo()
+    assert new.name in {Path(path).name for path in clean(run)["artefacts"]}
 
 
 def test_find_garbage_deletes_nothing(made, tmp_path):

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import json
+import os
 import sqlite3
 from collections import Counter
 from dataclasses import replace
@@ -201,6 +202,38 @@ def test_database_damaged_while_open_is_made_anew(size, full):
         assert database.listed(TILES).counts == {"done": len(TILES)}
     with RunDatabase.open_readonly(full) as database:
         assert database.listed(TILES).counts == {"done": len(TILES)}
+
+
+def test_damaged_database_on_a_full_disk_says_so_until_there_is_space(full, monkeypatch):
+    def no_space(path, *_):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    with RunDatabase.open(full) as database:
+        database._connection.execute("PRAGMA cache_size = 1")
+        full.write_bytes(b"\xff" * 8192)
+        monkeypatch.setattr("flexroad.pipeline.store.database.create", no_space)
+        for number in ("1_1", "4_4"):
+            database.record(entry(number))
+            with pytest.raises(OSError, match="No space left on device"):
+                database.flush()
+        database._pending.clear()
+        with pytest.raises(OSError, match=f"it is damaged and could not be made anew: .*{NAME}"):
+            list(database.states())
+        monkeypatch.undo()
+        database.record(entry("4_4"))
+    with RunDatabase.open_readonly(full) as database:
+        assert database.get("4_4") == entry("4_4")
+
+
+@pytest.mark.parametrize("mask", [0o002, 0o022, 0o077])
+def test_database_has_the_rights_that_the_umask_gives(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        with RunDatabase.open(tmp_path / NAME) as database:
+            database.set_states([("a", "pending")])
+    finally:
+        os.umask(before)
+    assert (tmp_path / NAME).stat().st_mode & 0o777 == 0o666 & ~mask
 
 
 def test_file_that_calls_itself_read_only_is_replaced(full):
