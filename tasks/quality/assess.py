@@ -64,7 +64,7 @@ class Options(base.Options):
         0.5,
         gt=0,
         description="flag worst-error: largest estimated error of a connected 25 m2 of road (m); sound roads "
-        "have less than 0.3",
+        "have at most 0.32",
     )
     suspect_m2: float = Field(
         50.0, gt=0, description="flag patch: largest patch of road farther than agree_m from DSM and DTM (m2)"

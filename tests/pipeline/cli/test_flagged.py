@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import os
 from pathlib import Path
 
 import geopandas
@@ -158,3 +159,20 @@ def test_lifted_opendrive_names_road_over_heap(run, flexroad, tmp_path):
     flexroad("lift", source, run, "-o", tmp_path / "x.xodr", "--report", report).expected(0)
     rows = list(csv.DictReader(report.open()))
     assert [RAISED in row["flags"] for row in rows] == [True, False]
+
+
+def test_flags_of_tile_with_changed_sources_are_the_last_ones_or_unknown(run, flexroad):
+    dsm, results, aside = run.parent / "dsm.tif", run / "store" / "assess", run.parent / "aside"
+    before = dsm.stat()
+    os.utime(dsm, ns=(before.st_atime_ns, before.st_mtime_ns + 10**9))
+    try:
+        last, _ = profile(flexroad, run, OVER, 1)
+        results.rename(aside)
+        unknown, said = profile(flexroad, run, OVER, 1)
+    finally:
+        if aside.exists():
+            aside.rename(results)
+        os.utime(dsm, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert last["flags"].str.contains(RAISED).any()
+    assert set(unknown["flags"]) == {"unknown"}
+    assert "sources or options of 1 tile have changed" in said
