@@ -191,7 +191,7 @@ def use_own_values(variables: MutableMapping[str, str] = os.environ) -> str:
     file = variables.get(FILE)
     if file is None:
         usual = Path(variables.get("HOME", "/"), ".gdal", "gdalrc")
-        ignored += [str(usual)] if usual.is_file() else []
+        ignored += [f"{usual} (avoid this with {FILE}=)"] if usual.is_file() else []
     elif file:
         ignored.append(f"{FILE}={file}")
     variables[FILE] = ""

@@ -38,7 +38,7 @@ def test_configuration_files_of_gdal_are_turned_off_and_named(tmp_path):
     file.parent.mkdir()
     file.write_text("[configoptions]\nGTIFF_IGNORE_READ_ERRORS=YES\n")
     for variables, named in (
-        ({}, str(file)),
+        ({}, f"{file} (avoid this with {FILE}=)"),
         ({FILE: "/etc/gdal"}, f"{FILE}=/etc/gdal"),
     ):
         variables["HOME"] = str(tmp_path)
