@@ -72,7 +72,8 @@ class _Signals:
         self.stop_raising()
         for number, handler in self.before.items():
             # After an interruption a signal that comes with the first one must not change the exit code.
-            signal.signal(number, handler if self.first_s is None else self._late)
+            late = self.first_s is not None and signal.getsignal(number) == self._interrupt
+            signal.signal(number, self._late if late else handler)
         signal.set_wakeup_fd(self.wakeup)
         os.close(self.send)
         sys.unraisablehook, sys.excepthook = self.hooks
