@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
-from itertools import islice
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid, overlap
@@ -124,7 +123,8 @@ def _overlapped(extents: tuple[Bounds, ...]) -> list[set[int]]:
     before: list[set[int]] = [set() for _ in extents]
     eastward = sorted(range(len(extents)), key=extents.__getitem__)
     for start, one in enumerate(eastward, 1):
-        for other in islice(eastward, start, None):
+        for place in range(start, len(eastward)):
+            other = eastward[place]
             if extents[one][2] - extents[other][0] <= TOUCH_M:
                 # All further ones begin farther east.
                 break

@@ -58,7 +58,7 @@ class _Signals:
     def __enter__(self) -> None:
         self.before = {number: signal.getsignal(number) for number in NUMBERS}
         self.hooks = sys.unraisablehook, sys.excepthook
-        sys.unraisablehook, sys.excepthook = self._lost, self._print
+        sys.unraisablehook, sys.excepthook = self._lost, self._show
         received, self.send = os.pipe()
         os.set_blocking(self.send, False)
         threading.Thread(target=_watch, args=(received,), name="signals", daemon=True).start()
@@ -72,7 +72,8 @@ class _Signals:
         self.stop_raising()
         for number, handler in self.before.items():
             # After an interruption a signal that comes with the first one must not change the exit code.
-            signal.signal(number, handler if self.first_s is None else self._late)
+            late = self.first_s is not None and signal.getsignal(number) == self._interrupt
+            signal.signal(number, self._late if late else handler)
         signal.set_wakeup_fd(self.wakeup)
         os.close(self.send)
         sys.unraisablehook, sys.excepthook = self.hooks
@@ -107,7 +108,7 @@ class _Signals:
         elif self.raising:
             signal.setitimer(signal.ITIMER_REAL, SOON_S, AGAIN_S)
 
-    def _print(self, kind: type[BaseException], *error: Any) -> None:
+    def _show(self, kind: type[BaseException], *error: Any) -> None:
         """Print an error, but for a lost interrupt, whose traceback Cython prints."""
         if not issubclass(kind, KeyboardInterrupt):
             self.hooks[1](kind, *error)

@@ -115,6 +115,14 @@ def test_without_signal_handlers_are_as_before():
     assert signal.set_wakeup_fd(wakeup) == -1
 
 
+def test_signal_that_is_ignored_stays_ignored_after_an_interruption():
+    with same_signals():
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        with pytest.raises(KeyboardInterrupt), signals_interrupt():
+            interrupt()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+
+
 IN_LIBRARY = """
     import ctypes
     from flexroad.pipeline.cli.signals import signals_interrupt
