@@ -16,7 +16,7 @@ from tests.permissions import permissions_enforced
 from .conftest import OPTIONS, contents
 
 DATUM = ("--height-offset", "47.5")
-WRITTEN_WHOLE = ("mosaic", "pmtiles")
+WRITTEN_WHOLE = ("mosaic",)
 """Formats that have no markers: each export writes them again."""
 each_format = pytest.mark.parametrize("name", FORMATS)
 
