@@ -32,7 +32,7 @@ SEPARATOR = "."
 CHANGES = ".changes"
 """End of the name of faces that are stored as differences from the face before, in a quarter of the bytes."""
 LEVELS = ("level", "levels", "structures")
-"""Fields that are left out if they are empty: results without levels have the header of earlier versions."""
+"""Fields that are left out if they are empty: most results have no levels."""
 SHA256_BYTES = 32
 
 
@@ -70,9 +70,8 @@ def decode(data: bytes) -> Stored:
     with np.load(io.BytesIO(payload), allow_pickle=False) as archive:
         arrays = dict(_arrays(archive))
     header = json.loads(arrays.pop(HEADER).tobytes())
-    # Stores of earlier versions have no notes.
-    notes = tuple(header.get("notes", ()))
-    return Stored(_result(header["type"], header["fields"], "", arrays), header["seconds"], notes)
+    value = _result(header["type"], header["fields"], "", arrays)
+    return Stored(value, header["seconds"], tuple(header["notes"]))
 
 
 def _fields(value: Any, prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:

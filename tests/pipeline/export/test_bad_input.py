@@ -157,14 +157,6 @@ def test_files_of_others_in_the_folder_of_another_format_are_refused(made_city, 
     assert (tmp_path / "mosaic" / "height.tif").read_text() == "mine"
 
 
-def test_export_of_an_earlier_version_goes_on(made_city, flexroad, tmp_path):
-    words = ["export", made_city.path, "--format", "obj", "-o", tmp_path]
-    flexroad(*words).expected(0)
-    (tmp_path / BEGUN).unlink()
-    flexroad(*words).expected(0)
-    assert (tmp_path / BEGUN).read_text() == "obj\n"
-
-
 def test_folder_that_another_export_writes_is_refused(made_city, refused, flexroad, tmp_path):
     words = [made_city.path, "--format", "obj", "-o", tmp_path]
     with run_lock(tmp_path):
