@@ -210,7 +210,7 @@ def _field(fields: dict[str, Any], name: str, kind: type, place: str = "") -> An
 
 
 def _optional(fields: dict[str, Any], name: str, kind: type, place: str = "") -> Any:
-    """Return a field's value, None if it has none: older catalogs do not have all fields."""
+    """Return a field's value, None if it has none: catalogs of other programs do not have all fields."""
     return None if fields.get(name) is None else _field(fields, name, kind, place)
 
 
@@ -321,7 +321,7 @@ def _label(properties: dict[str, Any], name: str) -> str:
 
 
 def _extents(asset: dict[str, Any], files: int) -> tuple[Bounds, ...]:
-    # Older catalogs do not have this field.
+    # Catalogs of other programs do not have this field.
     values = asset.get("flexroad:extents")
     if values is None:
         return ()

@@ -49,7 +49,7 @@ class Layer:
     """CRS of files without one."""
     extents: tuple[Bounds, ...] = ()
     """West, south, east and north of each file (m, in the tile's CRS), in the order of ``files``; empty where
-    they are unknown (published datasets, older catalogs): each file may then lie anywhere."""
+    they are unknown (published datasets): each file may then lie anywhere."""
     reproject: bool = False
     """Whether rasters in another CRS than the tile's are warped when they are read, or are an error."""
     sublayer: str | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
@@ -14,10 +14,6 @@ class Options(BaseModel):
     """Base of the stages' option models: frozen; unknown keys, NaN and infinity raise an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    LATER: ClassVar[tuple[str, ...]] = ()
-    """Options that a later version added: at their default they are no part of fingerprints, so that stored
-    results stay valid."""
 
 
 def stage_module(options: Options) -> ModuleType:

@@ -1,7 +1,6 @@
 """Sample the surface to a mesh: the paper's step D, "Dynamic Surface Sampling".
 
 dynamic: points at ``road_m`` on the road and at ``terrain_m`` elsewhere, joined by Delaunay triangulation;
-adaptive: as few points as keep the mesh within a tolerance of the surface (`tasks.meshing.adaptive`);
 uniform: a regular grid of triangles (RGT); corners: the two triangles of a plane.
 
 The lattices are anchored at the south-west corner of the domain: the hull of the core's cell centres where
@@ -11,14 +10,13 @@ the points on the border and their heights are those of the neighbours too: the 
 A dynamic mesh has edges along the limit of the survey and ends there (`tasks.meshing.survey_limit`). If the
 roads are polygons, it has edges along their outlines, too (`tasks.meshing.road_outline`).
 
-With levels, dynamic and adaptive meshes have one part per level, which share no vertex. A deck or tube ends
-at its outline, and meets level 0 on its joints (`tasks.meshing.joint_lines`).
+With levels, dynamic meshes have one part per level, which share no vertex. A deck or tube ends at its
+outline, and meets level 0 on its joints (`tasks.meshing.joint_lines`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -29,11 +27,9 @@ from pydantic import Field, model_validator
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.meshing.adaptive import Area, adaptive, free_sides, thinned
 from flexroad.tasks.meshing.breaklines import breaklines
 from flexroad.tasks.meshing.joint_lines import (
     JoinedGround,
-    JoinedOutline,
     LevelOutline,
     level_outline,
     without_joints,
@@ -57,7 +53,6 @@ from flexroad.tasks.spline.mesh_border import (
     SAME_M,
     border_heights,
     border_points,
-    border_sides,
     joined,
     on_border,
 )
@@ -70,8 +65,6 @@ VERSION = 5
 SMOOTH_M = 1.5
 """Distance from the road up to which a mesh without breaklines has no steps (m): faces between road and
 terrain would be steep, and those on the road's edge count as road."""
-PROBES = 2
-"""Probes of an adaptive mesh per ``road_m``: places where it is compared with the surface."""
 FEW = 0.1
 """Share of the points below which it takes longer to find the squares of a lattice than to do without."""
 
@@ -79,22 +72,15 @@ FEW = 0.1
 class Options(base.Options):
     """Where the surface is sampled."""
 
-    method: Literal["dynamic", "adaptive", "uniform", "corners"] = Field(
+    method: Literal["dynamic", "uniform", "corners"] = Field(
         "dynamic",
-        description="dynamic: fine on roads, coarse elsewhere; adaptive: fine where the surface bends; "
-        "uniform: road_m everywhere; corners: a plane",
+        description="dynamic: fine on roads, coarse elsewhere; uniform: road_m everywhere; corners: a plane",
     )
     road_m: float = Field(1.0, ge=0.05, description="spacing of samples on roads, the paper's s^r (m)")
     terrain_m: float = Field(10.0, ge=0.05, description="spacing of samples elsewhere, the paper's s^t (m)")
     mask: Literal["raw", "filtered"] = Field(
         "raw",
         description="road mask for sampling: raw: as segmented, M^r; filtered: as kept by ECSRC, M^{r+}",
-    )
-    tolerance_m: float = Field(
-        0.005, ge=0.0005, description="adaptive: largest distance of the mesh from the surface on roads (m)"
-    )
-    terrain_tolerance_m: float = Field(
-        0.2, ge=0.0005, description="adaptive: largest distance of the mesh from the surface elsewhere (m)"
     )
     breaklines: bool = Field(
         False,
@@ -148,14 +134,10 @@ def sample(
     if isinstance(surface, SteppedSurface) and not options.breaklines:
         on_road = road.mask[road.grid.window(road.core)]
         surface = surface.without_steps_near(on_road, SMOOTH_M, frame)
-    if isinstance(surface, LevelledSurface) and options.method in ("dynamic", "adaptive"):
+    if isinstance(surface, LevelledSurface) and options.method == "dynamic":
         return _levels(surface, road, mask, local, options, frame)
     if options.method == "dynamic":
         return _dynamic(surface, road, mask, local, options, frame)
-    if options.method == "adaptive":
-        if isinstance(surface, MovingNurbs):
-            raise TaskError("sample.method adaptive needs a surface over plan; use dynamic with plan: moving")
-        return _adaptive(surface, road, mask, local, options, frame)
     step = options.road_m if options.method == "uniform" else np.inf
     points, faces = _regular(surface, origin, local, step, frame)
     if isinstance(surface, MovingNurbs):
@@ -211,8 +193,7 @@ def _levels(
     """Return the mesh of all levels; they meet on joints and share no vertex."""
     every = (level_outline(own.level, road.core, local, options.road_m) for own in surface.levels)
     outlines = [outline for outline in every if outline]
-    method = _dynamic if options.method == "dynamic" else _adaptive
-    first = method(surface, road, mask, local, options, frame, outlines)
+    first = _dynamic(surface, road, mask, local, options, frame, outlines)
     meshes, ground = {0: first}, first.vertices + np.array([0.0, 0.0, first.origin[2]])
     for outline in outlines:
         if not outline.area.is_empty:
@@ -244,29 +225,12 @@ def _other_level(
     if limit:
         area = shapely.intersection(area, limit.covered)
         lines.append(parts_of(limit.lines))
-    part = Area(
-        origin=road.core.origin,
-        local=local,
-        outline=RoadOutline(area, outline.lines),
-        limit=None,
-        lines=lines,
-        step=options.road_m / PROBES,
-        tolerance_m=options.tolerance_m,
-        terrain_tolerance_m=options.terrain_tolerance_m,
-    )
-    adapted = options.method == "adaptive"
-    border = (
-        _thinned_border(surface, road, part, options, frame)
-        if adapted
-        else _dynamic_border(surface, road, local, options, frame, lines)
-    )
+    border = _dynamic_border(surface, road, local, options, frame, lines)
     border = outline.with_shared(border, ground, local)
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
     covered = SurveyLimit(
         shapely.multilinestrings(plan[segments]), outline.covered(area, plan[segments], local)
     )
-    if adapted:
-        return adaptive(surface, replace(part, limit=covered), border, SAME_M)
     free = _lattice(surface, road, np.ones_like(road.mask), local, options.road_m)
     free = free[covered.covers(free) & ~on_border(free, local)]
     free = free[apart_from(free, lines, options.road_m / 2)]
@@ -343,76 +307,6 @@ def _in_space(points: Floats, surface: MovingNurbs, origin: tuple[float, float])
     moved = np.column_stack([*places, points[:, 2]])
     moved[:, :2] += np.subtract(surface.origin, origin)
     return moved[np.isfinite(moved).all(axis=1)]
-
-
-def _outline(
-    road: RoadMask, mask: Bools, local: Bounds, options: Options, frame: Frame | None
-) -> RoadOutline:
-    """Return the outline of roads: that of their polygons, else lines between road and other cells."""
-    core, raw = road.core, options.mask == "raw"
-    if road.areas is not None and raw:
-        return road_outline(road.areas, local, np.inf)
-    cells = mask[road.grid.window(core)]
-    if frame:
-        cells = frame.road(cells, raw)
-    corner = core.west - core.origin[0], core.north - core.origin[1]
-    between = survey_limit(~cells, corner, core.cell, local)
-    return RoadOutline(between.covered, parts_of(between.lines))
-
-
-def _adaptive(
-    surface: Surface,
-    road: RoadMask,
-    mask: Bools,
-    local: Bounds,
-    options: Options,
-    frame: Frame | None,
-    others: Sequence[LevelOutline] = (),
-) -> Mesh:
-    """Return the mesh of few points within the tolerances, with roads and the survey's limit as edges.
-
-    Parameters
-    ----------
-    others : sequence of LevelOutline
-        The other levels: their joints are edges, too.
-    """
-    limit, outline = _limit(road, local, frame), _outline(road, mask, local, options, frame)
-    if others:
-        outline = JoinedOutline.of(outline, others)
-    lines = [outline.lines] if limit is None else [outline.lines, parts_of(limit.lines)]
-    lines += [part for other in others for part in (other.joints, other.feet)]
-    step, joined = options.road_m / PROBES, _joined_ground(surface, road, others)
-    area = Area(road.core.origin, local, outline, limit, lines, step, *_tolerances(options))
-    border = _thinned_border(joined or surface, road, area, options, frame)
-    points, faces = adaptive(joined or surface, area, border, SAME_M)
-    return _mesh(points, faces, road, mask, outline)
-
-
-def _tolerances(options: Options) -> tuple[float, float]:
-    """Return the tolerances of an adaptive mesh (m), on roads and elsewhere."""
-    return options.tolerance_m, options.terrain_tolerance_m
-
-
-def _thinned_border(
-    surface: Surface, road: RoadMask, area: Area, options: Options, frame: Frame | None
-) -> Floats:
-    """Return the border points of an adaptive mesh, ``(n, 3)``."""
-    local = area.local
-    if frame:
-        dense = [axis(0.0, local[i + 2] - local[i], area.step, to_end=True) for i in (0, 1)]
-        raw = options.mask == "raw"
-        crossed = raw and road.areas is not None
-        sides = border_sides(frame, local, road.core.cell, dense, raw, crossed, area.step / 2)
-    else:
-        sides = free_sides(area, ends_at_border(area.lines, local))
-    border = []
-    for plan, needed, on_road in sides:
-        place = (plan + road.core.origin).T
-        z = border_heights(surface, *place) if frame else surface.height(*place)
-        along = np.abs(plan - plan[0]).sum(axis=1)
-        kept = thinned(along, z, np.where(on_road, *_tolerances(options)), needed)
-        border.append(np.column_stack([plan, z])[kept])
-    return np.concatenate(border)
 
 
 def _limit(road: RoadMask, local: Bounds, frame: Frame | None) -> SurveyLimit | None:

@@ -1,15 +1,12 @@
 """Vertices of exported files, read literally by the formats' specifications."""
 
 import gzip
-import io
 import json
 from xml.etree import ElementTree
 
 import numpy as np
 import shapely
 import trimesh
-from PIL import Image
-from pmtiles.reader import MmapSource, Reader, all_tiles
 from pyproj import Transformer
 
 from flexroad.pipeline.export.source import select
@@ -109,39 +106,6 @@ def tiles3d(folder, crs):
             x, y, _ = back.transform(*placed.T)
             points.append(np.column_stack([x, y, geographic.transform(*placed.T)[2] - OFFSET_M]))
     return np.concatenate(points)
-
-
-def heightfields(folder, names="*"):
-    """The nodes of all fields, and the precision that the files say."""
-    points, precision = [], 0.0
-    for file in sorted(folder.glob(f"{names}_heightfield.json")):
-        place = json.loads(file.read_text())
-        west, south, east, north = place["bounds"]
-        columns, rows = place["size"]
-        values = np.asarray(Image.open(file.with_suffix(".png")), float)
-        x, y = np.meshgrid(np.linspace(west, east, columns), np.linspace(north, south, rows))
-        heights = place["low_m"] + values * place["step_m"]
-        points.append(np.column_stack([x.ravel(), y.ravel(), heights.ravel()]))
-        precision = max(precision, place["precision_m"])
-    return np.concatenate(points), precision
-
-
-def pmtiles_pixels(path):
-    """x, y (m, Web Mercator) and height of the pixels that have one, of each map tile of the finest level."""
-    with path.open("rb") as stream:
-        archive = MmapSource(stream)
-        none, finest = Reader(archive).metadata()["no_height_m"], Reader(archive).header()["max_zoom"]
-        half = np.pi * 6378137
-        side = 2 * half / 2**finest
-        for (zoom, column, row), data in all_tiles(archive):
-            if zoom < finest:
-                continue
-            red, green, blue = np.moveaxis(np.asarray(Image.open(io.BytesIO(data)), float), -1, 0)
-            height = red * 256 + green + blue / 256 - 32768
-            parts = (np.arange(len(height)) + 0.5) / len(height)
-            x, y = np.meshgrid((column + parts) * side - half, half - (row + parts) * side)
-            known = height != none
-            yield x[known], y[known], height[known]
 
 
 def vertices(out, crs="EPSG:25832"):

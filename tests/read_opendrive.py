@@ -40,33 +40,13 @@ def polynomial(element: ET.Element, path: str, s: float, key: str = "s") -> floa
     return a + b * (s - at) + c * (s - at) ** 2 + d * (s - at) ** 3
 
 
-def shape(element: ET.Element, s: float, t: float) -> float:
-    """Return the height of the shapes at s and t, linear between their cross-sections; 0 without any."""
-    rows = element.findall("lateralProfile/shape")
-    starts = sorted({float(row.attrib["s"]) for row in rows})
-    if not starts:
-        return 0.0
-
-    def height(start: float) -> float:
-        own = [row for row in rows if float(row.attrib["s"]) == start]
-        found = [row for row in own if float(row.attrib["t"]) <= t] or own[:1]
-        at, a, b, c, d = numbers(found[-1], "t", "a", "b", "c", "d")
-        return a + b * (t - at) + c * (t - at) ** 2 + d * (t - at) ** 3
-
-    before = max(start for start in starts if start <= s)
-    after = min((start for start in starts if start > s), default=before)
-    share = (s - before) / (after - before) if after > before else 0.0
-    return height(before) * (1 - share) + height(after) * share
-
-
 def place(element: ET.Element, at: tuple[float, float, float], s: float, t: float) -> np.ndarray:
-    """Return x, y, z at s and t: elevation, superelevation and shape, with the plan at s."""
+    """Return x, y, z at s and t: elevation and superelevation, with the plan at s."""
     x, y, heading = at
     lateral = element.findall("lateralProfile/superelevation")
     turn = polynomial(element, "lateralProfile/superelevation", s) if lateral else 0.0
-    high = shape(element, s, t)
-    aside = t * cos(turn) - high * sin(turn)
-    z = polynomial(element, "elevationProfile/elevation", s) + t * sin(turn) + high * cos(turn)
+    aside = t * cos(turn)
+    z = polynomial(element, "elevationProfile/elevation", s) + t * sin(turn)
     return np.array([x - aside * sin(heading), y + aside * cos(heading), z])
 
 

@@ -38,7 +38,7 @@ def test_command_line_starts_without_heavy_libraries(module):
     assert done.stdout.strip() == "[]"
 
 
-SCRIPTS = sorted([*(ROOT / "experiments").glob("*.py"), *(ROOT / "tests" / "bench").glob("*.py")])
+SCRIPTS = sorted((ROOT / "tests" / "bench").glob("*.py"))
 
 
 @pytest.mark.slow

@@ -9,9 +9,8 @@ import yaml
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PINS = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().split())
-RECIPES = {
-    path.parent.name: yaml.safe_load(path.read_text()) for path in (ROOT / "recipe").glob("*/recipe.yaml")
-}
+FOLDER = ROOT / "docs" / "operations" / "conda"
+RECIPES = {path.parent.name: yaml.safe_load(path.read_text()) for path in FOLDER.glob("*/recipe.yaml")}
 CONDA = {
     "dask[distributed]": ("dask-core", "distributed"),
     "isal": ("python-isal",),
@@ -54,7 +53,7 @@ def test_recipe_has_name_version_licence_and_command_of_the_project():
         project["license"],
         project["description"],
     )
-    assert (ROOT / "recipe" / "flexroad" / recipe["source"]["path"]).resolve() == ROOT
+    assert (FOLDER / "flexroad" / recipe["source"]["path"]).resolve() == ROOT
 
 
 def test_recipe_of_startinpy_has_the_tested_version():

@@ -38,8 +38,8 @@ def export(
         typer.Option(
             "--format",
             metavar="NAME",
-            help="Formats, separated by commas: 3dtiles, landxml, cityjson, obj, heightfield, step, 3dm, "
-            "crg, xodr, lines, mosaic, pmtiles.",
+            help="Formats, separated by commas: 3dtiles, landxml, cityjson, obj, step, crg, xodr, "
+            "lines, mosaic.",
             rich_help_panel=OUTPUTS,
         ),
     ],

@@ -53,13 +53,9 @@ def lift(
         typer.Option(min=0.0001, metavar="METRES", help="Largest distance of profiles from the surface (m)."),
     ] = 0.005,
     lateral: Annotated[
-        Literal["superelevation", "shape", "none"],
+        Literal["superelevation", "none"],
         typer.Option(help="What roads of OpenDRIVE have across."),
     ] = "superelevation",
-    crg: Annotated[
-        bool,
-        typer.Option("--crg", help="Also write the surface of each road of OpenDRIVE as OpenCRG."),
-    ] = False,
     beyond: Annotated[
         Literal["keep", "flat"],
         typer.Option(help="Heights where the run has no surface: as they are, or level from there on."),
@@ -124,7 +120,6 @@ def lift(
     wanted = Options(
         tolerance_m=tolerance,
         lateral=lateral,
-        crg=crg,
         flat_ends=beyond == "flat",
         add_vertices=vertices,
         columns=columns,

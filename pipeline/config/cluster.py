@@ -14,16 +14,16 @@ from flexroad.tasks.options import Options
 DEFAULT_TIMEOUT_S = 3600
 """Time limit of a tile if the configuration gives none."""
 DEFAULT_MEMORY_BYTES = 4 * 1024**3
-"""Memory of one SLURM or Kubernetes worker if the configuration gives none."""
+"""Memory of one SLURM worker if the configuration gives none."""
 
 
 class Cluster(Options):
     """The workers that process the tiles; `--workers` and `--scheduler` override it for one command."""
 
-    kind: Literal["local", "slurm", "kubernetes"] = Field(
+    kind: Literal["local", "slurm"] = Field(
         "local",
-        description="local: processes of this machine; slurm, kubernetes: workers requested there "
-        "(pip install 'flexroad[slurm]' or 'flexroad[kubernetes]')",
+        description="local: processes of this machine; slurm: workers requested there "
+        "(pip install 'flexroad[slurm]')",
     )
     workers: int | None = Field(
         None,
@@ -35,7 +35,7 @@ class Cluster(Options):
         None,
         ge=100 * 1024**2,
         description="memory of each worker, as 4 GiB; a value starts workers for any tile; by default an "
-        "equal share of this machine's memory, on slurm and kubernetes 4 GiB; a tile that needs more is "
+        "equal share of this machine's memory, on slurm 4 GiB; a tile that needs more is "
         "stopped and becomes a failed row",
     )
     tile_timeout_s: float = Field(
@@ -54,8 +54,8 @@ class Cluster(Options):
     security: Literal["tls", "none"] = Field(
         "tls",
         description="tls: scheduler and workers answer only processes with certificates made for this "
-        "command; none: whoever reaches their ports can run programs as you; kubernetes has no tls; for "
-        "--scheduler Dask's own configuration counts",
+        "command; none: whoever reaches their ports can run programs as you; for --scheduler "
+        "Dask's own configuration counts",
     )
     flush: bool = Field(
         True,
@@ -66,8 +66,7 @@ class Cluster(Options):
         3600,
         gt=0,
         le=604_800,
-        description="slurm, kubernetes: waiting time for the first worker, and for a new one when all "
-        "are lost (s)",
+        description="slurm: waiting time for the first worker, and for a new one when all are lost (s)",
     )
     walltime_h: float = Field(8, gt=0, le=10_000, description="slurm: time limit of each job (hours)")
     queue: str | None = Field(None, min_length=1, description="slurm: partition (-p)")
@@ -80,8 +79,6 @@ class Cluster(Options):
     prologue: tuple[str, ...] = Field(
         (), description="slurm: shell lines run before a worker starts, as module load gdal"
     )
-    image: str | None = Field(None, min_length=1, description="kubernetes: image of scheduler and workers")
-    namespace: str | None = Field(None, min_length=1, description="kubernetes: namespace of the pods")
 
     @property
     def needs_workers(self) -> bool:
@@ -93,7 +90,7 @@ class Cluster(Options):
     def programs(self) -> dict[str, Any]:
         """The given options that can start programs, or let others do so.
 
-        These are those of free text, in a job's script or a pod, and ``security: none``.
+        These are those of free text, in a job's script, and ``security: none``.
         """
         fields = type(self).model_fields.items()
         texts = {name for name, field in fields if get_origin(field.annotation) is not Literal} | {"security"}

@@ -27,8 +27,8 @@ def check_levels(chain: Mapping[str, Any], where: str) -> None:
         (chain["fit"].method == "smoothing_spline", f"fit: smoothing_spline, not {chain['fit'].method}"),
         (load.halo_m >= HALO_M, f"load.halo_m of {HALO_M:g} or more, not {load.halo_m:g}"),
         (
-            sample.method in ("dynamic", "adaptive"),
-            f"sample.method dynamic or adaptive, not {sample.method}",
+            sample.method == "dynamic",
+            f"sample.method dynamic, not {sample.method}",
         ),
         (sample.mask == "raw", f"sample.mask raw, not {sample.mask}"),
     ]

@@ -22,19 +22,6 @@ from flexroad.pipeline.config.models import ROOT, TAG, Config, Export, stage_mod
 from flexroad.pipeline.config.settings import Setting, applied, merge, texts
 from flexroad.pipeline.errors import ConfigError
 
-SPLINE = "; the solver is a method of its own: fit: {method: smoothing_spline}"
-RENAMED = {
-    "variant": "; it is called method",
-    "grounded": "; it is called planar",
-    "hygiene": "; it is called cleanup",
-    "doubt_m": "; it is called error_estimate_m",
-    "doubted_m2": "; it is called suspect_m2",
-    "solver": SPLINE,
-    "smoothness": SPLINE,
-}
-"""Option names of earlier versions and the hint for each."""
-EARLIER = {"nightly": "production"}
-"""Earlier names of shipped configurations."""
 SECTIONS = ("dataset", "export", "cluster", "variants", "extends")
 """Parts of a configuration that are no stages."""
 USUAL = "production"
@@ -179,8 +166,7 @@ def _existing(name: str | Path) -> Path:
     if special:
         raise ConfigError(f"configuration '{given}' is not a regular file; name a YAML file")
     begun = [config for config in configs if config.startswith(str(name))]
-    stem = EARLIER.get(Path(name).name, Path(name).name)
-    near = begun or difflib.get_close_matches(stem, configs, n=1)
+    near = begun or difflib.get_close_matches(Path(name).name, configs, n=1)
     hint = f"; did you mean {near[0]}?" if near else f"; shipped are {', '.join(configs)}"
     raise ConfigError(f"no configuration '{given}': neither a file nor a shipped name{hint}")
 
@@ -302,11 +288,11 @@ def _error_line(details: Any, model: TypeAdapter[Any], where: str) -> str:
     key = ".".join([where, *map(_short, path)])
     if details["type"] == "extra_forbidden":
         if len(path) > 1:
-            return f"{key}: unknown key{RENAMED.get(path[-1]) or _hint(path[-1], _nested_keys(model))}"
+            return f"{key}: unknown key{_hint(path[-1], _nested_keys(model))}"
         return f"{key}: unknown key{_remedy(path[-1], method, keys)}"
     if details["type"] == "union_tag_invalid":
         tag = details["ctx"]["tag"]
-        return f"{key}: there is no method {shown(tag)}{RENAMED.get(tag) or _hint(tag, sorted(keys))}"
+        return f"{key}: there is no method {shown(tag)}{_hint(tag, sorted(keys))}"
     message = printable(details["msg"].removeprefix("Value error, "))
     if isinstance(details["input"], dict):
         # The message of an error about several options contains their values.
@@ -316,9 +302,9 @@ def _error_line(details: Any, model: TypeAdapter[Any], where: str) -> str:
 
 def _remedy(key: str, method: str, keys: Mapping[str, list[str]]) -> str:
     others = [name for name, options in keys.items() if key in options and name != method]
-    if key not in RENAMED and others:
+    if others:
         return f"; it is an option of method {' and '.join(others)}, not of {method}"
-    return RENAMED.get(key) or _hint(key, keys[method])
+    return _hint(key, keys[method])
 
 
 def _keys(model: TypeAdapter[Any]) -> dict[str, list[str]]:

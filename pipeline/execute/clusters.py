@@ -1,13 +1,11 @@
-"""Dask clusters: on this machine, already running, or requested from SLURM or Kubernetes."""
+"""Dask clusters: on this machine, already running, or requested from SLURM."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import importlib.util
 import logging
 import time
-import uuid
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,14 +20,12 @@ from distributed.utils import silence_logging_cmgr
 
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline import OF_WORKERS
-from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
+from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.slurm import slurm
 from flexroad.pipeline.execute.start import (
     bytes_of_worker,
     certificates,
-    environment,
-    extra,
     one_line,
     opened,
     settings,
@@ -96,7 +92,7 @@ def open_cluster(
         if cluster.kind == "local":
             started = stack.enter_context(local(cluster, dashboard))
             yield ClusterTarget(started, "the local cluster", 0, cluster.patience_s)
-        elif cluster.kind == "slurm":
+        else:
             jobs = stack.enter_context(slurm(cluster, dashboard, logs, say))
             yield ClusterTarget(
                 jobs.cluster,
@@ -105,15 +101,6 @@ def open_cluster(
                 cluster.start_s,
                 f"`squeue --me` shows its jobs, {jobs.folder} has their output",
                 lambda: jobs.given_up,
-            )
-        else:
-            started = stack.enter_context(kubernetes(cluster))
-            yield ClusterTarget(
-                started,
-                "the kubernetes cluster",
-                cluster.start_s,
-                cluster.start_s,
-                "`kubectl get pods` shows its pods",
             )
 
 
@@ -175,59 +162,6 @@ def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
                 "--workers, or allow more processes and open files (ulimit -u, ulimit -n)"
             ) from error
         yield started
-
-
-def kubernetes(cluster: Cluster) -> Any:
-    """Return a cluster of Kubernetes pods, created by the Dask operator.
-
-    Raises
-    ------
-    ConfigError
-        If dask-kubernetes is not installed, no image is set, TLS is demanded, or the cluster cannot be
-        reached.
-    """
-    if cluster.security == "tls":
-        raise ConfigError(
-            "cluster.kind kubernetes: Dask's operator has no TLS: whoever reaches the port of the scheduler "
-            "can run programs in its pods; close it with a NetworkPolicy, and set cluster.security to none"
-        )
-    operator = extra("kubernetes")
-    if not cluster.image:
-        raise ConfigError(
-            "cluster.kind kubernetes: no image is set; set cluster.image to one that contains flexroad"
-        )
-    spec = operator.make_cluster_spec(**kubernetes_options(cluster))
-    # The client libraries raise many types: no credentials, no connection, no operator, no permission.
-    try:
-        importlib.import_module("kr8s").api(namespace=cluster.namespace).version()
-    except Exception as error:
-        raise ConfigError(
-            f"cluster.kind kubernetes: {one_line(error)}; does `kubectl get pods` work?"
-        ) from error
-    try:
-        return operator.KubeCluster(
-            custom_cluster_spec=spec, namespace=cluster.namespace, quiet=True, resource_timeout=60
-        )
-    except Exception as error:
-        raise ConfigError(
-            f"cluster.kind kubernetes: {one_line(error)}; is the Dask operator installed, and may this "
-            "account create DaskCluster resources?"
-        ) from error
-
-
-def kubernetes_options(cluster: Cluster) -> dict[str, Any]:
-    """Return the options of ``make_cluster_spec``: pods of one worker, one thread and core each."""
-    size = {"cpu": "1", "memory": str(int(cluster.memory or DEFAULT_MEMORY_BYTES))}
-    return {
-        "name": f"flexroad-{uuid.uuid4().hex[:8]}",
-        "image": cluster.image,
-        "n_workers": cluster.workers or 1,
-        "resources": {"requests": size, "limits": size},
-        "env": environment(cluster, dashboard=True),
-        "worker_command": "dask worker --nthreads 1",
-        # If the client is killed, the cluster ends by itself after this many seconds.
-        "idle_timeout": 900,
-    }
 
 
 @contextlib.contextmanager

@@ -26,7 +26,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.start import (
     certificates,
     environment,
-    extra,
+    load_jobqueue,
     opened,
     start_workers,
     web_address,
@@ -148,7 +148,7 @@ def slurm(
     ConfigError
         If dask-jobqueue or SLURM is not installed, or SLURM takes no job.
     """
-    jobqueue = extra("slurm")
+    jobqueue = load_jobqueue()
     for program in ("sbatch", "squeue", "scancel"):
         if shutil.which(program) is None:
             raise ConfigError(

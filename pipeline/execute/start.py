@@ -23,11 +23,6 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.memory import MOUNT, OWN, group_limits
 
 T = TypeVar("T")
-PACKAGES = {
-    "slurm": ("dask_jobqueue", "dask-jobqueue"),
-    "kubernetes": ("dask_kubernetes.operator", "dask-kubernetes"),
-}
-"""Module and package by kind of cluster."""
 SETTINGS = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
@@ -57,11 +52,10 @@ def settings(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
         # A worker that died is started again here. Dask looks for it 15 s after each death, by default, and
         # gives it up for ever if it has died a second time and is just being started.
         values["distributed.deploy.lost-worker-timeout"] = "1000 d"
-    if cluster.kind != "kubernetes":
-        # Web pages ask for no certificate. The Dask operator of Kubernetes needs them.
-        values["distributed.worker.http.routes"] = []
-        if not dashboard:
-            values["distributed.scheduler.http.routes"] = []
+    # Web pages ask for no certificate.
+    values["distributed.worker.http.routes"] = []
+    if not dashboard:
+        values["distributed.scheduler.http.routes"] = []
     return values
 
 
@@ -71,7 +65,7 @@ def web_address(dashboard: bool) -> str:
 
 
 def environment(cluster: Cluster, dashboard: bool) -> dict[str, str]:
-    """Return the environment of workers, and of a scheduler that is started elsewhere."""
+    """Return the environment of workers."""
     values = settings(cluster, dashboard).items()
     return OF_WORKERS | {_variable(key): str(value) for key, value in values}
 
@@ -104,24 +98,23 @@ def bytes_of_worker(cluster: Cluster) -> int:
     return int(cluster.memory or available_bytes() // workers_here(cluster))
 
 
-def extra(kind: str) -> Any:
-    """Return the module of a kind of cluster.
+def load_jobqueue() -> Any:
+    """Return the module dask_jobqueue.
 
     Raises
     ------
     ConfigError
-        If its package is not installed.
+        If it is not installed.
     """
-    module, package = PACKAGES[kind]
     interrupt = signal.getsignal(signal.SIGINT)
     try:
-        return importlib.import_module(module)
+        return importlib.import_module("dask_jobqueue")
     except ImportError as error:
         raise ConfigError(
-            f"cluster.kind {kind} needs {package}: pip install 'flexroad[{kind}]' ({error})"
+            f"cluster.kind slurm needs dask-jobqueue: pip install 'flexroad[slurm]' ({error})"
         ) from error
     finally:
-        # The import of dask_jobqueue lets Ctrl-C exit with code 0.
+        # This import lets Ctrl-C exit with code 0.
         signal.signal(signal.SIGINT, interrupt)
 
 

@@ -249,14 +249,8 @@ def _begun(out: Location, formats: Collection[str]) -> set[str]:
 
 def _formats(out: Location) -> set[str] | None:
     """Return the formats of earlier exports into the folder, None if there was none."""
-    if exists(out / BEGUN):
-        return set(read(out / BEGUN).decode(errors="replace").split())
-    try:
-        # An export of an earlier version.
-        manifest = json.loads(read(out / MANIFEST)) if exists(out / MANIFEST) else {}
-        return set(manifest["formats"]) if manifest["flexroad"] else None
-    except (IsADirectoryError, ValueError, KeyError, TypeError):
-        return None
+    begun = out / BEGUN
+    return set(read(begun).decode(errors="replace").split()) if exists(begun) else None
 
 
 def _foreign(file: Location) -> ConfigError:

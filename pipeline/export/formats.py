@@ -16,21 +16,13 @@ from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, remove, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export import (
-    along_roads,
-    height_fields,
-    mosaic,
-    road_lines,
-    terrain_tiles,
-    tiles3d,
-)
+from flexroad.pipeline.export import along_roads, mosaic, road_lines, tiles3d
 from flexroad.pipeline.export.network import network
 from flexroad.pipeline.export.pieces import Encode, Piece, Row, figures, part_name, write_joined, write_pieces
 from flexroad.pipeline.export.source import Options, Source, TileItem, photographed, texture_of
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import FinishedTile
-from flexroad.tasks.errors import TaskError
-from flexroad.tasks.export import cityjson, landxml, obj, opencrg, opendrive, rhino, step
+from flexroad.tasks.export import cityjson, landxml, obj, opencrg, opendrive, step
 from flexroad.tasks.export import road_lines as line_file
 from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.roads.extent import covered
@@ -120,21 +112,6 @@ def step_piece(tile: FinishedTile, place: Georeference) -> Piece:
         f"{name}{step.NAME_SIDECAR}": place.sidecar(step.AXES, **about),
     }
     return Piece(files, _smooth_row(tile, bounds, beyond_m2))
-
-
-def rhino_piece(tile: FinishedTile, place: Georeference) -> Piece:
-    """Return the surface, cut to what the survey covers of the tile, and the mesh as 3DM."""
-    surface = tile.surface
-    nurbs = surface if isinstance(surface, NurbsSurface) else None
-    bounds, beyond_m2 = covered(tile.road)
-    texts = {
-        "bounds": " ".join(f"{v:.15g}" for v in bounds),
-        "beyond_survey_m2": f"{beyond_m2:g}",
-        "steps_max_m": f"{_steps_m(tile):g}",
-    }
-    data = rhino.encode(tile.mesh, nurbs, bounds, place, texts)
-    row = _smooth_row(tile, bounds, beyond_m2) if nurbs else {}
-    return Piece({f"{safe_name(tile.id)}{rhino.NAME}": data}, row)
 
 
 def _smooth_row(tile: FinishedTile, bounds: Bounds, beyond_m2: float) -> Row:
@@ -235,23 +212,6 @@ def _write_each(
     return figures(write_pieces(tiles, folder, version, encode, source.place, executor))
 
 
-def _per_tile(
-    title: str, version: int, encode: Encode, precision_m: float | None, check: Check | None = None
-) -> Format:
-    return Format(title, partial(_write_each, version, encode), version, precision_m, check=check)
-
-
-def _needs_rhino(source: Source, options: Options) -> None:
-    try:
-        rhino.load_rhino3dm()
-    except TaskError as error:
-        raise ConfigError(str(error)) from error
-
-
-def _needs_pmtiles(source: Source, options: Options) -> None:
-    terrain_tiles.load_writer()
-
-
 def _along_roads(title: str, version: int, write: Write) -> Format:
     return Format(title, write, version, None, check=network)
 
@@ -267,15 +227,8 @@ FORMATS = {
         "CityJSONSeq 2.0, for city models", write_cityjson, cityjson.VERSION, 0.001, of_meshes=True
     ),
     "obj": Format("OBJ, for modelling", write_obj, obj.VERSION, 0.0001, of_meshes=True),
-    "heightfield": Format(
-        "16-bit height fields, for game engines", height_fields.write_fields, height_fields.VERSION, None
-    ),
-    "step": _per_tile("STEP AP214, for CAD", step.VERSION, step_piece, 1e-9),
+    "step": Format("STEP AP214, for CAD", partial(_write_each, step.VERSION, step_piece), step.VERSION, 1e-9),
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
-    "pmtiles": Format(
-        "Map tiles of heights", terrain_tiles.write_tiles, terrain_tiles.VERSION, 0.002, check=_needs_pmtiles
-    ),
-    "3dm": _per_tile("3DM, for Rhino", rhino.VERSION, rhino_piece, 1e-4, _needs_rhino),
     "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
     "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),
     "lines": _along_roads("Road lines as GeoPackage, for GIS", line_file.VERSION, road_lines.write_lines),

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import math
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -40,8 +39,6 @@ from flexroad.tasks.types import Bools, Floats, Surface
 rasterio = lazy("rasterio")
 
 VERSION = 1
-DRAFTS = ".drafts"
-"""Name of the folder of temporary rasters in earlier versions."""
 NORMAL_STEPS = 32767
 """Value of a component of length 1."""
 NO_NORMAL = -32768
@@ -121,11 +118,7 @@ def write_mosaics(
 @contextmanager
 def _drafts(folder: Location) -> Iterator[Path]:
     """Yield a temporary folder beside the files, as they need the most space; of a bucket, a local one."""
-    beside = folder if isinstance(folder, Path) else None
-    if beside:
-        # That of an export of an earlier version that was killed is large.
-        shutil.rmtree(beside / DRAFTS, ignore_errors=True)
-    with ScratchFolder(beside) as name:
+    with ScratchFolder(folder if isinstance(folder, Path) else None) as name:
         yield Path(name)
 
 

@@ -93,9 +93,6 @@ class _Mark:
         """Return a mark, None if it does not exist or is damaged."""
         try:
             content = json.loads(read(where))
-            if "figures" in content:
-                # That of a joined file of an earlier version.
-                content |= {"sizes": {content["name"]: content["size"]}, "row": content["figures"]}
             mark = cls(content["key"], dict(content["sizes"]), content["row"])
         except (OSError, ValueError, KeyError, TypeError):
             return None

@@ -6,7 +6,6 @@ import io
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
@@ -47,14 +46,8 @@ class Options:
     """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
     compress: bool = option(False, OUTPUTS, "Compress LandXML.", name="gzip")
     """Whether text formats of the complete run are compressed with gzip."""
-    nodes: Literal["power", "unreal"] = option(
-        "power",
-        OUTPUTS,
-        "Sizes of heightfield. power: 2^n + 1 nodes a side; unreal: those of Unreal Engine.",
-    )
-    """Family of sizes of height fields, of `tasks.export.heightfield.SIZES`."""
     resolution_m: float | None = option(
-        None, OUTPUTS, "Cell size of mosaic and pmtiles; default: that of the run.", "METRES", min=0.01
+        None, OUTPUTS, "Cell size of mosaic; default: that of the run.", "METRES", min=0.01
     )
     """Cell size of rasters over the run (m)."""
     level: int | None = option(

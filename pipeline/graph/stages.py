@@ -42,11 +42,9 @@ def stage_version(stage: str, options: Options) -> tuple[str, int]:
 
 def stage_head(stage: str, options: Options) -> list[Any]:
     """Return stage, `VERSION` and options as they enter fingerprints."""
-    fields = type(options).model_fields
-    unchanged = {name for name in options.LATER if getattr(options, name) == fields[name].default}
     module = stage_module(options)
     version = [module.VERSION, module.LEVELS_VERSION] if getattr(options, "levels", False) else module.VERSION
-    return [stage, version, options.model_dump(mode="json", exclude=unchanged)]
+    return [stage, version, options.model_dump(mode="json")]
 
 
 def model_files(options: Options) -> tuple[Path, ...]:

@@ -20,8 +20,6 @@ NAMES = (CATALOG, *(f"{layer}.tif" for layer in LAYERS))
 """The files that a command writes, or removes if it does not write them."""
 LAYER_TAG = "LAYER"
 """TIFF tag with the layer of a raster: shows that this program has written it."""
-FORMER = ".prepare-*"
-"""Temporary folders in the output folder of processes of earlier versions that were killed."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FULL_BYTES = 2**24
 """A disk with less free space counts as full if an error has no number, as those of GDAL."""
@@ -91,8 +89,6 @@ def scratch_folder(out: Path) -> Iterator[Path]:
         with contextlib.ExitStack() as stack:
             with disk_errors(out):
                 out.mkdir(parents=True, exist_ok=True)
-                for former in out.glob(FORMER):
-                    shutil.rmtree(former, ignore_errors=True)
                 folder = Path(stack.enter_context(ScratchFolder(out)))
             yield folder
     finally:

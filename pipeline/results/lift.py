@@ -58,7 +58,7 @@ PACKED = {
     b"OSMHeader": "is OSM's PBF; convert it: osmium cat {file} -o streets.osm",
 }
 """What to do with files that are not read, by their first bytes."""
-DISTANCES = {"elevation_m": "", "superelevation_m": " with superelevation", "shape_m": " with shapes"}
+DISTANCES = {"elevation_m": "", "superelevation_m": " with superelevation"}
 """Distances from the surface in the summary, and what they are with."""
 NEAR_M = 5.0
 """Distance up to which consecutive points are of one line (m); lines have a height every metre or less."""
@@ -383,12 +383,11 @@ def _explained(source: Path) -> Iterator[None]:
 
 def _move(scratch: Path, out: Path) -> tuple[Path, ...]:
     """Move the files that a format has written into their places; the one that was asked for is the last."""
-    made = sorted(path for path in scratch.rglob("*") if path.is_file() and not path.name.startswith("."))
+    made = sorted(path for path in scratch.iterdir() if path.is_file() and not path.name.startswith("."))
     made.sort(key=lambda path: path.name == out.name)
     files = list[Path]()
     for path in made:
-        target = out.parent / path.relative_to(scratch)
-        target.parent.mkdir(exist_ok=True)
+        target = out.parent / path.name
         path.replace(output_file(target))
         files.append(target)
     return tuple(files)
@@ -440,7 +439,6 @@ def _row(row: Lifted) -> dict[str, str | int | float]:
         "before_max_mm": (row.before_m, 1000, 1),
         "elevation_max_mm": (row.elevation_m, 1000, 1),
         "superelevation_max_mm": (row.superelevation_m, 1000, 1),
-        "shape_max_mm": (row.shape_m, 1000, 1),
         "grade_max_percent": (row.grade, 100, 3),
         "crossfall_max_percent": (row.crossfall, 100, 3),
         "error_estimate_mm": (row.error_m, 1000, 1),

@@ -51,7 +51,7 @@ from flexroad.tasks.types import (
 ESTIMATES = 32
 """Number of tiles of which a process keeps the error estimates (0.6 MB each)."""
 NO_DISTANCES = (math.nan,) * len(FIGURES)
-"""Distances of a mesh that has none, or is of an older version (m)."""
+"""Distances of a mesh that has none (m)."""
 SEE_REPORT = "`flexroad report` says what is wrong there"
 COMPUTED_AGAIN = "it was computed again while it was exported; export again"
 

@@ -32,7 +32,7 @@ SEPARATOR = "."
 CHANGES = ".changes"
 """End of the name of faces that are stored as differences from the face before, in a quarter of the bytes."""
 LEVELS = ("level", "levels", "structures")
-"""Fields that are left out if they are empty: results without levels have the header of earlier versions."""
+"""Fields that are left out if they are empty: most results have no levels."""
 SHA256_BYTES = 32
 
 

@@ -161,7 +161,7 @@ def from_failed(content: dict[str, Any], marker: MarkerStat | None) -> TileRecor
 def with_distances(rows: Iterable[MetricsRow], largest: MeshDistances) -> Iterator[MetricsRow]:
     """Yield the rows, and put the largest distances in them into ``largest``.
 
-    Rows of failed tiles and of older versions have none.
+    Rows of failed tiles have none.
     """
     for row in rows:
         for name, value in distances_of(row).items():

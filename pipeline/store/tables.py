@@ -202,8 +202,7 @@ def read_metrics(run: Location, name: str = METRICS) -> pd.DataFrame:
         frame = frame_of(read(path))
         if unknown := set(frame.columns) - set(COLUMNS):
             raise ValueError(f"it has the columns {', '.join(map(repr, sorted(unknown, key=repr)))}")
-        # Tables of older versions lack the newer columns.
-        return frame.reindex(columns=list(COLUMNS))
+        return frame[list(COLUMNS)]
     except (OSError, ValueError, KeyError, TypeError, NotImplementedError) as error:
         if why := access_reason(error):
             raise ConfigError(f"{path} {why}") from error

@@ -77,9 +77,6 @@ class Options(BaseOptions):
     stop_tolerance: float = Field(
         1e-4, ge=0, description="stop when the relative decrease of the loss is below this"
     )
-    engine: Literal["numba"] = Field(
-        "numba", description="library that computes the fit; kept for one release, as fingerprints contain it"
-    )
 
 
 @dataclass(frozen=True, eq=False)

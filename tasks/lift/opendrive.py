@@ -1,4 +1,4 @@
-"""OpenDRIVE 1.4 to 1.8 (``.xodr``): elevation and lateral profile of each road from the surface."""
+"""OpenDRIVE 1.4 to 1.8 (``.xodr``): elevation and superelevation of each road from the surface."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from flexroad.tasks.lift import lanes, levels, opendrive_text, plan_view, road_l
 from flexroad.tasks.lift.batches import with_heights
 from flexroad.tasks.lift.levels import ANY, Numbers
 from flexroad.tasks.lift.lines import steepest
-from flexroad.tasks.lift.opendrive_crg import CrgFiles, CrgLine, crg_line
 from flexroad.tasks.lift.plan_view import numbers
 from flexroad.tasks.lift.profile import AHEAD_M, value_at
 from flexroad.tasks.lift.road_profiles import NONE, CrossSections
@@ -32,8 +31,8 @@ STEPS = False
 """Whether heights have the steps beside roads: OpenDRIVE has kerbs in its lanes."""
 ALONG_M, LEAST_ALONG = 1.0, 4
 """Distance of the cross-sections of a road (m), and their least number, less one."""
-ACROSS_M, SHAPE_ACROSS_M = 1.0, 0.5
-"""Distance of the points of a cross-section, and where shapes are written (m)."""
+ACROSS_M = 1.0
+"""Distance of the points of a cross-section (m)."""
 LEAST_ACROSS, MOST_ACROSS = 4, 80
 """Number of the points of a cross-section, less one."""
 MOST_FINER, MOST_FINE = 8, 4000
@@ -64,8 +63,6 @@ class Road:
     """The profile that it had, ``(k, 5)``."""
     superelevation: Floats
     structures: tuple[Structure, ...]
-    crg: CrgLine | None
-    """Where its OpenCRG file has heights; None if it gets none."""
 
     @property
     def inside(self) -> Bools:
@@ -86,16 +83,13 @@ class Road:
         return self.x - away * np.sin(self.heading), self.y + away * np.cos(self.heading)
 
     def places(self) -> tuple[Floats, Floats]:
-        """Return x and y of the points: cross-sections, the line, before and after its points, OpenCRG."""
+        """Return x and y of the points: cross-sections, the line, before and after its points."""
         ahead, left = np.cos(self.heading), np.sin(self.heading)
         x = [(self.x[:, None] - self.t * left[:, None]).ravel()]
         y = [(self.y[:, None] + self.t * ahead[:, None]).ravel()]
         for away in (0.0, -AHEAD_M, AHEAD_M):
             x.append(self.x + away * ahead)
             y.append(self.y + away * left)
-        if self.crg is not None:
-            x.append(self.crg.x)
-            y.append(self.crg.y)
         return np.concatenate(x), np.concatenate(y)
 
 
@@ -140,9 +134,9 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
     TaskError
         If the file cannot be read; continues a sentence that begins with its name.
     """
-    crg, of_links = CrgFiles(out), LinkedLevels(source, heights)
+    of_links = LinkedLevels(source, heights)
     with xml_text.opened(source) as file, xml_text.written(out) as copy:
-        parts = (_read(part, options) for part in xml_text.parts(file, {"road"}))
+        parts = map(_read, xml_text.parts(file, {"road"}))
         for part, found in with_heights(parts, _places, heights):
             if isinstance(part, bytes):
                 copy.write(part)
@@ -151,7 +145,7 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
                 copy.write(part.part.text)
                 yield Lifted(part.id, note=part.note)
             else:
-                text, row = _lifted(part, found, options, crg, of_links)
+                text, row = _lifted(part, found, options, of_links)
                 copy.write(text)
                 yield row
 
@@ -160,7 +154,7 @@ def _places(part: bytes | Left | Road) -> tuple[Floats, Floats] | None:
     return part.places() if isinstance(part, Road) else None
 
 
-def _read(part: bytes | Part, options: Options) -> bytes | Left | Road:
+def _read(part: bytes | Part) -> bytes | Left | Road:
     """Return a road, or why it stays as it is."""
     if isinstance(part, bytes):
         return part
@@ -169,12 +163,12 @@ def _read(part: bytes | Part, options: Options) -> bytes | Left | Road:
         return part.text
     try:
         with np.errstate(all="ignore"):
-            return _road(part, name, options)
+            return _road(part, name)
     except TaskError as error:
         return Left(part, name, f"{error}; it stays as it was")
 
 
-def _road(part: Part, name: str, options: Options) -> Road:
+def _road(part: Part, name: str) -> Road:
     element = part.element
     (length,) = numbers(element, "length")
     if not 0 < length <= LONGEST_M:
@@ -195,11 +189,9 @@ def _road(part: Part, name: str, options: Options) -> Road:
     if not np.isfinite([x, y, heading]).all():
         raise TaskError("has a planView with places that are no numbers")
     right, left = float(extent.right.min()), float(extent.left.max())
-    step = SHAPE_ACROSS_M if options.lateral == "shape" else ACROSS_M
     if left - right < ACROSS_M / 2:
         right, left = right - ACROSS_M / 2, left + ACROSS_M / 2
-    across = int(np.clip(np.ceil((left - right) / step), LEAST_ACROSS, MOST_ACROSS))
-    own_crg = element.find("surface/CRG") is not None
+    across = int(np.clip(np.ceil((left - right) / ACROSS_M), LEAST_ACROSS, MOST_ACROSS))
     return Road(
         part=part,
         id=name,
@@ -212,7 +204,6 @@ def _road(part: Part, name: str, options: Options) -> Road:
         elevation=_old(element, "elevationProfile/elevation"),
         superelevation=_old(element, "lateralProfile/superelevation"),
         structures=tuple(_structures(element)),
-        crg=crg_line(plan, length, max(reach, 1.0)) if options.crg and not own_crg else None,
     )
 
 
@@ -233,9 +224,7 @@ def _old(road: ET.Element, path: str) -> Floats:
     return pieces if pieces[0, 0] <= 0 else np.vstack([NONE, pieces])
 
 
-def _lifted(
-    road: Road, heights: Heights, options: Options, crg: CrgFiles, of_links: LinkedLevels
-) -> tuple[bytes, Lifted]:
+def _lifted(road: Road, heights: Heights, options: Options, of_links: LinkedLevels) -> tuple[bytes, Lifted]:
     """Return the text of a road with heights, and its row."""
     sections, used, unknown_m, rows = _sections(road, heights, of_links)
     beyond: road_profiles.Beyond = "flat" if options.flat_ends else "keep"
@@ -245,20 +234,9 @@ def _lifted(
     if elevation is None or across is None:
         length = float(road.s[-1])
         return road.part.text, Lifted(road.id, length, length, (), unknown_m)
-    lateral, shapes = None, list[tuple[float, Floats]]()
-    if options.lateral != "none":
-        lateral = opendrive_text.records("superelevation", across)
-    if options.lateral == "shape":
-        shapes = road_profiles.shape(sections, elevation, across, tolerance)
-        lateral = [*(lateral or ()), *opendrive_text.shapes(shapes)]
-    surface = None
-    if road.crg is not None:
-        z = _on_rows(heights[-len(road.crg.x) :], road.crg.of_points(road.s, rows))
-        surface = crg.write(road.id, road.crg, z, float(road.s[-1]))
-    text = opendrive_text.with_profiles(
-        road.part, opendrive_text.records("elevation", elevation), lateral, surface
-    )
-    row = _row(road, sections, used, unknown_m, elevation, across, shapes, options)
+    lateral = None if options.lateral == "none" else opendrive_text.records("superelevation", across)
+    text = opendrive_text.with_profiles(road.part, opendrive_text.records("elevation", elevation), lateral)
+    row = _row(road, sections, used, unknown_m, elevation, across, options)
     on_lanes = np.flatnonzero(road.inside)
     numbers = np.array(heights.numbers, np.int8)[np.repeat(rows, len(road.t))[on_lanes]]
     return text, replace(row, flags=passed(heights[on_lanes].flags_on(numbers)))
@@ -276,7 +254,7 @@ def _sections(
     _, chosen = levels.along(line, wanted)
     rows = np.searchsorted(np.array(heights.numbers), chosen)
     of_point = np.concatenate([np.repeat(rows, m), *[rows] * 3])
-    z = _on_rows(heights[: len(of_point)], of_point)
+    z = heights.z[of_point, np.arange(len(of_point))]
     on, before, after = z[n * m :].reshape(3, n)
     grid = z[: n * m].reshape(n, m)
     sections = road_profiles.cross_sections(road.s, road.t, grid, (on, before, after), road.inside, joined)
@@ -320,7 +298,7 @@ class LinkedLevels:
     def _levels(self) -> dict[str, int]:
         roads = dict[str, road_levels.Ends]()
         with xml_text.opened(self._source) as file:
-            parts = (_read(part, Options()) for part in xml_text.parts(file, {"road"}))
+            parts = map(_read, xml_text.parts(file, {"road"}))
             lines = (part for part in parts if isinstance(part, Road))
             for road, line in with_heights(lines, Road.middle, self._heights):
                 assert line is not None
@@ -338,11 +316,6 @@ def _ends(road: Road, line: Heights) -> road_levels.Ends:
     return road_levels.Ends(known, road_levels.links(road.part.element))
 
 
-def _on_rows(heights: Heights, rows: NDArray[np.intp]) -> Floats:
-    """Return the height of each point in its row of `Heights.z`."""
-    return np.asarray(heights.z[rows, np.arange(len(rows))])
-
-
 def _row(
     road: Road,
     sections: CrossSections,
@@ -350,7 +323,6 @@ def _row(
     unknown_m: float,
     elevation: Floats,
     across: Floats,
-    shapes: list[tuple[float, Floats]],
     options: Options,
 ) -> Lifted:
     s, t = road.s, road.t
@@ -359,15 +331,14 @@ def _row(
     # Lanes that are level have the height of the middle.
     t_read = np.broadcast_to(road.extent.middle[:, None] if road.extent.level else t, seen.shape)
 
-    def missed(profile: Floats, lateral: Floats, rest: Floats | float = 0.0) -> float:
-        z = value_at(profile, s)[:, None] + t_read * np.tan(value_at(lateral, s))[:, None] + rest
+    def missed(profile: Floats, lateral: Floats) -> float:
+        z = value_at(profile, s)[:, None] + t_read * np.tan(value_at(lateral, s))[:, None]
         return float(np.abs(z - sections.z)[seen].max(initial=0.0))
 
     lateral = road.superelevation if options.lateral == "none" else across
     crossfall = np.where(known, np.tan(value_at(across, s)), 0.0)
     grade = np.where(known, sections.grade, 0.0)
     gone = ~(known[:-1] & known[1:]) & ~(sections.joined[:-1] | sections.joined[1:])
-    shaped = 0.0 if road.extent.level or not shapes else road_profiles.shape_at(shapes, s, t)
     return Lifted(
         id=road.id,
         length_m=float(s[-1]),
@@ -377,22 +348,14 @@ def _row(
         before_m=missed(road.elevation, road.superelevation),
         elevation_m=missed(elevation, NONE),
         superelevation_m=np.nan if lateral is NONE else missed(elevation, lateral),
-        shape_m=missed(elevation, across, shaped) if shapes else np.nan,
         grade=float(np.abs(grade).max()),
         crossfall=float(np.abs(crossfall).max()),
         steep=(
             *_steep(road, "grade", grade, options.grade_limit),
             *_steep(road, "crossfall", crossfall, options.crossfall_limit),
         ),
-        note="; ".join(_notes(road, options)),
+        note=ALL_LEVEL if road.extent.level and options.lateral != "none" else "",
     )
-
-
-def _notes(road: Road, options: Options) -> Iterator[str]:
-    if road.extent.level and options.lateral != "none":
-        yield ALL_LEVEL
-    if options.crg and road.crg is None:
-        yield "has no OpenCRG file: it has one of its own, is too short or too large, or bends too much"
 
 
 def _steep(

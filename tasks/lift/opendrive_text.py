@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from flexroad.tasks.lift.xml_text import Part
 from flexroad.tasks.types import Floats
 
 LATERAL = ("superelevation", "crossfall", "shape", "crossSectionSurface")
 """The elements of a lateral profile that are replaced."""
-BEFORE_SURFACE = ("planView", "elevationProfile", "lateralProfile", "lanes", "objects", "signals")
-"""The elements of a road before its surface."""
 Edit = tuple[int, int, bytes]
 
 
 def records(name: str, pieces: Floats) -> list[str]:
     """Return the elements of cubic pieces, ``(k, 5)``: s, a, b, c, d."""
-    return [_record(name, ("s", "a", "b", "c", "d"), row) for row in pieces]
+    values = (zip("sabcd", row, strict=True) for row in pieces.tolist())
+    texts = (" ".join(f'{key}="{value:.12g}"' for key, value in each) for each in values)
+    return [f"<{name} {text}/>" for text in texts]
 
 
-def shapes(cross_sections: Iterable[tuple[float, Floats]]) -> list[str]:
-    """Return the elements of shapes: s and the pieces of each, ``(k, 5)``: t, a, b, c, d."""
-    names = ("s", "t", "a", "b", "c", "d")
-    return [_record("shape", names, [s, *row]) for s, pieces in cross_sections for row in pieces]
-
-
-def with_profiles(
-    road: Part, elevation: Sequence[str], lateral: Sequence[str] | None, surface: str | None = None
-) -> bytes:
+def with_profiles(road: Part, elevation: Sequence[str], lateral: Sequence[str] | None) -> bytes:
     """Return the text of a road with the elements of its profiles; missing ones are added in their place.
 
     Parameters
@@ -35,8 +27,6 @@ def with_profiles(
     road : Part
     elevation, lateral : sequence of str
         Elements in ``elevationProfile`` and in ``lateralProfile``; None leaves the latter as it is.
-    surface : str, optional
-        An element that is added to ``surface``.
     """
     around, within = _indents(road)
     edits, added = list[Edit](), ""
@@ -57,20 +47,7 @@ def with_profiles(
             added += f"{around}<{name}>{body}{around}</{name}>"
     if added:
         edits.append((place, place, added.encode("ascii")))
-    if surface is not None:
-        element = road.element.find("surface")
-        if element is not None:
-            edits.append(road.with_child(surface, element))
-        else:
-            last = max(_end(road, each.tag) for each in road.element if each.tag in BEFORE_SURFACE)
-            text = f"{around}<surface>{within}{surface}{around}</surface>"
-            edits.append((last, last, text.encode("ascii")))
     return road.replaced(edits)
-
-
-def _record(name: str, names: Sequence[str], values: Iterable[float]) -> str:
-    text = " ".join(f'{key}="{value:.12g}"' for key, value in zip(names, values, strict=True))
-    return f"<{name} {text}/>"
 
 
 def _end(road: Part, name: str) -> int:

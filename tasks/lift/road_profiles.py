@@ -1,8 +1,8 @@
-"""Profiles of a road of OpenDRIVE from heights beside its reference line: elevation, superelevation, shape.
+"""Profiles of a road of OpenDRIVE from heights beside its reference line: elevation and superelevation.
 
 The elevation is the surface at the reference line. At both ends of a road it has the height and the grade of
 the surface there, so that roads that meet in plan meet in height. The superelevation is the slope of the
-straight line through it that fits the cross-section best. The shape is what the surface has beside that.
+straight line through it that fits the cross-section best.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from flexroad.tasks.lift.profile import AHEAD_M, cubic_pieces, value_at
+from flexroad.tasks.lift.profile import AHEAD_M, cubic_pieces
 from flexroad.tasks.types import Bools, Floats
 
 NONE = np.zeros((1, 5))
@@ -108,42 +108,6 @@ def superelevation(sections: CrossSections, old: Floats, beyond: Beyond, toleran
     return _profile(sections, angle, _slopes(s, angle), old, beyond, tolerance / max(reach, 1.0))
 
 
-def shape(
-    sections: CrossSections, elevation: Floats, superelevation: Floats, tolerance: float
-) -> list[tuple[float, Floats]]:
-    """Return the shapes of cross-sections: s and the pieces of each, ``(k, 5)``: t, a, b, c, d.
-
-    Between two of them, readers interpolate linearly along the road.
-    """
-    s, t = sections.s, sections.t
-    plane = value_at(elevation, s)[:, None] + t * np.tan(value_at(superelevation, s))[:, None]
-    rest = sections.z - plane
-    for row, known in zip(rest, np.isfinite(rest), strict=True):
-        row[:] = np.interp(t, t[known], row[known]) if known.any() else 0.0
-    rest[~np.isfinite(sections.line)] = 0.0
-    if len(t) < 2:
-        return []
-    rows = _needed_rows(s, rest, tolerance / 2)
-    slopes = np.gradient(rest[rows], t, axis=1)
-    return [
-        (float(s[row]), cubic_pieces(t, rest[row], slope, tolerance / 2))
-        for row, slope in zip(rows, slopes, strict=True)
-    ]
-
-
-def shape_at(shapes: list[tuple[float, Floats]], s: Floats, t: Floats) -> Floats:
-    """Return the heights of shapes at distances s and t, ``(n, m)``, as readers have them."""
-    if not shapes:
-        return np.zeros((len(s), len(t)))
-    table = np.array([value_at(pieces, t) for _, pieces in shapes])
-    starts = np.array([start for start, _ in shapes])
-    at = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, max(len(starts) - 2, 0))
-    after = np.minimum(at + 1, len(starts) - 1)
-    span = starts[after] - starts[at]
-    share = np.clip((s - starts[at]) / np.where(span > 0, span, 1.0), 0.0, 1.0)[:, None]
-    return np.asarray(table[at] * (1 - share) + table[after] * share)
-
-
 def _profile(
     sections: CrossSections, values: Floats, slopes: Floats, old: Floats, beyond: Beyond, tolerance: float
 ) -> Floats | None:
@@ -194,27 +158,3 @@ def _slopes(s: Floats, values: Floats) -> Floats:
             slopes[start:end] = np.gradient(values[start:end], s[start:end])
         start = end
     return slopes
-
-
-def _needed_rows(s: Floats, rows: Floats, tolerance: float) -> list[int]:
-    """Return the rows between which the others are linear within a tolerance: as few as possible, about."""
-
-    def straight(a: int, b: int) -> bool:
-        share = ((s[a : b + 1] - s[a]) / (s[b] - s[a]))[:, None]
-        missed = rows[a : b + 1] - rows[a] * (1 - share) - rows[b] * share
-        return bool(np.abs(missed).max() <= tolerance)
-
-    chosen, last = [0], len(s) - 1
-    while chosen[-1] < last:
-        start = chosen[-1]
-        fits, beyond, step = start + 1, last + 1, 2
-        while start + step <= last:
-            if not straight(start, start + step):
-                beyond = start + step
-                break
-            fits, step = start + step, 2 * step
-        while beyond - fits > 1:
-            middle = (fits + beyond) // 2
-            fits, beyond = (middle, beyond) if straight(start, middle) else (fits, middle)
-        chosen.append(fits)
-    return chosen

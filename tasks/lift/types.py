@@ -96,10 +96,8 @@ class Options:
 
     tolerance_m: float = 0.005
     """Largest distance of a profile, or of a line between its vertices, from the surface (m)."""
-    lateral: Literal["superelevation", "shape", "none"] = "superelevation"
+    lateral: Literal["superelevation", "none"] = "superelevation"
     """What OpenDRIVE's roads have across."""
-    crg: bool = False
-    """Whether OpenDRIVE's roads get OpenCRG files with the surface itself."""
     flat_ends: bool = False
     """Whether a road without ground beneath goes on level; else it keeps the heights that it had."""
     add_vertices: bool | None = None
@@ -147,8 +145,6 @@ class Lifted:
     """Largest distance of its carriageway from the surface, by its elevation alone."""
     superelevation_m: float = np.nan
     """The same with the superelevation."""
-    shape_m: float = np.nan
-    """The same with the shape of its cross-sections."""
     grade: float = np.nan
     """Largest grade."""
     crossfall: float = np.nan

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.meshing.lines import AT_BORDER_M, GRID_M, parts_of
-from flexroad.tasks.meshing.road_outline import NEAR_M, RoadOutline, encoded, lines_of
+from flexroad.tasks.meshing.road_outline import encoded, lines_of
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.mesh_border import SAME_M, on_border
 from flexroad.tasks.types import Bools, Floats, Level
@@ -202,22 +202,3 @@ class JoinedGround:
     def normal(self, easting: Floats, northing: Floats) -> Floats:
         """Return upward unit normals of level 0 at scattered points, ``(..., 3)``."""
         return self.surface.normal(easting, northing)
-
-
-@dataclass(frozen=True, eq=False)
-class JoinedOutline(RoadOutline):
-    """The outline of the roads of level 0, of which joints are a part."""
-
-    joints: shapely.MultiLineString
-
-    @classmethod
-    def of(cls, outline: RoadOutline, outlines: Sequence[LevelOutline]) -> JoinedOutline:
-        """Return the outline of roads without what is beside joints."""
-        lines = without_joints(outline.lines, outlines)
-        joints = shapely.multilinestrings(np.concatenate([own.joints for own in outlines]))
-        return cls(outline.areas, lines, joints)
-
-    def touches(self, points: Floats) -> Bools:
-        """Return which points, ``(n, 2)``, are on the road or near it, or near a joint, ``(n,)``."""
-        at_joint = shapely.dwithin(self.joints, shapely.points(points), NEAR_M)
-        return np.asarray(super().touches(points) | at_joint)

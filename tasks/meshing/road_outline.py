@@ -23,8 +23,6 @@ TOLERANCE_M = 0.01
 """Largest distance by which an outline is simplified (m)."""
 GAP_M = 0.02
 """Gaps between roads up to this width (m) are closed: drawn neighbours often miss each other."""
-NEAR_M = 0.1
-"""Points this close to a road touch it (m)."""
 MARGIN_M = 1.0
 """Distance beyond a grid up to which its roads are kept (m)."""
 
@@ -41,11 +39,6 @@ class RoadOutline:
         """Return which points, ``(n, 2 or more)``, are on the road, ``(n,)``."""
         shapely.prepare(self.areas)
         return np.asarray(shapely.contains_xy(self.areas, points[:, 0], points[:, 1]))
-
-    def touches(self, points: Floats) -> Bools:
-        """Return which points, ``(n, 2)``, are on the road or within `NEAR_M` of it, ``(n,)``."""
-        shapely.prepare(self.areas)
-        return np.asarray(shapely.dwithin(self.areas, shapely.points(points), NEAR_M))
 
 
 def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:

@@ -12,7 +12,7 @@ has their height.
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -32,8 +32,6 @@ VERSION = 3
 
 class Options(base.Options):
     """Optional metrics, the mask that classes cells as road, and the heights that count as true."""
-
-    LATER: ClassVar[tuple[str, ...]] = ("truth",)
 
     nearest: bool = Field(False, description="also measure 3-D distances (slower)")
     classes: Literal["reference", "segmented"] = Field(

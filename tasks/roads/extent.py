@@ -10,10 +10,7 @@ import numpy as np
 import scipy
 
 from flexroad.catalog.grid import Bounds
-from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
-
-ROUNDING_M = 1e-6
-"""Points this near to the border of a cell are on it (m)."""
+from flexroad.tasks.types import Bools, RoadMask, TileData
 
 
 def beyond_extent(data: TileData) -> Bools:
@@ -32,18 +29,6 @@ def beyond_extent(data: TileData) -> Bools:
     beyond[0] = False
     outside: Bools = beyond[labels]
     return outside
-
-
-def nodes_beyond(road: RoadMask, eastings: Floats, northings: Floats) -> Bools:
-    """Return which nodes of a lattice lie beyond the survey, ``(len(northings), len(eastings))``.
-
-    A node on the border of cells is beyond the survey if all of them are, so that tiles agree on the nodes of
-    their common edge.
-    """
-    north_row, west_col = road.grid.cells(eastings - ROUNDING_M, northings + ROUNDING_M)
-    south_row, east_col = road.grid.cells(eastings + ROUNDING_M, northings - ROUNDING_M)
-    rows = road.outside[north_row] & road.outside[south_row]
-    return np.asarray(rows[:, west_col] & rows[:, east_col])
 
 
 def covered(road: RoadMask) -> tuple[Bounds, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -23,8 +23,6 @@ NEEDS = ("roads",)
 
 class Options(rasterise.Options):
     """Selection of the road features, widths of the lines, and cleanup of the mask."""
-
-    LATER: ClassVar[tuple[str, ...]] = ("levels", "level_columns", "structure_columns")
 
     method: Literal["vector"] = "vector"
     cleanup: Cleanup = Field(NOTHING, description="cleanup of the mask; none by default")

@@ -72,41 +72,10 @@ def border_points(
         on_road, elsewhere = (_at(road, (t[axis] + nudge) / cell) for t in (fine, coarse))
         regular = np.concatenate([fine[axis][on_road], coarse[axis][~elsewhere]])
         ends = coarse[axis][[0, -1]]
-        along, _ = _with_marks(regular, _marks(edge, cell, ends, raw), ends, apart_m)
+        marks = _marks(edge, cell, ends, raw)
+        along = np.unique(np.concatenate([regular[apart(regular, marks, apart_m)], marks, ends]))
         sides.append(_placed(along, ends, axis, at, local))
     return np.concatenate(sides)
-
-
-def border_sides(
-    frame: Frame,
-    local: Bounds,
-    cell: float,
-    dense: Sequence[Floats],
-    raw: bool,
-    outlined: bool,
-    apart_m: float,
-) -> Iterator[tuple[Floats, Bools, Bools]]:
-    """Yield for each side of a tile possible vertices, ``(n, 2)``, which are needed, and which are road.
-
-    Parameters
-    ----------
-    frame, local, cell, raw, apart_m
-        As in `border_points`.
-    dense : sequence of ndarray
-        Distances of possible vertices from the start of an edge, along easting and along northing (m).
-    outlined : bool
-        Whether roads are polygons, so that the crossings of their outline count and not the cells.
-    """
-    for edge, axis, at in _edges(frame, local):
-        nudge = NUDGE * cell * (1 if axis == 0 else -1)
-        road = edge.road if raw else edge.kept
-        ends = dense[axis][[0, -1]]
-        marks = _marks(edge, cell, ends, raw and outlined)
-        if not outlined:
-            changes = np.round((np.flatnonzero(road[1:] != road[:-1]) + 1) * cell, DECIMALS)
-            marks = np.concatenate([marks, changes[apart(changes, marks, SAME_M)]])
-        along, needed = _with_marks(dense[axis], marks, ends, apart_m)
-        yield _placed(along, ends, axis, at, local), needed, _at(road, (along + nudge) / cell)
 
 
 def _marks(edge: Edge, cell: float, ends: Floats, crossed: bool) -> Floats:
@@ -115,13 +84,6 @@ def _marks(edge: Edge, cell: float, ends: Floats, crossed: bool) -> Floats:
     if crossed:
         marks = np.concatenate([marks, edge.crossings[apart(edge.crossings, marks, SAME_M)]])
     return _spaced(marks[apart(marks, ends, SAME_M)])
-
-
-def _with_marks(regular: Floats, marks: Floats, ends: Floats, apart_m: float) -> tuple[Floats, Bools]:
-    """Return ascending positions on an edge with marks and ends, and which of them these are."""
-    needed = np.concatenate([marks, ends])
-    along = np.unique(np.concatenate([regular[apart(regular, marks, apart_m)], needed]))
-    return along, np.isin(along, needed)
 
 
 def _placed(along: Floats, ends: Floats, axis: int, at: float, local: Bounds) -> Floats:

@@ -55,7 +55,7 @@ def main(roads: int) -> None:
         run = make_city(Path(name))
         source = Path(name, "in.xodr")
         write_network(source, south_west(run), roads)
-        for lateral in ("none", "superelevation", "shape"):
+        for lateral in ("none", "superelevation"):
             out = Path(name, f"{lateral}.xodr")
             command = [sys.executable, "-m", "flexroad", "lift", source, run, "-o", out, "--lateral", lateral]
             start = time.perf_counter()

@@ -42,8 +42,6 @@ SAMPLINGS = {
     "1.25 m, 5 m": {"road_m": 1.25, "terrain_m": 5},
     "1 m, 10 m, breaklines": {"breaklines": True},
     "1 m, 5 m, breaklines": {"terrain_m": 5, "breaklines": True},
-    "adaptive 5 mm, 0.2 m": {"method": "adaptive"},
-    "adaptive 10 mm, 0.15 m": {"method": "adaptive", "tolerance_m": 0.01, "terrain_tolerance_m": 0.15},
 }
 Inputs = tuple[Surface, RoadMask, RoadClusters, Frame | None]
 

@@ -11,9 +11,7 @@ import numpy as np
 import pyopencrg
 import pytest
 import rasterio
-import rhino3dm
 import shapely
-from PIL import Image
 from pyproj import Transformer
 from rio_cogeo import cog_validate
 
@@ -29,15 +27,7 @@ from flexroad.pipeline.export.source import Options, select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.spline.stepped import without_steps
-from tests.read_exports import (
-    OFFSET_M,
-    heightfields,
-    off_surface,
-    pmtiles_pixels,
-    spline_heights,
-    true_heights,
-    vertices,
-)
+from tests.read_exports import OFFSET_M, off_surface, spline_heights, true_heights, vertices
 from tests.read_opendrive import quality_issues
 from tests.real.streets import STREETS
 from tests.validators.gltf import gltf_issues
@@ -87,19 +77,6 @@ def test_vertices_lie_on_the_surface(barbican, exported):
         assert np.isfinite(error).mean() > 0.99
 
 
-def test_nodes_of_height_fields_lie_on_the_surface(tiles, exported):
-    for name, tile in tiles.items():
-        points, precision = heightfields(exported / "heightfield", name)
-        holes = np.asarray(Image.open(exported / "heightfield" / f"{name}_holes.png")).ravel() == 255
-        error = np.abs(points[:, 2] - tile.surface.height(*points[:, :2].T))
-        assert error[~holes].max() <= precision * 1.01
-        # Beyond the survey there is no other height than those of covered nodes.
-        covered = points[~holes, 2]
-        assert not holes.any() or covered.min() <= points[holes, 2].min()
-        assert not holes.any() or points[holes, 2].max() <= covered.max()
-        assert precision < 0.001
-
-
 def test_step_is_the_surface_of_each_tile(tiles, exported):
     for name, tile in tiles.items():
         valid, points = read_step(exported / "step" / f"{name}.stp", 30)
@@ -110,19 +87,6 @@ def test_step_is_the_surface_of_each_tile(tiles, exported):
         assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((west, east, south, north), abs=1e-8)
         # A northing of 181,750 m has a rounding error of 3e-11 m; slopes here are below 10.
         np.testing.assert_allclose(points[:, 2], without_steps(tile.surface).height(x, y), rtol=0, atol=1e-9)
-
-
-def test_3dm_has_the_meshes_of_each_tile(barbican, tiles, exported):
-    for name in tiles:
-        model = rhino3dm.File3dm.Read(str(exported / "3dm" / f"{name}.3dm"))
-        for part in (item.Geometry for item in model.Objects):
-            if isinstance(part, rhino3dm.Mesh):
-                points = np.array(
-                    [(p.X, p.Y, p.Z) for p in map(part.Vertices.Point3dAt, range(len(part.Vertices)))]
-                )
-                # The mesh itself has rounded vertices.
-                error = off_surface(barbican, np.add(points, (*Run.open(barbican).origin, 0.0)))
-                assert np.nanmax(error) <= 2 * FORMATS["3dm"].precision_m
 
 
 def test_glb_files_have_no_issue(exported):
@@ -194,14 +158,3 @@ def test_road_lines_lie_on_the_surface(barbican, exported):
     known = np.isfinite(heights)
     assert known.mean() > 0.99
     np.testing.assert_allclose(places[known, 2], heights[known], rtol=0, atol=1e-4)
-
-
-def test_map_tiles_have_the_heights_of_the_surfaces(barbican, exported):
-    (file,) = (exported / "pmtiles").glob("*.pmtiles")
-    plan = Transformer.from_crs("EPSG:3857", "EPSG:27700", always_xy=True)
-    compared = 0
-    for x, y, height in pmtiles_pixels(file):
-        error = height - true_heights(barbican, np.column_stack(plan.transform(x, y)))
-        assert np.nanmax(np.abs(error)) <= FORMATS["pmtiles"].precision_m
-        compared += len(height)
-    assert compared > 500 * 600

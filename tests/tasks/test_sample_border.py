@@ -91,7 +91,7 @@ def union(parts):
     size_m=st.tuples(*(st.integers(3, 15).map(lambda half: 2 * half) for _ in range(2))),
     share=st.floats(0, 1),
     road_m=st.sampled_from([0.3, 0.7, 1.0, 2.5]),
-    method=st.sampled_from(["dynamic", "adaptive", "uniform"]),
+    method=st.sampled_from(["dynamic", "uniform"]),
     mask=st.sampled_from(["raw", "filtered"]),
 )
 def test_meshes_of_four_tiles_join_without_open_edges(seed, cell, size_m, share, road_m, method, mask):
@@ -106,12 +106,11 @@ def test_meshes_of_four_tiles_join_without_open_edges(seed, cell, size_m, share,
     assert whole.area == pytest.approx(4 * size[0] * size[1] * cell**2, rel=1e-12)
 
 
-@pytest.mark.parametrize("method", ["dynamic", "adaptive"])
-def test_mesh_borders_are_exact_in_float32(method):
+def test_mesh_borders_are_exact_in_float32():
     """Relative to a whole-metre datum, as in GLB files."""
     rng = np.random.default_rng(0)
     (grid, frame), *_ = block(rng, 1.0, (250, 250), 0.5).values()
-    (mesh,) = meshes({(0, 0): (grid, frame)}, rng, Options(method=method))
+    (mesh,) = meshes({(0, 0): (grid, frame)}, rng, Options())
     x, y, z = mesh.vertices.T
     border = (x == 0) | (x == 250) | (y == 0) | (y == 250)
     assert border.sum() > 300

@@ -13,7 +13,6 @@ from flexroad.tasks.sample import Options, sample
 from tests.crossing import GROUND_M, RISE, WEST, Crossing
 from tests.mesh_union import Union
 
-METHODS = pytest.mark.parametrize("method", ["dynamic", "adaptive"])
 PLACES = {
     "in one tile": Crossing(),
     "over a border": Crossing((60.0, 30.0)),
@@ -29,8 +28,8 @@ CASES = pytest.mark.parametrize("crossing", PLACES.values(), ids=PLACES.keys())
 
 
 @cache
-def meshes(crossing, method):
-    options = Options(method=method)
+def meshes(crossing):
+    options = Options()
     return [sample(*tile[:3], options, tile.frame) for tile in crossing.tiles()]
 
 
@@ -47,11 +46,10 @@ def at_joints(mesh, level):
     return {tuple(vertex) for vertex in mesh.vertices[near].astype(np.float32).tolist()}
 
 
-@METHODS
 @CASES
-def test_levels_are_height_fields_with_common_vertices_on_joints(crossing, method):
+def test_levels_are_height_fields_with_common_vertices_on_joints(crossing):
     number, level, count = crossing.number, crossing.level, 0
-    for mesh in meshes(crossing, method):
+    for mesh in meshes(crossing):
         assert all(faults(mesh.at(k)) == () for k in mesh.numbers)
         if number in mesh.numbers:
             of_ground, of_deck = (at_joints(mesh.at(k), level) for k in (0, number))
@@ -60,10 +58,9 @@ def test_levels_are_height_fields_with_common_vertices_on_joints(crossing, metho
     assert count >= 4
 
 
-@METHODS
 @CASES
-def test_levels_have_no_open_edge_over_borders(crossing, method):
-    parts, number = meshes(crossing, method), crossing.number
+def test_levels_have_no_open_edge_over_borders(crossing):
+    parts, number = meshes(crossing), crossing.number
     for k in (0, number):
         whole = Union.of(absolute(mesh.at(k)) for mesh in parts if k in mesh.numbers)
         start, side = np.array([500000.0, 5600000.0]), crossing.size
@@ -77,9 +74,8 @@ def test_levels_have_no_open_edge_over_borders(crossing, method):
         assert whole.area == pytest.approx((2 * side) ** 2 if k == 0 else crossing.level.areas.area, abs=0.1)
 
 
-@METHODS
 @CASES
-def test_edges_of_deck_on_joints_are_edges_of_ground(crossing, method):
+def test_edges_of_deck_on_joints_are_edges_of_ground(crossing):
     level = crossing.level
 
     def edges_on_joints(mesh, most):
@@ -90,19 +86,18 @@ def test_edges_of_deck_on_joints_are_edges_of_ground(crossing, method):
         on_joint = shapely.dwithin(level.joints, middles, 0.02)
         return {frozenset(map(tuple, pair)) for pair in ends[on_joint].tolist()}
 
-    parts = meshes(crossing, method)
+    parts = meshes(crossing)
     ground = set().union(*(edges_on_joints(mesh.at(0), 2) for mesh in parts))
     deck = set().union(*(edges_on_joints(mesh.at(crossing.number), 1) for mesh in parts))
     assert deck
     assert deck <= ground
 
 
-@METHODS
-def test_heights_of_meshes_are_those_of_levels(method):
+def test_heights_of_meshes_are_those_of_levels():
     crossing = Crossing((40.0, 30.0), angle=10.0)
     tile = next(crossing.tiles())
     grid, level = tile.road.core, crossing.level
-    mesh = sample(*tile[:3], Options(method=method), tile.frame)
+    mesh = sample(*tile[:3], Options(), tile.frame)
     ground, deck = (drape(mesh.at(k), grid) + mesh.origin[2] for k in (0, 1))
     x, y = np.meshgrid(grid.eastings, grid.northings)
     inside = shapely.intersects_xy(level.areas, x, y)
@@ -114,11 +109,10 @@ def test_heights_of_meshes_are_those_of_levels(method):
     assert mesh.road[mesh.level == 1].all()
 
 
-@METHODS
-def test_mesh_of_tile_far_from_decks_is_that_without_levels(method):
+def test_mesh_of_tile_far_from_decks_is_that_without_levels():
     crossing = Crossing((30.0, 30.0))
     *_, tile = crossing.tiles()
-    options = Options(method=method)
+    options = Options()
     mesh = sample(*tile[:3], options, tile.frame)
     spline = replace(tile.surface, levels=())
     plain = sample(spline, replace(tile.road, levels=()), tile.clusters, options, tile.frame)
@@ -128,9 +122,8 @@ def test_mesh_of_tile_far_from_decks_is_that_without_levels(method):
 
 
 @pytest.mark.slow
-@METHODS
 @pytest.mark.parametrize("seed", range(30))
-def test_random_decks_and_tubes_meet_the_ground(seed, method):
+def test_random_decks_and_tubes_meet_the_ground(seed):
     rng = np.random.default_rng(seed)
     crossing = Crossing(
         middle=tuple(rng.uniform(28, 92, 2)),
@@ -139,6 +132,6 @@ def test_random_decks_and_tubes_meet_the_ground(seed, method):
         width=rng.uniform(2.5, 14),
         number=int(rng.choice([1, -1, 2])),
     )
-    test_levels_are_height_fields_with_common_vertices_on_joints(crossing, method)
-    test_levels_have_no_open_edge_over_borders(crossing, method)
-    test_edges_of_deck_on_joints_are_edges_of_ground(crossing, method)
+    test_levels_are_height_fields_with_common_vertices_on_joints(crossing)
+    test_levels_have_no_open_edge_over_borders(crossing)
+    test_edges_of_deck_on_joints_are_edges_of_ground(crossing)

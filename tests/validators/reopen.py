@@ -29,30 +29,27 @@ import numpy as np
 import pyogrio
 import pyopencrg
 import rasterio
-import rhino3dm
 import scipy
 import shapely
 import trimesh
-from pyproj import Transformer
 
 import flexroad
 from flexroad.pipeline.export.source import select
 from tests import validators
-from tests.read_exports import OFFSET_M, pmtiles_pixels, spline_heights
+from tests.read_exports import OFFSET_M, spline_heights
 from tests.real.streets import STREETS
 from tests.validators.opencascade import read_step
 from tests.validators.opendrive import by_carla, by_sumo, in_crs, printed_mm
 
 HERE = Path(__file__).parent
 FLEXROAD = Path(sys.executable).with_name("flexroad")
-FORMATS = "3dtiles,landxml,obj,heightfield,step,mosaic,pmtiles,3dm,crg,xodr,lines"
+FORMATS = "3dtiles,landxml,obj,step,mosaic,crg,xodr,lines"
 ROADS = "class = 'road' AND certainty <> 'low' AND visible_in IS NOT 'rgb'"
 SURFACE, SMOOTH, MESH = "query", "query without steps", "mesh of the run"
 """What heights are compared with: `RunView.height`, the same without kerbs and walls, or vertices."""
 SAME_M = 0.001
 """Distance from a vertex of the run within which files have it (m)."""
 RNG_SEED = 0
-POINTS_PER_TILE = 500
 
 
 @dataclass(frozen=True)
@@ -184,49 +181,6 @@ def opencrg(survey: Survey, _: Path) -> Iterator[Found]:
         yield survey.compare(version("pyopencrg"), "crg", against, points, of_roads)
 
 
-def mujoco(survey: Survey, _: Path) -> Iterator[Found]:
-    """Height fields at nodes, and OBJ, of which MuJoCo reads the first group, the road, in cells of road."""
-    rng, program = np.random.default_rng(RNG_SEED), _mujoco_version()
-    nodes, printed = [], []
-    for file in survey.files("heightfield/*_heightfield.json"):
-        place = json.loads(file.read_text())
-        steps = rng.integers(1, np.array(place["size"]) - 1, (POINTS_PER_TILE, 2))
-        nodes.append(np.array(place["bounds"][:2]) + steps * place["spacing_m"])
-        printed += [place["precision_m"]] * POINTS_PER_TILE
-    places, errors = np.concatenate(nodes), np.array(printed)
-    known = np.isfinite(survey.heights(SURFACE, *places.T))
-    # At a node a ray may pass between the triangles.
-    points = np.column_stack([places, _rays(survey.out / "heightfield", places + 1e-6)])
-    yield survey.compare(program, "heightfield", SURFACE, points[known], errors[known])
-    cells = []
-    for tile in select(survey.run).finished():
-        core = tile.road.core
-        rows, columns = np.nonzero(tile.road.mask[tile.road.grid.window(core)])
-        chosen = rng.choice(len(rows), min(POINTS_PER_TILE, len(rows)), replace=False)
-        # Where the run has measured the distance of the mesh from the surface.
-        shift = 0.25 * core.cell
-        easting, northing = core.eastings[columns[chosen]] + shift, core.northings[rows[chosen]] + shift
-        cells.append(np.column_stack([easting, northing]))
-    places = np.concatenate(cells)
-    points = np.column_stack([places, _rays(survey.out / "obj", places)])
-    largest = survey.manifest["formats"]["obj"]["mesh_distances"]["mesh_max_road_m"]
-    yield survey.compare(program, "obj, road", SURFACE, points, largest + _precision(survey, "obj"))
-
-
-def _mujoco_version() -> str:
-    code = "import mujoco; print(mujoco.__version__)"
-    return subprocess.run(
-        [validators.python(), "-c", code], capture_output=True, text=True, check=True
-    ).stdout.strip()
-
-
-def _rays(folder: Path, places: np.ndarray) -> np.ndarray:
-    command = [validators.python(), HERE / "cast_rays.py", folder]
-    text = json.dumps(places.tolist())
-    done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
-    return np.array(json.loads(done.stdout), float)
-
-
 def _precision(survey: Survey, name: str) -> float:
     return float(survey.manifest["formats"][name]["precision_m"])
 
@@ -266,20 +220,6 @@ def opencascade(survey: Survey, _: Path) -> Iterator[Found]:
         assert valid, f"{file}: OpenCASCADE finds it invalid"
         parts.append(points + json.loads(file.with_name(f"{file.stem}_stp.json").read_text())["origin"])
     yield from _cad(survey, "8.0.1", "step", np.concatenate(parts))
-
-
-def rhino(survey: Survey, _: Path) -> Iterator[Found]:
-    """The surfaces of 3DM, on a lattice over each tile."""
-    parts = []
-    origin = np.array(json.loads(survey.files("obj/*.json")[0].read_text())["origin"])
-    for file in survey.files("3dm/*.3dm"):
-        for part in (item.Geometry for item in rhino3dm.File3dm.Read(str(file)).Objects):
-            if isinstance(part, rhino3dm.NurbsSurface):
-                ends = part.Domain(0), part.Domain(1)
-                u, v = (np.linspace(end.T0, end.T1, 30) for end in ends)
-                at = [part.PointAt(a, b) for a in u for b in v]
-                parts.append(np.array([(point.X, point.Y, point.Z) for point in at]) + origin)
-    yield from _cad(survey, rhino3dm.__version__, "3dm", np.concatenate(parts))
 
 
 def _cad(survey: Survey, program: str, name: str, points: np.ndarray) -> Iterator[Found]:
@@ -331,28 +271,15 @@ def _lines(survey: Survey, program: str, vertices: np.ndarray) -> Iterator[Found
     yield survey.compare(program, "lines", SURFACE, vertices, 1e-4 + steps)
 
 
-def pmtiles(survey: Survey, _: Path) -> Iterator[Found]:
-    """Map tiles of the finest level at the middle of pixels."""
-    (file,) = survey.files("pmtiles/*.pmtiles")
-    plan = Transformer.from_crs("EPSG:3857", survey.manifest["crs"], always_xy=True)
-    x, y, height = (np.concatenate(part) for part in zip(*pmtiles_pixels(file), strict=True))
-    points = np.column_stack([*plan.transform(x, y), height])
-    known = np.isfinite(survey.heights(SURFACE, *points[:, :2].T))
-    yield survey.compare(version("pmtiles"), "pmtiles", SURFACE, points[known], _precision(survey, "pmtiles"))
-
-
 PROGRAMS: dict[str, tuple[str, Callable[[Survey, Path], Iterator[Found]]]] = {
     "CARLA": ("carla", carla),
     "SUMO": ("sumo", sumo),
     "PyOpenCRG": ("carla", opencrg),
-    "MuJoCo": ("mujoco", mujoco),
     "Blender": ("bpy", blender),
     "trimesh": ("", trimesh_),
     "OpenCASCADE": ("OCP", opencascade),
-    "rhino3dm": ("", rhino),
     "QGIS": ("qgis", qgis),
     "GDAL": ("", gdal),
-    "pmtiles": ("", pmtiles),
 }
 """What opens files, and the module that another interpreter needs for it; empty for modules of the tests."""
 

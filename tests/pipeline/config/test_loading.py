@@ -126,17 +126,11 @@ def test_override_with_other_filter_uses_its_defaults(tmp_path):
             {"fit": {"huber_m": 0.1}},
             "x: fit.huber_m: unknown key; it is an option of method smoothing_spline, not of nurbs",
         ),
-        ({"ecsrc": {"variant": "off"}}, "x: ecsrc.variant: unknown key; it is called method"),
-        ({"ecsrc": "grounded"}, "x: ecsrc: there is no method 'grounded'; it is called planar"),
+        ({"ecsrc": "plane"}, "x: ecsrc: there is no method 'plane'; did you mean planar?"),
         ({"cluster": {"batch": 4}}, "x: cluster.batch: unknown key; valid are account, "),
         (
             {"fit": {"method": "smoothing_spline", "engine": "torch"}},
-            "x: fit.engine: input should be 'numba', not 'torch'",
-        ),
-        ({"fit": {"solver": "irls"}}, "x: fit.solver: unknown key; the solver is a method of its own"),
-        (
-            {"segment": {"method": "vector", "hygiene": {}}},
-            "x: segment.hygiene: unknown key; it is called cleanup",
+            "x: fit.engine: unknown key; it is an option of method nurbs, not of smoothing_spline",
         ),
         ({"fit": [1]}, "x: fit: expected a mapping of options, not [1]"),
         ({"variants": {"a": {"fitt": {}}}}, "x: variants.a.fitt: unknown key; did you mean fit?"),
@@ -167,8 +161,6 @@ def test_compose_export_without_variants_takes_the_main_one():
 def test_load_config_unusable_file_raises(tmp_path):
     with pytest.raises(ConfigError, match="did you mean paper"):
         load_config("papr")
-    with pytest.raises(ConfigError, match="no configuration 'nightly': .*did you mean production"):
-        load_config("nightly")
     bad = tmp_path / "bad.yaml"
     bad.write_text("fit: {degree: 3")
     with pytest.raises(ConfigError, match=r"bad.yaml: not readable as YAML"):

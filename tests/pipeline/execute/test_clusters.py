@@ -1,4 +1,4 @@
-"""Executor on running clusters (real processes on loopback); options of SLURM and Kubernetes clusters."""
+"""Executor on running clusters (real processes on loopback); options of SLURM clusters."""
 
 import ctypes
 import os
@@ -17,7 +17,7 @@ from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor, clusters
-from flexroad.pipeline.execute.clusters import kubernetes_options, open_cluster
+from flexroad.pipeline.execute.clusters import open_cluster
 from flexroad.pipeline.execute.slurm import slurm_options
 from flexroad.pipeline.execute.workers import checksum_of_code
 from tests.dask_processes import Processes, until, wait_for
@@ -406,34 +406,17 @@ def test_map_on_slurm_starts_and_ends_jobs(tmp_path, monkeypatch):
     assert not list((tmp_path / "home").iterdir())
 
 
-def test_kubernetes_options_set_pods():
-    operator = pytest.importorskip("dask_kubernetes.operator")
-    cluster = Cluster(kind="kubernetes", workers=5, memory="2 GiB", image="roads:1")
-    spec = operator.make_cluster_spec(**kubernetes_options(cluster))["spec"]
-    assert spec["worker"]["replicas"] == 5
-    (container,) = spec["worker"]["spec"]["containers"]
-    assert container["image"] == "roads:1"
-    assert container["resources"]["limits"] == {"cpu": "1", "memory": str(2 * 1024**3)}
-    assert {"name": "OMP_NUM_THREADS", "value": "1"} in container["env"]
-    assert container["args"][:4] == ["dask", "worker", "--nthreads", "1"]
-
-
 @pytest.mark.parametrize(
-    ("kind", "remedy"),
-    [("slurm", "there is no sbatch here"), ("kubernetes", r"pip install 'flexroad\[kubernetes\]'")],
+    ("module", "remedy"),
+    [("", "there is no sbatch here"), ("dask_jobqueue", r"pip install 'flexroad\[slurm\]'")],
 )
-def test_open_cluster_missing_program_raises(kind, remedy, monkeypatch, tmp_path):
+def test_open_cluster_missing_program_raises(module, remedy, monkeypatch, tmp_path):
+    pytest.importorskip("dask_jobqueue")
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setitem(sys.modules, "dask_kubernetes.operator", None)
-    cluster = Cluster(kind=kind, security="none")
+    if module:
+        monkeypatch.setitem(sys.modules, module, None)
+    cluster = Cluster(kind="slurm", security="none")
     with pytest.raises(ConfigError, match=remedy), open_cluster(cluster, None, None, False):
-        pass
-
-
-def test_open_cluster_kubernetes_with_tls_raises():
-    cluster = Cluster(kind="kubernetes", image="roads:1")
-    match = "Dask's operator has no TLS.*set cluster.security to none"
-    with pytest.raises(ConfigError, match=match), open_cluster(cluster, None, None, False):
         pass
 
 

@@ -9,7 +9,7 @@ import sys
 import psutil
 import pytest
 
-from flexroad.pipeline.execute.start import extra
+from flexroad.pipeline.execute.start import load_jobqueue
 from tests import command_line
 from tests.dask_processes import until
 
@@ -56,11 +56,11 @@ def test_workers_import_no_module_of_the_current_folder(command, made_survey, qu
     assert not marks.exists()
 
 
-def test_extra_keeps_the_handler_of_interrupts(monkeypatch):
+def test_import_of_jobqueue_keeps_the_handler_of_interrupts(monkeypatch):
     """The module dask_jobqueue.runner replaces it."""
     pytest.importorskip("dask_jobqueue")
     for name in [name for name in sys.modules if name.partition(".")[0] == "dask_jobqueue"]:
         monkeypatch.delitem(sys.modules, name)
     before = signal.getsignal(signal.SIGINT)
-    extra("slurm")
+    load_jobqueue()
     assert signal.getsignal(signal.SIGINT) is before

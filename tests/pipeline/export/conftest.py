@@ -64,12 +64,8 @@ def run_city(folder: Path) -> SmallCity:
     return SmallCity(run.path, (first, second), third, fourth)
 
 
-def contents(folder: Path) -> dict[str, bytes | int]:
-    """The files of an export by name, without its manifest and the hidden ones; of 3DM files the sizes.
-
-    The library that writes 3DM puts times and random identifiers into them.
-    """
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files of an export by name, without its manifest and the hidden ones."""
     files = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     shown = [path for path in files if not any(part.startswith(".") for part in path.parts)]
-    named = {str(path): (folder / path).read_bytes() for path in shown if path.name != "export.json"}
-    return {name: len(data) if name.endswith(".3dm") else data for name, data in named.items()}
+    return {str(path): (folder / path).read_bytes() for path in shown if path.name != "export.json"}

@@ -16,7 +16,7 @@ from tests.permissions import permissions_enforced
 from .conftest import OPTIONS, contents
 
 DATUM = ("--height-offset", "47.5")
-WRITTEN_WHOLE = ("mosaic", "pmtiles")
+WRITTEN_WHOLE = ("mosaic",)
 """Formats that have no markers: each export writes them again."""
 each_format = pytest.mark.parametrize("name", FORMATS)
 
@@ -155,14 +155,6 @@ def test_files_of_others_in_the_folder_of_another_format_are_refused(made_city, 
     line = refused(made_city.path, "--format", "obj,mosaic", "-o", tmp_path)
     assert str(tmp_path / "mosaic" / "height.tif") in line
     assert (tmp_path / "mosaic" / "height.tif").read_text() == "mine"
-
-
-def test_export_of_an_earlier_version_goes_on(made_city, flexroad, tmp_path):
-    words = ["export", made_city.path, "--format", "obj", "-o", tmp_path]
-    flexroad(*words).expected(0)
-    (tmp_path / BEGUN).unlink()
-    flexroad(*words).expected(0)
-    assert (tmp_path / BEGUN).read_text() == "obj\n"
 
 
 def test_folder_that_another_export_writes_is_refused(made_city, refused, flexroad, tmp_path):

@@ -2,13 +2,11 @@
 
 import gzip
 import json
-import sys
 import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import rhino3dm
 from rich.console import Console
 
 from flexroad.catalog import Catalog
@@ -25,7 +23,7 @@ from flexroad.pipeline.run.progress import StepProgress
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.errors import TaskError
-from tests.read_exports import OFFSET_M, heightfields, off_surface, true_heights, vertices
+from tests.read_exports import OFFSET_M, off_surface, vertices
 
 OPTIONS = Options(Datum("offset", str(OFFSET_M)))
 
@@ -56,22 +54,11 @@ def test_vertices_of_all_formats_lie_on_the_surface(city, exported):
         assert np.isfinite(error).mean() > 0.95
 
 
-def test_nodes_of_height_fields_lie_on_the_surface(city, exported):
-    points, precision = heightfields(exported / "heightfield")
-    assert precision < 0.001
-    error = np.abs(points[:, 2] - true_heights(city, points[:, :2]))
-    assert error.max() <= precision * 1.01
-
-
-def test_step_and_3dm_have_a_file_per_tile(exported):
-    """Their content is tested with their modules."""
+def test_step_has_a_file_per_tile(exported):
+    """Its content is tested with its module."""
     assert len(list((exported / "step").glob("*.stp"))) == 2
     for file in (exported / "step").glob("*.stp"):
         assert file.read_text().startswith("ISO-10303-21;")
-    for file in (exported / "3dm").glob("*.3dm"):
-        model = rhino3dm.File3dm.Read(str(file))
-        assert len(model.Objects) == 3
-    assert len(list((exported / "3dm").glob("*.3dm"))) == 2
 
 
 def test_manifest_says_what_was_written(city, exported):
@@ -131,16 +118,6 @@ def test_selection_by_id_and_box(city):
         select(city, ids=[third.id])
     with pytest.raises(ConfigError, match="exports no variant 'plane'; it has flexroad"):
         select(city, variant="plane")
-
-
-@pytest.mark.parametrize(("name", "library"), [("3dm", "rhino3dm"), ("pmtiles", "pmtiles.writer")])
-def test_library_that_is_missing_is_named_before_any_file_is_written(
-    city, tmp_path, monkeypatch, name, library
-):
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(ConfigError, match=r"^[^:]*needs? .*pip install 'flexroad\[export\]'$"):
-        export(select(city), tmp_path, ["landxml", name], OPTIONS, SerialExecutor())
-    assert not list(tmp_path.iterdir())
 
 
 def test_error_ends_the_progress_lines(city, tmp_path, monkeypatch):

@@ -24,7 +24,7 @@ from tests.tasks.export.test_step import read_surface
 
 SIZE_M, HALF_M, LOWER_M = 60, 5, 0.4
 """Side of the tile; half the width of a road through its middle; depth of the ground beside it."""
-FORMATS = ["crg", "xodr", "lines", "step", "3dm"]
+FORMATS = ["crg", "xodr", "lines", "step"]
 
 
 def ground(easting, west):
@@ -104,17 +104,16 @@ def test_road_within_the_mask_has_no_step(street, tmp_path):
     assert "misses the surface by at most" in entries["crg"]["summary"]
 
 
-def test_step_and_3dm_say_what_they_leave_out_and_queries_have_it(street, tmp_path):
+def test_step_says_what_it_leaves_out_and_queries_have_it(street, tmp_path):
     run, kerb = street
     entries, _ = exported(run, 6.0, tmp_path)
     (tile,) = Catalog.read(run / "catalog.parquet").tiles
     (west, south, _, _), out = tile.grid.bounds, tmp_path / "out"
     about = json.loads((out / "step" / f"{tile.id}_stp.json").read_text())
     differs = f"with kerbs and walls it differs by up to {steps(run):.2f} m, where the run has no road"
-    for name in ("step", "3dm"):
-        assert entries[name]["steps_max_m"] == pytest.approx(steps(run), abs=0.001)
-        assert entries[name].get("summary", "").endswith(differs if kerb else "")
-        assert ("summary" in entries[name]) == bool(kerb)
+    assert entries["step"]["steps_max_m"] == pytest.approx(steps(run), abs=0.001)
+    assert entries["step"].get("summary", "").endswith(differs if kerb else "")
+    assert ("summary" in entries["step"]) == bool(kerb)
     assert about["steps_max_m"] == entries["step"]["steps_max_m"]
     surface = read_surface((out / "step" / f"{tile.id}.stp").read_text())
     for y in (24.5, 25.5, 34.5, 35.5):

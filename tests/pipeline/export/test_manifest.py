@@ -17,7 +17,7 @@ from flexroad.tasks.metrics.mesh_distance import FIGURES
 from .conftest import OPTIONS
 
 DOCS = Path(__file__).parents[3] / "docs" / "export.md"
-MEASURED = {"landxml", "cityjson", "obj", "heightfield"}
+MEASURED = {"landxml", "cityjson", "obj"}
 OF_MESHES = {"3dtiles", "landxml", "cityjson", "obj"}
 
 
@@ -93,14 +93,6 @@ def test_height_error_of_cityjson_is_that_of_its_vertices(made_city, exported, m
         east, north, height = (np.array(feature["vertices"]) * scale + shift).T
         errors.append(np.abs(surfaces[item["attributes"]["tile"]].height(east, north) - height).max())
     assert manifest["formats"]["cityjson"]["height_error_m"] == pytest.approx(max(errors), abs=1e-7)
-
-
-def test_height_error_of_height_fields_is_half_of_the_largest_step(exported, manifest):
-    steps = [
-        json.loads(file.read_text())["step_m"]
-        for file in (exported / "heightfield").glob("*_heightfield.json")
-    ]
-    assert manifest["formats"]["heightfield"]["height_error_m"] == max(steps) / 2
 
 
 def test_results_name_the_meshes(made_city, exported, manifest, tmp_path):

@@ -169,12 +169,9 @@ def test_full_disk_leaves_no_file(town, written, tmp_path, monkeypatch, part):
 
 
 def test_files_of_an_export_that_was_killed_are_removed(town, tmp_path):
-    """Also those of earlier versions, which have no lock."""
-    of_earlier = tmp_path / "mosaic" / mosaic.DRAFTS
     of_killed = tmp_path / "mosaic" / ".flexroad-killed"
-    for left in (of_earlier, of_killed):
-        left.mkdir(parents=True)
-        (left / "height").write_bytes(b"draft")
+    of_killed.mkdir(parents=True)
+    (of_killed / "height").write_bytes(b"draft")
     (of_killed / LOCK).touch()
     export(select(town.path), tmp_path, ["mosaic"], Options(), SerialExecutor())
     found = {file.name for file in (tmp_path / "mosaic").iterdir()}

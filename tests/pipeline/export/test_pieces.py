@@ -66,18 +66,6 @@ def test_second_export_encodes_nothing_and_says_the_same(made_city, tmp_path, na
     assert file.stat().st_mtime_ns == before
 
 
-@each
-def test_mark_of_an_earlier_version_is_valid(made_city, tmp_path, name, encoded):
-    write(made_city, tmp_path, name)
-    mark = json.loads((tmp_path / f".{name}.json").read_text())
-    ((file, size),) = mark["sizes"].items()
-    earlier = {"key": mark["key"], "name": file, "size": size, "figures": mark["row"]}
-    (tmp_path / f".{name}.json").write_text(json.dumps(earlier))
-    encoded.clear()
-    write(made_city, tmp_path, name)
-    assert not encoded
-
-
 def test_whole_file_is_written_once_and_replaces_one_of_another_name(tmp_path):
     filled = []
 

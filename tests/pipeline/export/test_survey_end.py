@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 import rasterio
-from PIL import Image
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.benchmark.scenes import write_scenes
@@ -49,7 +48,7 @@ def survey(tmp_path_factory):
 @pytest.fixture(scope="module")
 def exported(survey, tmp_path_factory):
     out = tmp_path_factory.mktemp("exported")
-    formats = ["heightfield", "step", "3dm", "obj"]
+    formats = ["step", "obj"]
     return out, export(select(survey), out, formats, Options(), SerialExecutor())["formats"]
 
 
@@ -59,38 +58,7 @@ def tiles(survey):
     return sorted((tile.tile for tile in select(survey).finished()), key=lambda tile: tile.grid.west)
 
 
-def test_height_field_is_flat_beyond_the_survey_with_holes_and_a_number(exported, tiles):
-    out, manifest = exported
-    west, east = (
-        json.loads((out / "heightfield" / f"{tile.id}_heightfield.json").read_text()) for tile in tiles
-    )
-    values, holes = (
-        np.asarray(Image.open(out / "heightfield" / f"{tiles[1].id}{name}"))
-        for name in ("_heightfield.png", "_holes.png")
-    )
-    size = len(values)
-    x = np.arange(size) * SIZE_M / (size - 1)
-    beyond = (x > COLUMNS) | (x < MISSING)[:, None]
-    # Nodes on the common edge are on the ground of the western tile.
-    beyond[:, 0] = False
-    np.testing.assert_array_equal(holes, np.where(beyond, 255, 0))
-    assert (west["nodes_without_height"], east["nodes_without_height"]) == (0, beyond.sum())
-    # The lowest and highest covered place have 125 m and 135 m; limits are whole metres around them.
-    assert (west["low_m"], west["high_m"]) == (east["low_m"], east["high_m"])
-    assert east["low_m"] in (124, 125)
-    assert east["high_m"] in (135, 136)
-    heights = east["low_m"] + values * east["step_m"]
-    expected = np.tile(131 + 0.1 * np.minimum(x, x[x <= COLUMNS].max()), (size, 1))
-    np.testing.assert_allclose(heights[x >= MISSING], expected[x >= MISSING], rtol=0, atol=2e-3)
-    np.testing.assert_allclose(heights[~beyond], expected[~beyond], rtol=0, atol=2e-3)
-    assert heights.min() == pytest.approx(131, abs=2e-3)
-    assert heights.max() == pytest.approx(expected.max(), abs=2e-3)
-    assert manifest["heightfield"]["notes"] == [
-        "1 tile: nodes beyond the survey are flat, and holes in the mask"
-    ]
-
-
-def test_step_and_3dm_end_with_the_survey_and_tiles_lie_side_by_side(exported, survey, tiles):
+def test_step_ends_with_the_survey_and_tiles_lie_side_by_side(exported, survey, tiles):
     """The eastern tile begins where the western one ends, as all have one origin."""
     out, manifest = exported
     origin = Run.open(survey).origin
@@ -108,20 +76,7 @@ def test_step_and_3dm_end_with_the_survey_and_tiles_lie_side_by_side(exported, s
     assert low[0] == pytest.approx(across, abs=1e-9)
     np.testing.assert_allclose((high - low)[:2], (COLUMNS, ROWS), rtol=0, atol=1e-6)
     note = "1 tile: surface cut to the rectangle that the survey covers"
-    assert manifest["step"]["notes"] == manifest["3dm"]["notes"] == [note]
-
-
-def test_3dm_has_the_surface_of_the_covered_rectangle(exported, survey, tiles):
-    rhino3dm = pytest.importorskip("rhino3dm")
-    out, _ = exported
-    model = rhino3dm.File3dm.Read(str(out / "3dm" / f"{tiles[1].id}.3dm"))
-    (surface,) = (item.Geometry for item in model.Objects if item.Attributes.Name == "surface")
-    first, last = surface.PointAt(0, 0), surface.PointAt(1, 1)
-    east, north, _, _ = np.array(tiles[1].grid.bounds) - np.tile(Run.open(survey).origin, 2)
-    np.testing.assert_allclose([first.X, first.Y, first.Z], [east, north, 131], rtol=0, atol=2e-3)
-    np.testing.assert_allclose(
-        [last.X, last.Y, last.Z], [east + COLUMNS, north + ROWS, 135], rtol=0, atol=2e-3
-    )
+    assert manifest["step"]["notes"] == [note]
 
 
 def test_obj_of_all_tiles_has_one_origin(exported, survey, tiles):

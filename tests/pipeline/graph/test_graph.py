@@ -74,12 +74,10 @@ def reference_fingerprints(graph, config) -> dict[str, dict[str, str]]:
         for stage, inputs in STAGES.items():
             options = chain[stage]
             module = stage_module(options)
-            # None of the configurations changes an option that was added later.
-            values = {k: v for k, v in options.model_dump(mode="json").items() if k not in options.LATER}
             hashed = [
                 stage,
                 module.VERSION,
-                values,
+                options.model_dump(mode="json"),
                 [by_stage[name] for name in inputs] or asdict(tile.grid),
                 [source for source in graph.sources if source[0] in getattr(module, "READS", ())],
                 [],
@@ -340,24 +338,6 @@ def test_several_rasters_are_hashed_as_joined_and_one_as_ever(name, files, end, 
     tile = replace(Catalog.read(survey).tiles[0], layers=(layer,))
     hashed = json.loads(SourceFiles(tile, lambda path: None, checksum=False).text(layer))
     assert hashed == [name, [[file, None] for file in files], [1], "EPSG:25832", *end]
-
-
-def test_later_option_enters_fingerprints_only_if_it_is_changed():
-    class Extended(mask.Options):
-        __module__ = mask.__name__
-        LATER = ("extra",)
-        extra: int = 3
-
-    assert stage_head("segment", Extended()) == stage_head("segment", mask.Options())
-    assert stage_head("segment", Extended(extra=4))[-1] == {"method": "mask", "extra": 4}
-
-
-def test_options_of_levels_do_not_change_fingerprints():
-    """The hash is that of the version before these options."""
-    head = json.dumps(stage_head("segment", vector.Options()), sort_keys=True)
-    assert "levels" not in head
-    assert hashlib.sha256(head.encode()).hexdigest()[:16] == "a1bf6d02b744da5e"
-    assert stage_head("segment", vector.Options(levels=True))[-1]["levels"] is True
 
 
 def test_version_of_levels_enters_fingerprints_only_with_levels(monkeypatch):

@@ -93,6 +93,3 @@ def test_gather_ranks_tiles_by_error_estimate(survey, quick_config, tmp_path):
     with rasterio.open(folder / f"{tile}_flexroad_support.tif") as raster:
         assert raster.nodata == Support.NONE
         assert set(np.unique(raster.read(1))) <= set(Support)
-    # Runs of earlier versions have fewer columns and can still be read.
-    table.drop(columns=["error_estimate_m", "flags"]).to_parquet(run.path / "metrics.parquet")
-    assert gather(run).worst_estimates.empty

@@ -151,14 +151,13 @@ def hilly(x, y):
     return 100 + 2 * np.sin(x / 25) + 1.5 * np.cos(y / 30)
 
 
-@pytest.mark.parametrize(("lateral", "within"), [("superelevation", 0.02), ("shape", 0.005)])
-def test_a_network_of_netconvert_lies_on_a_hilly_surface(network, lateral, within):
-    root, rows = lifted(network, hilly, lateral=lateral)
+def test_a_network_of_netconvert_lies_on_a_hilly_surface(network):
+    root, rows = lifted(network, hilly)
     assert len(rows) == 18
     for element, row in zip(root.findall("road"), rows, strict=True):
         x, y, z = places(element, float(extent(element, np.zeros(1)).right[0]), 0.0).T
-        assert np.abs(z - hilly(x, y)).max() < within, row
-        assert (row.shape_m if lateral == "shape" else row.superelevation_m) < within
+        assert np.abs(z - hilly(x, y)).max() < 0.02, row
+        assert row.superelevation_m < 0.02
 
 
 def test_linked_roads_of_netconvert_meet_within_a_millimetre(network):

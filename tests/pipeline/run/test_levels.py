@@ -212,7 +212,7 @@ def test_dask_gives_the_same_products(run, tmp_path):
         (["ecsrc=paper"], "segment.levels needs ecsrc: planar, not paper"),
         (["fit=nurbs"], "segment.levels needs fit: smoothing_spline, not nurbs"),
         (["load.halo_m=20"], "segment.levels needs load.halo_m of 40 or more, not 20"),
-        (["sample.method=uniform"], "segment.levels needs sample.method dynamic or adaptive, not uniform"),
+        (["sample.method=uniform"], "segment.levels needs sample.method dynamic, not uniform"),
         (["sample.mask=filtered"], "segment.levels needs sample.mask raw, not filtered"),
         (["segment.outlines=false"], "levels need the outlines of roads"),
     ],

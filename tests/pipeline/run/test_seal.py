@@ -52,7 +52,6 @@ PROGRAMS = {
     "prologue": ["touch {mark}"],
     "job_extra": ["--comment x\ntouch {mark}"],
     "queue": "x\ntouch {mark}",
-    "image": "registry/other",
     "security": "none",
 }
 

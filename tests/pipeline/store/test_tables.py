@@ -38,14 +38,6 @@ def test_read_metrics_damaged_byte_raises_or_changes_nothing(tmp_path):
     assert refused > 150
 
 
-def test_read_metrics_of_earlier_version_lacks_columns(tmp_path):
-    table = pd.DataFrame({"tile_id": ["a"], "l2_road_m": [0.028]})
-    table.to_parquet(tmp_path / "metrics.parquet")
-    read = read_metrics(tmp_path)
-    assert list(read.columns) == list(COLUMNS)
-    assert (read.l2_road_m[0], read.l2_terrain_m.isna().all()) == (0.028, True)
-
-
 FORMULAS = ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\t=1", "\n=1"]
 PLAIN = ["", "a=1", "'quoted'", "-5", "+1.5e-3", "-81%", "-500_5600", "-1,5", "1-2", "-81% to -79%", "é"]
 
@@ -88,6 +80,12 @@ def test_levels_have_a_table_of_their_own_while_tiles_have_some(tmp_path):
     assert read_metrics(tmp_path).tile_id.tolist() == ["=a", "b"]
     write_tables(tmp_path, [tile], [])
     assert not (tmp_path / "levels.csv").exists()
+
+
+def test_read_metrics_missing_column_raises(tmp_path):
+    pd.DataFrame({"tile_id": ["a"]}).to_parquet(tmp_path / "metrics.parquet")
+    with pytest.raises(ConfigError, match=r"is damaged: .*'variant'.*not in index.*flexroad rerun"):
+        read_metrics(tmp_path)
 
 
 def test_read_metrics_unknown_column_raises(tmp_path):

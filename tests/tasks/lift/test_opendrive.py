@@ -11,7 +11,6 @@ from flexroad.tasks.lift import opendrive, plan_view
 from flexroad.tasks.lift.lanes import extent
 from flexroad.tasks.lift.types import Frame, Heights, Lifted, Options
 from tests.read_opendrive import place, polynomial
-from tests.tasks.export import test_opencrg as opencrg
 
 LEVEL = 'level="false"'
 LANES = """<lanes>
@@ -116,17 +115,6 @@ def test_lanes_lie_on_ground_that_is_planar_across(tmp_path, surface, plan, with
     assert row.note == ""
 
 
-@pytest.mark.parametrize("surface", [crowned, twisted])
-def test_shapes_follow_any_ground(tmp_path, surface):
-    root, (row,) = lifted(write(tmp_path, road()), surface, lateral="shape")
-    x, y, z = places(root.find("road")).T
-    assert np.abs(z - surface(x, y)).max() < 5e-3
-    assert row.shape_m < 5e-3
-    names = [each.tag for each in root.find("road/lateralProfile")]
-    assert names == sorted(names, reverse=True)
-    assert set(names) == {"superelevation", "shape"}
-
-
 def test_a_profile_on_a_plane_is_one_piece_with_its_slopes(tmp_path):
     root, (row,) = lifted(write(tmp_path, road()), plane)
     (elevation,) = root.findall("road/elevationProfile/elevation")
@@ -165,7 +153,7 @@ def test_roads_that_meet_have_one_height_and_one_grade(tmp_path):
     assert ends[0][0] == pytest.approx(float(crowned(70.0, 20.0)), abs=1e-9)
 
 
-@pytest.mark.parametrize("lateral", ["superelevation", "shape", "none"])
+@pytest.mark.parametrize("lateral", ["superelevation", "none"])
 @pytest.mark.parametrize(
     "profiles",
     [
@@ -431,39 +419,11 @@ def test_places_above_limits_are_the_steepest_of_their_stretch(tmp_path):
     assert [each.kind for each in row.steep] == ["grade"]
 
 
-@pytest.mark.parametrize(("plan", "surface"), [(LINE, crowned), (ARC, cone)])
-def test_opencrg_has_the_surface_itself(tmp_path, plan, surface):
-    source = write(tmp_path, road(plan), road(plan, name="8", more="<surface/>"))
-    root, (row, again) = lifted(source, surface, crg=True)
-    assert row.note == again.note == ""
-    for element in root.findall("road"):
-        (crg,) = element.findall("surface/CRG")
-        path = tmp_path / crg.get("file")
-        assert path.parent.name == "out_crg"
-        values, _, rows = opencrg.read(path.read_bytes())
-        # The file's line starts at the road's start, with its heading there and hOffset.
-        x, y, heading = (float(value[0]) for value in plan_view.read(element).at(np.zeros(1)))
-        assert values["REFERENCE_LINE_START_X"] == pytest.approx(x)
-        assert values["REFERENCE_LINE_START_Y"] == pytest.approx(y)
-        assert rows[1, 0] == pytest.approx(heading + float(crg.get("hOffset")), abs=1e-6)
-        line = opencrg.positions(values, rows)
-        assert len(line) == 121
-        v = np.linspace(values["LONG_SECTION_V_RIGHT"], values["LONG_SECTION_V_LEFT"], rows.shape[1] - 1)
-        assert v[0] <= -3.5
-        assert v[-1] >= 3.5
-        along = line[2:] - line[:-2]
-        left = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
-        places = line[1:-1, None] + v[None, :, None] * left[:, None]
-        z = values["REFERENCE_LINE_START_Z"] + rows[1:-1, 1:]
-        assert np.abs(z - surface(places[..., 0], places[..., 1])).max() < 1e-3
-
-
-def test_a_road_with_opencrg_of_its_own_keeps_it(tmp_path):
+def test_a_reference_to_opencrg_stays(tmp_path):
     own = '<surface><CRG file="a.crg" sStart="0" sEnd="60" orientation="same" mode="attached"/></surface>'
-    root, (row,) = lifted(write(tmp_path, road(more=own)), plane, crg=True)
+    root, (row,) = lifted(write(tmp_path, road(more=own)), plane)
     assert [each.get("file") for each in root.iter("CRG")] == ["a.crg"]
-    assert "has one of its own" in row.note
-    assert not (tmp_path / "out_crg").exists()
+    assert row.note == ""
 
 
 def test_large_roads_have_no_more_points_than_they_need(tmp_path):
@@ -476,9 +436,8 @@ def test_large_roads_have_no_more_points_than_they_need(tmp_path):
     narrow = ARC.replace("0.01", "5")
     wide = LANES.format(LEVEL).replace('a="3.5"', 'a="150"')
     roads = [road(narrow, 9000.0), road(LINE, 6000.0, "8", lanes=wide)]
-    _, rows = lifted(write(tmp_path, *roads), counted, crg=True)
+    lifted(write(tmp_path, *roads), counted)
     assert sum(asked) < 800_000
-    assert "too large" in rows[1].note
 
 
 def test_places_that_are_no_numbers_leave_the_road(tmp_path):

@@ -1,7 +1,7 @@
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.roads.extent import covered, nodes_beyond
+from flexroad.tasks.roads.extent import covered
 from flexroad.tasks.types import RoadMask
 
 CORE = Grid("EPSG:25832", 295500.0, 5629500.0, 2.0, 5, 4)
@@ -32,21 +32,3 @@ def test_covered_counts_the_core_alone():
     outside = np.ones(halo.shape, bool)
     outside[1:-1, 1:-1] = False
     assert covered(road(outside, halo)) == (CORE.bounds, 0.0)
-
-
-def test_nodes_on_the_border_of_a_covered_cell_are_covered():
-    outside = np.zeros(CORE.shape, bool)
-    outside[:, 3:] = True
-    x = CORE.west + np.array([0, 5.9, 6, 6.1, 10])
-    np.testing.assert_array_equal(
-        nodes_beyond(road(outside), x, CORE.north - np.array([0.0, 8.0])), [[0, 0, 0, 1, 1]] * 2
-    )
-
-
-def test_nodes_on_the_edge_of_a_tile_are_covered_if_the_neighbour_is():
-    """The neighbour's cells are in the halo."""
-    halo = Grid(CORE.crs, CORE.west - 2, CORE.north + 2, 2.0, 7, 6)
-    outside = np.ones(halo.shape, bool)
-    outside[:, -1] = False
-    beyond = nodes_beyond(road(outside, halo), CORE.west + np.array([8.0, 10.0]), CORE.north - np.ones(1))
-    np.testing.assert_array_equal(beyond, [[True, False]])

@@ -162,7 +162,7 @@ def test_steps_are_measured_from_the_heights_that_the_road_is_fitted_to():
     assert np.abs(heights(fitted(lifted, clusters)) - truth)[inner(ROAD | VERGE)].max() < 1e-3
 
 
-@pytest.mark.parametrize("method", ["dynamic", "adaptive", "uniform"])
+@pytest.mark.parametrize("method", ["dynamic", "uniform"])
 def test_mesh_without_breaklines_has_a_smooth_road_and_the_ground_beside(method):
     data, clusters, truth = tile(0.5)
     road = RoadMask(GRID, GRID, ROAD, np.zeros(GRID.shape, bool))
@@ -179,8 +179,8 @@ def test_mesh_without_breaklines_has_a_smooth_road_and_the_ground_beside(method)
 
 
 def test_breaklines_without_dynamic_sampling_are_refused():
-    with pytest.raises(ValueError, match="method adaptive has no breaklines; choose method dynamic"):
-        sample.Options(method="adaptive", breaklines=True)
+    with pytest.raises(ValueError, match="method uniform has no breaklines; choose method dynamic"):
+        sample.Options(method="uniform", breaklines=True)
 
 
 def test_plane_with_a_hole_is_filled_with_the_plane():

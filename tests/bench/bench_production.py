@@ -1,8 +1,9 @@
 """The production settings against the paper's: on the benchmark, in two real towns, on a real survey.
 
-``PYTHONPATH=. python experiments/production.py 240`` gives the table of docs/fit.md; without a number 4 tiles
-of the benchmark are used. Stages and options are those of configs/paper.yaml and configs/production.yaml,
-tile by tile as in a run; only the benchmark's tiles, which have no neighbours, have no halo.
+``PYTHONPATH=. python tests/bench/bench_production.py 240`` gives the table of docs/fit.md; without a number
+4 tiles of the benchmark are used. Stages and options are those of configs/paper.yaml and
+configs/production.yaml, tile by tile as in a run; only the benchmark's tiles, which have no neighbours, have
+no halo.
 
 If FLEXROAD_REAL_DATA is set, two more comparisons follow. Barbican and Gothenburg have their canopies added
 to the DSM and a degraded DTM (noise and scars); truth is the original DTM. The north of Autzen has roads
