@@ -27,7 +27,7 @@ COMMANDS = {
     "status": ("run", "Show the state of a run and the failures of its tiles."),
     "clean": ("clean", "Delete files that no run needs."),
     "report": ("results", "Write a report on a run: failures, places, figures."),
-    "query": ("query", "Print heights, normals and classes at points or along lines."),
+    "query": ("query", "Print heights, classes and flags at points or along lines."),
     "lift": ("lift", "Write a road network or features with heights of a run."),
     "export": ("export", "Write finished tiles in the formats of other programs."),
     "view": ("view", "Write a run as a page for browsers: map and surface in 3D."),

@@ -103,7 +103,7 @@ def query(
     ] = None,
     allow: options.Allow = None,
 ) -> None:
-    """Print heights, normals, classes and flags at points or along lines.
+    """Print heights, classes and flags at points or along lines.
 
     The output is CSV: the columns of the points and height_m, nx, ny, nz, tile, class and flags; with --line
     also distance and grade.

@@ -26,7 +26,7 @@ def config(tmp_path):
 
     def written(**changes):
         path = tmp_path / "x.yaml"
-        path.write_text(json.dumps({"fit": FIT} | changes))
+        path.write_text(json.dumps({"extends": "defaults", "fit": FIT} | changes))
         return path
 
     return written
