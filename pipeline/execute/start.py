@@ -7,7 +7,7 @@ import contextlib
 import importlib
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -127,9 +127,19 @@ def opened(make: Callable[[], T]) -> Iterator[T]:
     all processes of a command: this one ends the others, which would only print tracebacks.
     """
     with ThreadPoolExecutor(1, initializer=_block_signals) as pool, contextlib.ExitStack() as stack:
+        # Dask sets the variables of workers in this process, too; what a caller starts afterwards has its own.
+        stack.callback(_restore, {name: os.environ.get(name) for name in OF_WORKERS})
         made = pool.submit(make)
         stack.callback(_close, made)
         yield made.result()
+
+
+def _restore(variables: Mapping[str, str | None]) -> None:
+    for name, value in variables.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
 
 
 def _block_signals() -> None:

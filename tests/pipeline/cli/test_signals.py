@@ -150,6 +150,8 @@ def test_second_signal_ends_the_process(code, number):
     words = [sys.executable, "-c", textwrap.dedent(code)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout.readline() == b"ready\n"
+        # The line is printed before the library is called.
+        time.sleep(0.5)
         process.send_signal(number)
         time.sleep(ONE_S + 0.3)
         process.send_signal(number)
