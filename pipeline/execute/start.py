@@ -127,7 +127,7 @@ def opened(make: Callable[[], T]) -> Iterator[T]:
     all processes of a command: this one ends the others, which would only print tracebacks.
     """
     with ThreadPoolExecutor(1, initializer=_block_signals) as pool, contextlib.ExitStack() as stack:
-        # Dask sets the variables of workers in this process, too; what a caller starts afterwards has its own.
+        # Dask sets the variables of workers in this process, too, and a caller may start others afterwards.
         stack.callback(_restore, {name: os.environ.get(name) for name in OF_WORKERS})
         made = pool.submit(make)
         stack.callback(_close, made)
