@@ -6,8 +6,8 @@ import posixpath
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
-from flexroad.catalog.headers.open_raster import MAX_DEPTH, vrt_sources
-from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.guard.open_raster import MAX_DEPTH, vrt_sources
+from flexroad.catalog.guard.refused import Refused
 from flexroad.catalog.index import Catalog
 from flexroad.catalog.storage.paths import Location, resolved
 from flexroad.catalog.tile import LAYERS, Layer, Tile

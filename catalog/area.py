@@ -14,10 +14,10 @@ import shapely
 from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.headers.open_vector import ERRORS, in_its_encoding, vector_name
-from flexroad.catalog.headers.refused import Refused
-from flexroad.catalog.headers.vectors import layers, listed
+from flexroad.catalog.guard.open_vector import ERRORS, in_its_encoding, vector_name
+from flexroad.catalog.guard.refused import Refused
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.scan.vectors import layers, listed
 from flexroad.catalog.text import count, reason
 
 pyogrio = lazy("pyogrio")

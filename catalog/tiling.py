@@ -24,10 +24,10 @@ from flexroad.catalog.crs import bounds_in, in_plan, is_projected, plan_unit, sa
 from flexroad.catalog.crs_checks import elsewhere, require_scale
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid, is_whole, union
-from flexroad.catalog.headers.cover import height_share
-from flexroad.catalog.headers.rasters import RasterFile, require_metric, zoned
 from flexroad.catalog.index import Catalog
 from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.scan.cover import height_share
+from flexroad.catalog.scan.rasters import RasterFile, require_metric, zoned
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import count, some
 from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, RECENT, Layer, Tile, by_cover

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from flexroad.catalog.errors import CatalogError
-    from flexroad.pipeline.benchmark.example import example
     from flexroad.pipeline.errors import ConfigError
-    from flexroad.pipeline.results.process import catalog_from, run
-    from flexroad.pipeline.results.run import RunView, open_run
-    from flexroad.pipeline.results.surface import Surface, fit, open_surface
     from flexroad.pipeline.run.observer import Observer
     from flexroad.tasks.errors import TaskError
+    from flexroad.tools.results.process import catalog_from, run
+    from flexroad.tools.results.run import RunView, open_run
+    from flexroad.tools.results.surface import Surface, fit, open_surface
+    from flexroad.tools.synthetic.example import example
 
     __version__: str
 
@@ -47,15 +47,15 @@ _HOME = {
     "CatalogError": "catalog.errors",
     "ConfigError": "pipeline.errors",
     "Observer": "pipeline.run.observer",
-    "RunView": "pipeline.results.run",
-    "Surface": "pipeline.results.surface",
+    "RunView": "tools.results.run",
+    "Surface": "tools.results.surface",
     "TaskError": "tasks.errors",
-    "catalog_from": "pipeline.results.process",
-    "example": "pipeline.benchmark.example",
-    "fit": "pipeline.results.surface",
-    "open_run": "pipeline.results.run",
-    "open_surface": "pipeline.results.surface",
-    "run": "pipeline.results.process",
+    "catalog_from": "tools.results.process",
+    "example": "tools.synthetic.example",
+    "fit": "tools.results.surface",
+    "open_run": "tools.results.run",
+    "open_surface": "tools.results.surface",
+    "run": "tools.results.process",
 }
 """The module of each public name, below this package."""
 

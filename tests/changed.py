@@ -33,18 +33,18 @@ RUNS = {
 """What reads and writes the files of a run; the stages are pure functions."""
 AREAS = {
     "runs": RUNS,
-    "exports": RUNS | {"pipeline/export", "tasks/export"},
+    "exports": RUNS | {"tools/export", "tasks/export"},
     "pages": {
         "viewer",
         "tasks/export",
-        "pipeline/export",
-        "pipeline/report",
+        "tools/export",
+        "tools/report",
         "pipeline/run",
         "pipeline/store",
     },
-    "photos": {"catalog", "tasks/acquire", "tasks/io", "pipeline/prepare"},
+    "photos": {"catalog", "tasks/acquire", "tasks/io", "tools/prepare"},
     "levels": {f"tasks/{name}" for name in ("filter", "fit", "levels", "roads", "segment", "spline")},
-    "readers": RUNS | {"pipeline/check", "pipeline/results", "tasks/acquire", "tasks/segment"},
+    "readers": RUNS | {"pipeline/check", "tools/results", "tasks/acquire", "tasks/segment"},
 }
 
 

@@ -96,7 +96,7 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def made_survey(tmp_path_factory) -> Path:
     """A folder with a survey of four adjacent tiles of 60 m with ground truth."""
-    from flexroad.pipeline.benchmark.scenes import write_scenes
+    from flexroad.tools.synthetic.scenes import write_scenes
 
     folder = tmp_path_factory.mktemp("survey")
     write_scenes(folder, 4, seed=3, size_m=60)

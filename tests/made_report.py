@@ -8,11 +8,11 @@ import pandas as pd
 from flexroad.catalog import Catalog
 from flexroad.catalog.grid import Grid
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.report.content import Content
-from flexroad.pipeline.report.steps import CHECK, COLUMNS, EdgeSteps
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.tables import metrics_frame
+from flexroad.tools.report.content import Content
+from flexroad.tools.report.steps import CHECK, COLUMNS, EdgeSteps
 
 SIDE_M = 250
 

@@ -6,11 +6,11 @@ import numpy as np
 import shapely
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests import make_roads
 
 TILE_M = 100

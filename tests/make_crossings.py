@@ -12,15 +12,15 @@ from scipy.ndimage import distance_transform_edt
 
 from flexroad.catalog import Grid
 from flexroad.catalog.borders import border_of
-from flexroad.pipeline.benchmark.scenes import _write_lines
 from flexroad.tasks import load
 from flexroad.tasks.border import ENDS, BorderStages
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.segment import vector
 from flexroad.tasks.spline.frame import Frame
-from flexroad.tasks.synthetic.centrelines import CentreLine
-from flexroad.tasks.synthetic.crossings import (
+from flexroad.tasks.types import RoadClusters, RoadMask, Source, Surface, TileData
+from flexroad.tools.synthetic.centrelines import CentreLine
+from flexroad.tools.synthetic.crossings import (
     CROSS_M,
     MAIN_M,
     REACH_M,
@@ -28,7 +28,7 @@ from flexroad.tasks.synthetic.crossings import (
     Crossings,
     make_crossings,
 )
-from flexroad.tasks.types import RoadClusters, RoadMask, Source, Surface, TileData
+from flexroad.tools.synthetic.scenes import _write_lines
 
 AROUND_M, HALO_M = 100.0, 50.0
 CRS = "EPSG:25832"

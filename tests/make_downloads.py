@@ -16,7 +16,7 @@ from rasterio.features import shapes
 from rasterio.merge import merge
 from rasterio.warp import Resampling, calculate_default_transform, reproject
 
-from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests import make_photos
 from tests.make_clouds import write_cloud
 from tests.make_rasters import write

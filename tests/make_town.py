@@ -8,10 +8,10 @@ from pyproj import Transformer
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.grid import Bounds, union
-from flexroad.catalog.headers.vectors import opened, with_roads
+from flexroad.catalog.scan.vectors import opened, with_roads
 from flexroad.catalog.sources import prepared
-from flexroad.tasks.synthetic import block
-from flexroad.tasks.synthetic.crossings import REACH_M, CrossingOptions, Crossings, make_crossings
+from flexroad.tools.synthetic import block
+from flexroad.tools.synthetic.crossings import REACH_M, CrossingOptions, Crossings, make_crossings
 from tests.make_roads import write_osm
 
 CRS = "EPSG:25832"

@@ -9,8 +9,8 @@ import shapely
 import trimesh
 from pyproj import Transformer
 
-from flexroad.pipeline.export.source import select
 from flexroad.tasks.spline.stepped import without_steps
+from flexroad.tools.export.source import select
 
 OFFSET_M = 47.5
 """Height of the vertical datum above the ellipsoid in the exports of the tests (m)."""

@@ -11,7 +11,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from flexroad.pipeline.results.points import Ground
+from flexroad.pipeline.run.points import Ground
 from tests import make_osm, validators
 from tests.command_line import call
 from tests.read_opendrive import quality_issues

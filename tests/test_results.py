@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from flexroad.pipeline.report.content import FIGURES
-from flexroad.pipeline.reproduce.metrics_data import FIGURE_DTYPE, FILE, read_metrics_data, write_metrics_data
-from flexroad.pipeline.reproduce.tables import pages
+from flexroad.tools.report.content import FIGURES
+from flexroad.tools.reproduce.metrics_data import FIGURE_DTYPE, FILE, read_metrics_data, write_metrics_data
+from flexroad.tools.reproduce.tables import pages
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"
@@ -203,7 +203,7 @@ def test_causes_has_the_changes_of_the_stored_fits():
 
 def test_causes_bound_follows_from_the_published_tables():
     """Target of the fit without ECSRC: RGT on roads, the DTM elsewhere; see section 1 of the page."""
-    from flexroad.pipeline.reproduce.published import published
+    from flexroad.tools.reproduce.published import published
 
     text = " ".join((RESULTS / "causes.md").read_text().split())
     road, terrain = published("rgt").l2_road_m, published("wo_nurbs").l2_terrain_m
@@ -222,8 +222,8 @@ def published(tmp_path):
     """A folder as `flexroad tables` writes it, over tiles with the paper's own figures."""
     import pandas as pd
 
-    from flexroad.pipeline.reproduce.metrics_data import MetricsData
-    from flexroad.pipeline.reproduce.published import TABLE_I
+    from flexroad.tools.reproduce.metrics_data import MetricsData
+    from flexroad.tools.reproduce.published import TABLE_I
 
     rows = [
         ("made", "segmented", f"t{i}", "", row.variant, *map(row.value, FIGURES))

@@ -22,14 +22,14 @@ from flexroad.catalog.crs import short
 from flexroad.catalog.derived import write_heights
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.editions import newest_first
-from flexroad.catalog.headers.mask_values import mask_notes
-from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.headers.plateaus import plateau_notes
-from flexroad.catalog.headers.point_clouds import chunks
-from flexroad.catalog.headers.rasters import RasterFile, glob, opened, scan, there, unlisted_folders
-from flexroad.catalog.headers.vectors import find, with_roads
+from flexroad.catalog.guard.open_raster import ERRORS, open_raster
 from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.scan.editions import newest_first
+from flexroad.catalog.scan.mask_values import mask_notes
+from flexroad.catalog.scan.plateaus import plateau_notes
+from flexroad.catalog.scan.point_clouds import chunks
+from flexroad.catalog.scan.rasters import RasterFile, glob, opened, scan, there, unlisted_folders
+from flexroad.catalog.scan.vectors import find, with_roads
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import some
 from flexroad.catalog.tile import HEIGHTS, Tile

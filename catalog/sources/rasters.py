@@ -8,12 +8,12 @@ from datetime import datetime
 from pathlib import Path
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.headers.editions import newest_first
-from flexroad.catalog.headers.mask_values import mask_notes
-from flexroad.catalog.headers.plateaus import plateau_notes
-from flexroad.catalog.headers.rasters import RasterFile, scan
-from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.scan.editions import newest_first
+from flexroad.catalog.scan.mask_values import mask_notes
+from flexroad.catalog.scan.plateaus import plateau_notes
+from flexroad.catalog.scan.rasters import RasterFile, scan
+from flexroad.catalog.scan.vectors import find, with_roads
 from flexroad.catalog.tile import HEIGHTS, LAYERS
 from flexroad.catalog.tiling import MASKS, NO_CONVERSION, Conversion, TilingResult, cut
 

@@ -23,7 +23,7 @@ from flexroad.catalog import layouts
 from flexroad.catalog.derived import is_current, rasters_of_points, write_heights
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.headers.rasters import RasterFile, glob, opened, require_metric, there, unlisted_folders
+from flexroad.catalog.scan.rasters import RasterFile, glob, opened, require_metric, there, unlisted_folders
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import shown, some
 from flexroad.catalog.tile import LAYERS, Layer, Tile

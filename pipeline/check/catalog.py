@@ -14,17 +14,16 @@ from flexroad.catalog import LAYERS, Catalog, CatalogError, Layer, Tile
 from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.crs_checks import crs_of
-from flexroad.catalog.headers.cover import AS_TEXT, height_share
-from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.headers.plateaus import plateau_notes
-from flexroad.catalog.headers.rasters import heights_fault, quiet
-from flexroad.catalog.headers.refused import Refused, head
+from flexroad.catalog.guard.open_raster import ERRORS, open_raster
+from flexroad.catalog.guard.refused import Refused, head
+from flexroad.catalog.scan.cover import AS_TEXT, height_share
+from flexroad.catalog.scan.plateaus import plateau_notes
+from flexroad.catalog.scan.rasters import heights_fault, quiet
 from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.trust import AllowedFolders
-from flexroad.pipeline.check.decks import deck_findings
 from flexroad.pipeline.check.finding import Finding, evenly
 from flexroad.pipeline.check.heights import height_findings
 from flexroad.pipeline.check.trial import trials
@@ -36,6 +35,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.io.raster_header import header
 from flexroad.tasks.roads import coregistration
+from flexroad.tools.check.decks import deck_findings
 
 MISSING, NO_FILE = "missing", "not a regular file"
 REMEDIES = {MISSING: "restore it or build the catalog again", NO_FILE: "replace it by one"}

@@ -23,8 +23,8 @@ from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES
 from flexroad.pipeline.graph.layers import fitting_config
-from flexroad.pipeline.prepare.options import MIN_COVER_HELP
 from flexroad.pipeline.run.progress import StepProgress
+from flexroad.tools.prepare.options import MIN_COVER_HELP
 
 app = group("catalog", "Make, show and check catalogs of tiles.")
 
@@ -279,7 +279,7 @@ def catalog_synthetic(
     ] = False,
 ) -> None:
     """Make synthetic scenes with known truth, and their catalog."""
-    from flexroad.pipeline.benchmark.scenes import write_scenes  # noqa: PLC0415 loads scipy
+    from flexroad.tools.synthetic.scenes import write_scenes  # noqa: PLC0415 loads scipy
 
     path = write_scenes(output, tiles, seed, tile_size, dop, preset, decks)
     echo(f"{count(len(Catalog.read(path).tiles), 'tile')} in {path}")

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog import Layer, Tile
-from flexroad.catalog.headers.source_files import source_stat
+from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.storage.paths import FileStat, Location
 from flexroad.pipeline.config.models import Chain, Config, Export
 from flexroad.pipeline.graph.borders import STAGE, BorderPattern, has_borders
@@ -42,8 +42,8 @@ from flexroad.pipeline.graph.sources import (
 )
 from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, model_files, stage_head
 from flexroad.tasks.border import ENDS, BorderTask
-from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.options import Options, stage_function, stage_module
+from flexroad.tasks.products import cog, glb, npz, ply
 
 ITEM_VERSION = 3
 """Raised when the STAC item of a tile changes for the same result."""

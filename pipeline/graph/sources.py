@@ -12,7 +12,7 @@ from typing import Any
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.borders import Border
-from flexroad.catalog.headers.source_files import files_of, source_stat
+from flexroad.catalog.guard.source_files import files_of, source_stat
 from flexroad.catalog.storage.paths import FileStat, Location, read
 from flexroad.tasks.load import READS
 

@@ -43,8 +43,8 @@ from flexroad.pipeline.worker.exports import (
     item_assets,
     of_level,
 )
-from flexroad.tasks.export import cog
-from flexroad.tasks.export.cog import BLOCK, NAME_STYLE, Band, encode_style
+from flexroad.tasks.products import cog
+from flexroad.tasks.products.cog import BLOCK, NAME_STYLE, Band, encode_style
 
 MAP = "tiles.geojson"
 MAP_COLUMNS = ("id", "state", "stale", "error", "seconds", "error_estimate_m", "flags", "finished")

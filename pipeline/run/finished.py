@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog import Grid, Tile
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.headers.source_files import source_stat
+from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.storage.paths import Location, parse_location, stat
 from flexroad.catalog.text import count, some
 from flexroad.pipeline.errors import ConfigError

@@ -18,7 +18,7 @@ from time import perf_counter
 from typing import Any
 
 from flexroad.catalog import Tile
-from flexroad.catalog.headers.source_files import source_stat
+from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.borders import STAGE
 from flexroad.pipeline.graph.graph import Node, TileGraph, files_read

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog import Grid
-from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.ids import safe_name
+from flexroad.catalog.scan.rasters import quiet
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store.products import file_entry
-from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.levels.seen import top_mask
 from flexroad.tasks.meshing.normals import mesh_normals
+from flexroad.tasks.products import cog, glb, npz, ply
 from flexroad.tasks.quality.support import of_faces, top_support
 from flexroad.tasks.roads.level_numbers import HIGHEST
 from flexroad.tasks.spline.levelled import LevelledSurface, top_of

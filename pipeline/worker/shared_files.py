@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from types import TracebackType
 
-from flexroad.catalog.headers.source_files import source_stat
+from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import PROBE, FileStat, parse_location
 from flexroad.pipeline.worker.tile import TileJob

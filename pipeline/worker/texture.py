@@ -8,9 +8,9 @@ from flexroad.catalog import Layer, Tile
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.worker.evaluator import check_unchanged
 from flexroad.tasks.errors import LayerMissing
-from flexroad.tasks.export import glb
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.load import layer_source
+from flexroad.tasks.products import glb
 from flexroad.tasks.types import Orthophoto
 
 NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"

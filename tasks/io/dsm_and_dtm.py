@@ -8,7 +8,7 @@ import numpy as np
 
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import vertical
-from flexroad.catalog.headers.rasters import date_of, quiet
+from flexroad.catalog.scan.rasters import date_of, quiet
 from flexroad.tasks.io.raster import Unreadable, read_raster
 from flexroad.tasks.types import Floats
 

@@ -20,12 +20,12 @@ from rasterio.windows import Window
 
 from flexroad.catalog.crs import short
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.headers.kept_rasters import kept_raster
-from flexroad.catalog.headers.open_raster import ERRORS, has_own_blocks, open_raster
-from flexroad.catalog.headers.rasters import heights_fault
-from flexroad.catalog.headers.refused import Refused, read_through
-from flexroad.catalog.headers.source_files import files_of
-from flexroad.catalog.headers.valid_cells import transparent
+from flexroad.catalog.guard.kept_rasters import kept_raster
+from flexroad.catalog.guard.open_raster import ERRORS, has_own_blocks, open_raster
+from flexroad.catalog.guard.refused import Refused, read_through
+from flexroad.catalog.guard.source_files import files_of
+from flexroad.catalog.scan.rasters import heights_fault
+from flexroad.catalog.scan.valid_cells import transparent
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders

@@ -12,8 +12,8 @@ from rasterio.enums import MaskFlags
 from flexroad.catalog.crs import bounds_in, in_plan, same, short
 from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.grid import Bounds, Grid
-from flexroad.catalog.headers.rasters import georeference_fault
-from flexroad.catalog.headers.valid_cells import alpha_band
+from flexroad.catalog.scan.rasters import georeference_fault
+from flexroad.catalog.scan.valid_cells import alpha_band
 from flexroad.catalog.storage.paths import Location
 from flexroad.tasks.errors import Unusable
 from flexroad.tasks.io.raster_grid import RasterGrid

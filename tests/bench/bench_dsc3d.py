@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from flexroad.catalog import Catalog, Tile
-from flexroad.pipeline.benchmark.scenes import write_stand_in
 from flexroad.tasks import load, sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import plane, raster
 from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.segment import mask
-from flexroad.tasks.synthetic.dsc3d import SITES
 from flexroad.tasks.types import Surface
+from flexroad.tools.synthetic.dsc3d import SITES
+from flexroad.tools.synthetic.scenes import write_stand_in
 
 PAPER = {
     "mesh triangles, least": 35_000,

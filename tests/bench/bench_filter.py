@@ -23,9 +23,9 @@ from flexroad.tasks import sample
 from flexroad.tasks.filter import ecsrc, planar
 from flexroad.tasks.fit import nurbs
 from flexroad.tasks.metrics import evaluate
-from flexroad.tasks.synthetic import gerod, make_scene
-from flexroad.tasks.synthetic.spoilers import BARE, Kind
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
+from flexroad.tools.synthetic import gerod, make_scene
+from flexroad.tools.synthetic.spoilers import BARE, Kind
 
 TILES, SEED, HALO_M = 24, 1, 50
 SOUND_M = 0.15

@@ -18,9 +18,9 @@ from flexroad.tasks import sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import plane, raster
 from flexroad.tasks.metrics import evaluate
-from flexroad.tasks.synthetic import SceneOptions, make_scene
-from flexroad.tasks.synthetic.gerod import survey
 from flexroad.tasks.types import RoadMask, Surface, TileData
+from flexroad.tools.synthetic import SceneOptions, make_scene
+from flexroad.tools.synthetic.gerod import survey
 
 PAPER = {
     "true road share": 0.18,

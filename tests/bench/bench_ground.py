@@ -21,11 +21,11 @@ import laspy
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from flexroad.tasks.acquire.points import morphological
-from flexroad.tasks.acquire.points.ground_filter import Options, ground
-from flexroad.tasks.synthetic import Scene, gerod, make_scene
-from flexroad.tasks.synthetic.spoilers import BARE, Kind
 from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.prepare.points import morphological
+from flexroad.tools.prepare.points.ground_filter import Options, ground
+from flexroad.tools.synthetic import Scene, gerod, make_scene
+from flexroad.tools.synthetic.spoilers import BARE, Kind
 
 SEED, TILES = 2, 24
 SIDE_M = 500

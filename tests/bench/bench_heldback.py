@@ -38,12 +38,12 @@ import flexroad
 from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.sources import prepared, rasters
 from flexroad.pipeline.cli.main import main as command
-from flexroad.pipeline.export.source import select
-from flexroad.tasks.acquire.points.to_rasters import Options, rasterise
 from flexroad.tasks.quality.estimate import INTERVAL
-from flexroad.tasks.synthetic import SceneOptions, make_scene
-from flexroad.tasks.synthetic.scene import DECK, GROUND, scan
 from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.export.source import select
+from flexroad.tools.prepare.points.to_rasters import Options, rasterise
+from flexroad.tools.synthetic import SceneOptions, make_scene
+from flexroad.tools.synthetic.scene import DECK, GROUND, scan
 
 SIDE_M, SHARE, FIRST = 5.0, 0.06, 7
 """Side of the squares, the share of them that is withheld, and the number of the first draw."""

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from flexroad.catalog import Catalog, Grid
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.tasks import load, sample
 from flexroad.tasks.fit.raster import RasterSurface
@@ -26,6 +25,7 @@ from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.options import stage_function
 from flexroad.tasks.roads.dtm_validity import ground_to_fit
 from flexroad.tasks.types import Floats, RoadClusters, RoadMask, Surface, TileData
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests.bench.gis_peers import installed
 from tests.bench.timing import cpu_s, one_cpu_s, one_thread
 

@@ -42,7 +42,7 @@ from flexroad.pipeline.store.database import NAME as DATABASE
 from flexroad.pipeline.store.records import DONE, from_item
 from flexroad.pipeline.worker.tile import TileJob, TileResult, marker_stat
 from flexroad.tasks.io.archive import npz
-from flexroad.tasks.synthetic import SceneOptions, make_scene
+from flexroad.tools.synthetic import SceneOptions, make_scene
 
 TILES = 1000
 CELL_M, TILE_M, SHEET_M = 5, 250, 1000

@@ -26,7 +26,7 @@ import numpy as np
 import rasterio
 
 from flexroad.pipeline import ONE_THREAD
-from flexroad.tasks.acquire.points.ground_filter import Options, ground
+from flexroad.tools.prepare.points.ground_filter import Options, ground
 from tests.make_clouds import write_cloud
 
 HERE = Path(__file__).parents[2]

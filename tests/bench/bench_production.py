@@ -31,14 +31,14 @@ import rasterio
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.sources.rasters import index
-from flexroad.pipeline.benchmark.scenes import TRUE_CATALOG, write_scenes
 from flexroad.pipeline.cli.main import main as flexroad
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES
 from flexroad.tasks.options import stage_function
-from flexroad.tasks.synthetic import gerod, make_scene
-from flexroad.tasks.synthetic.spoilers import Kind
 from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
+from flexroad.tools.synthetic import gerod, make_scene
+from flexroad.tools.synthetic.scenes import TRUE_CATALOG, write_scenes
+from flexroad.tools.synthetic.spoilers import Kind
 
 TILES, SEED = 4, 1
 OVER_M = 2.0

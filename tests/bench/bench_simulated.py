@@ -28,7 +28,7 @@ from flexroad.pipeline.execute import DaskExecutor
 from flexroad.pipeline.execute.executor import Probe
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.tasks.synthetic import SceneOptions, make_scene
+from flexroad.tools.synthetic import SceneOptions, make_scene
 from tests.bench.timing import resident_mb
 from tests.made_result import done
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog import Catalog, Tile
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import Node, TileGraph
@@ -27,6 +26,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator
 from flexroad.tasks.load import load_border
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests.bench import floors, measure_stages
 from tests.bench.floors import Work
 from tests.bench.timing import Peak, one_thread, peak

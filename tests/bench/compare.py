@@ -26,7 +26,7 @@ import numpy as np
 import rasterio
 
 from flexroad.pipeline import ONE_THREAD
-from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.tools.synthetic.scenes import write_scenes
 
 HERE = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("measure_stages.py")

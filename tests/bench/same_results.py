@@ -21,7 +21,7 @@ from pathlib import Path
 import pandas as pd
 
 from flexroad.pipeline import ONE_THREAD
-from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.tools.synthetic.scenes import write_scenes
 
 HERE = Path(__file__).parents[2]
 SEED, SIZE_M = 7, 120

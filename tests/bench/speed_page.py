@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks import load
 from flexroad.tasks.options import stage_function
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests.bench import bench_points, bench_simulated, bench_tile, measure_stages
 from tests.bench.timing import Peak, cpu_s, one_cpu_s, one_thread, peak
 

@@ -13,7 +13,7 @@ from shapely import LineString
 
 from flexroad.catalog import gdal_options
 from flexroad.catalog.gdal_options import DEFAULTS, FILE, FOLDERS, NETWORK, WITHOUT_DEFAULT, use_own_values
-from flexroad.catalog.headers.open_vector import vector_name
+from flexroad.catalog.guard.open_vector import vector_name
 from flexroad.catalog.sources.rasters import index
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.load import Options, load
@@ -110,8 +110,8 @@ def test_ascii_grid_keeps_decimals_though_a_variable_wants_whole_numbers(tmp_pat
     (tmp_path / "a.asc").write_text(grid)
     code = (
         "import flexroad.pipeline\nfrom pathlib import Path\n"
-        "from flexroad.catalog.headers.rasters import quiet\n"
-        "from flexroad.catalog.headers.open_raster import open_raster\n"
+        "from flexroad.catalog.scan.rasters import quiet\n"
+        "from flexroad.catalog.guard.open_raster import open_raster\n"
         f"with quiet(), open_raster(Path({str(tmp_path / 'a.asc')!r})) as raster: print(raster.read(1)[0])"
     )
     environment = os.environ | {"AAIGRID_DATATYPE": "Int32"}

@@ -4,7 +4,7 @@ from pyproj import CRS, Transformer
 
 from flexroad.catalog import CatalogError
 from flexroad.catalog.crs import in_plan, metric_twin, plan_unit
-from flexroad.catalog.headers.point_clouds import inspect
+from flexroad.catalog.scan.point_clouds import inspect
 from flexroad.catalog.to_metres import MetricTransform, agreed
 
 OREGON = (637000.0, 852000.0)

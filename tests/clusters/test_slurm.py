@@ -11,11 +11,11 @@ import cloudpickle
 import pytest
 import yaml
 
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor
 from flexroad.pipeline.execute.clusters import open_cluster
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests.dask_processes import until
 from tests.slurm_daemons import slurm_daemons
 from tests.whole_run import LIGHT, assert_whole, item_times

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.export.source import select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.spline.stepped import without_steps
+from flexroad.tools.export.source import select
+from flexroad.tools.synthetic.scenes import write_scenes
 
 
 @dataclass(frozen=True)

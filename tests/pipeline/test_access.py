@@ -3,11 +3,11 @@
 import pytest
 
 from flexroad.catalog import CatalogError
-from flexroad.catalog.headers import point_clouds, vectors
+from flexroad.catalog.scan import point_clouds, vectors
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import TaskError
-from flexroad.tasks.acquire.mesh.read import read_mesh
+from flexroad.tools.prepare.mesh.read import read_mesh
 from tests.permissions import permissions_enforced
 
 READERS = {

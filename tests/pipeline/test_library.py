@@ -21,19 +21,19 @@ import xarray as xr
 
 import flexroad
 from flexroad.catalog import Catalog
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tools.synthetic.scenes import write_scenes
 
 ROOT = Path(__file__).parents[2]
 MODULES = [
     "flexroad",
-    "flexroad.pipeline.benchmark.example",
-    "flexroad.pipeline.results.process",
-    "flexroad.pipeline.results.run",
-    "flexroad.pipeline.results.surface",
+    "flexroad.tools.synthetic.example",
+    "flexroad.tools.results.process",
+    "flexroad.tools.results.run",
+    "flexroad.tools.results.surface",
 ]
 CENTRE = 500210.0, 5600030.0
 

@@ -16,7 +16,7 @@ import pytest
 import rasterio
 from scipy.ndimage import map_coordinates
 
-from flexroad.pipeline.results.points import Ground
+from flexroad.pipeline.run.points import Ground
 from tests.read_opendrive import quality_issues
 from tests.real.opendrive import reference_lines
 from tests.real.shown import flexroad, measured, table_after

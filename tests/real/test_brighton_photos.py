@@ -7,10 +7,10 @@ import rasterio
 
 from flexroad.catalog.grid import Grid
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.prepare.options import PrepareOptions
-from flexroad.pipeline.prepare.photos import PhotosOptions, prepare_photos
-from flexroad.tasks.acquire.photos import mvs_cpu, sfm
-from flexroad.tasks.acquire.points import to_rasters
+from flexroad.tools.prepare.from_photos import PhotosOptions, prepare_photos
+from flexroad.tools.prepare.options import PrepareOptions
+from flexroad.tools.prepare.photos import mvs_cpu, sfm
+from flexroad.tools.prepare.points import to_rasters
 
 pytestmark = [pytest.mark.real, pytest.mark.slow, pytest.mark.soak("photos")]
 

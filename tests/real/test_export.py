@@ -17,16 +17,16 @@ from rio_cogeo import cog_validate
 
 from flexroad import open_run
 from flexroad.catalog import Catalog
-from flexroad.catalog.ellipsoidal import Datum
 from flexroad.catalog.sources.rasters import index
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.export.driver import export
-from flexroad.pipeline.export.formats import FORMATS
-from flexroad.pipeline.export.source import Options, select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.spline.stepped import without_steps
+from flexroad.tools.export.driver import export
+from flexroad.tools.export.ellipsoidal import Datum
+from flexroad.tools.export.formats import FORMATS
+from flexroad.tools.export.source import Options, select
 from tests.read_exports import OFFSET_M, off_surface, spline_heights, true_heights, vertices
 from tests.read_opendrive import quality_issues
 from tests.real.streets import STREETS

@@ -16,7 +16,7 @@ import numpy as np
 import shapely
 
 from flexroad.catalog import Catalog, Grid, Tile
-from flexroad.catalog.headers import vectors
+from flexroad.catalog.scan import vectors
 from flexroad.catalog.sources import prepared
 
 COLUMNS, ROWS, CELLS, CELL_M = 10, 2, 24, 5.0

@@ -2,7 +2,7 @@ import json
 
 from pyproj import CRS
 
-from flexroad.tasks.georeference import Georeference
+from flexroad.tools.export.georeference import Georeference
 
 PLACE = Georeference("EPSG:25832", (295500.0, 5629250.0, 150.0), "EPSG:7837")
 

@@ -34,7 +34,7 @@ import shapely
 import trimesh
 
 import flexroad
-from flexroad.pipeline.export.source import select
+from flexroad.tools.export.source import select
 from tests import validators
 from tests.read_exports import OFFSET_M, spline_heights
 from tests.real.streets import STREETS

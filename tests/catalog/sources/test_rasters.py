@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pyproj import CRS
 
 from flexroad.catalog import Catalog, CatalogError, Grid
-from flexroad.catalog.headers.rasters import date_of
+from flexroad.catalog.scan.rasters import date_of
 from flexroad.catalog.sources import nrw
 from flexroad.catalog.sources.rasters import index
 from tests.make_rasters import UTM, write, write_xyz

@@ -4,9 +4,9 @@ from pathlib import Path
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.allowlist import check_allowed
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.check.catalog import check
 from flexroad.pipeline.config.loading import load_config
+from flexroad.tools.synthetic.scenes import write_scenes
 
 
 def make(folder: Path) -> list[Path]:

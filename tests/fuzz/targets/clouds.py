@@ -5,7 +5,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from flexroad.catalog.headers.point_clouds import chunks, inspect
+from flexroad.catalog.scan.point_clouds import chunks, inspect
 from tests.make_clouds import write_cloud
 
 POINTS = 3000

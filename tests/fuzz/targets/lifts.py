@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from flexroad.pipeline.results.lift import XML_FORMATS
 from flexroad.tasks import TaskError
-from flexroad.tasks.lift import xml_text
-from flexroad.tasks.lift.types import Heights, Options
-from tests.tasks.lift import test_osm, test_sumo
-from tests.tasks.lift.test_opendrive import ARC, road, structure, write
+from flexroad.tools.lift import xml_text
+from flexroad.tools.lift.driver import XML_FORMATS
+from flexroad.tools.lift.types import Heights, Options
+from tests.tools.lift import test_osm, test_sumo
+from tests.tools.lift.test_opendrive import ARC, road, structure, write
 
 SPIRAL = (
     '<geometry s="0" x="1" y="2" hdg="3" length="{length}"><spiral curvStart="0" curvEnd="-0.1"/></geometry>'

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from PIL import Image
 
-from flexroad.tasks.acquire.mesh.read import read_mesh
-from flexroad.tasks.acquire.photos.exif import read_shot
+from flexroad.tools.prepare.mesh.read import read_mesh
+from flexroad.tools.prepare.photos.exif import read_shot
 from tests.make_photos import exif
-from tests.tasks.acquire.mesh.test_hostile import PLACED, write
+from tests.tools.prepare.mesh.test_hostile import PLACED, write
 
 NAMES = ("m.obj", "ascii.ply", "m.ply", "m.glb", "m.gltf")
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from flexroad.catalog import CatalogError, Grid
-from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.scan.rasters import quiet
 from flexroad.catalog.sources.rasters import index
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks import TaskError

@@ -7,15 +7,15 @@ from pathlib import Path
 import pandas as pd
 
 from flexroad.catalog import Catalog, CatalogError
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.results.run import open_run
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.store.tables import read_metrics
+from flexroad.tools.results.run import open_run
+from flexroad.tools.synthetic.scenes import write_scenes
 
 LIGHT = {
     "extends": "defaults",

@@ -5,8 +5,8 @@ from pathlib import Path
 from shapely import LineString, Polygon
 
 from flexroad.catalog import CatalogError
-from flexroad.catalog.headers.rasters import quiet
-from flexroad.catalog.headers.vectors import opened
+from flexroad.catalog.scan.rasters import quiet
+from flexroad.catalog.scan.vectors import opened
 from flexroad.tasks import TaskError
 from flexroad.tasks.segment import vector
 from tests.make_roads import GRID, on_grid, tile, write, write_osm

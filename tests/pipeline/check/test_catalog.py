@@ -9,15 +9,15 @@ import rasterio
 from affine import Affine
 
 from flexroad.catalog import LAYERS, Catalog
-from flexroad.catalog.headers import kept_rasters
-from flexroad.catalog.headers.open_raster import open_alone
+from flexroad.catalog.guard import kept_rasters
+from flexroad.catalog.guard.open_raster import open_alone
 from flexroad.catalog.sources import rasters
 from flexroad.catalog.tile import faulty
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.check.catalog import check, expected_failures
 from flexroad.pipeline.config.loading import load_config
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.load import Options, load
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests.make_rasters import write
 from tests.permissions import permissions_enforced
 

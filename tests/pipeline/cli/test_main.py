@@ -134,7 +134,7 @@ def _without_columns(folder: Path) -> Path:
 def test_ground_at_rgt_equals_dsm(finished, made_survey):
     import rasterio
 
-    from flexroad.pipeline.results.points import Ground
+    from flexroad.pipeline.run.points import Ground
 
     tile = Catalog.read(made_survey / "catalog.parquet").tiles[1]
     with rasterio.open(tile.paths(tile.layer("dsm"))[0]) as raster:

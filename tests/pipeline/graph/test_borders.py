@@ -18,7 +18,6 @@ from flexroad.catalog.borders import border_of
 from flexroad.catalog.sources import prepared, rasters
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.tile import REACH_M
-from flexroad.pipeline.benchmark.scenes import MADE, write_scenes
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE, check_tiles
@@ -30,6 +29,7 @@ from flexroad.tasks.border import ENDS, BorderStages
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import stage_module
 from flexroad.tasks.spline.lattice import Lattice
+from flexroad.tools.synthetic.scenes import MADE, write_scenes
 
 PRODUCTION = load_config("production")
 SIZE_M = 250

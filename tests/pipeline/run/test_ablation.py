@@ -63,7 +63,7 @@ def test_literal_changes_only_the_nurbs_and_what_follows(survey):
 
 @pytest.fixture(scope="module")
 def one_tile(tmp_path_factory):
-    from flexroad.pipeline.benchmark.scenes import write_scenes
+    from flexroad.tools.synthetic.scenes import write_scenes
 
     return Catalog.read(write_scenes(tmp_path_factory.mktemp("one"), 1, seed=5, size_m=80))
 

@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.results.run import open_run
 from flexroad.pipeline.store.tables import read_metrics
+from flexroad.tools.results.run import open_run
 from tests import bad_entries
 from tests.bad_entries import CHANGES, Change, cases
 from tests.command_line import Said

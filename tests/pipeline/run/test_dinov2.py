@@ -8,16 +8,16 @@ import pytest
 import yaml
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import load
-from flexroad.tasks.segment.dinov2 import train as training
 from flexroad.tasks.segment.dinov2.head import Head, read_head
-from flexroad.tasks.segment.dinov2.train import Sample
+from flexroad.tools.synthetic.scenes import write_scenes
+from flexroad.tools.train import fit_head as training
+from flexroad.tools.train.fit_head import Sample
 from tests.conftest import QUICK
 from tests.make_backbone import save_backbone
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.run.lock import Owner
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests import command_line
 from tests.faulty_files import FAULTS, Faulty, Operation, intercepted
 from tests.whole_run import LIGHT, assert_whole, item_times, temporary_files

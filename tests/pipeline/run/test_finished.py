@@ -6,12 +6,12 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.report.pictures import tile_pictures
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, open_variant
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import peek_statuses
+from flexroad.tools.report.content import gather
+from flexroad.tools.report.pictures import tile_pictures
 from tests.whole_run import LIGHT
 
 

@@ -30,7 +30,7 @@ variants: {plane: {fit: plane, sample: corners}, flexroad: {}}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    from flexroad.pipeline.benchmark.scenes import write_scenes
+    from flexroad.tools.synthetic.scenes import write_scenes
 
     path = tmp_path_factory.mktemp("kill")
     (path / "slow.yaml").write_text(CONFIG)

@@ -17,29 +17,29 @@ import trimesh
 import flexroad
 from flexroad.catalog import Catalog
 from flexroad.catalog.grid import Grid
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-from flexroad.pipeline.export.viewer import write_viewer
-from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.garbage import find_garbage
+from flexroad.pipeline.run.points import Ground
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import peek_statuses
-from flexroad.tasks.export import npz
+from flexroad.tasks.products import npz
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.spline.levelled import LevelledSurface
-from flexroad.tasks.synthetic.centrelines import MAIN, SIDE
-from flexroad.tasks.synthetic.crossings import CROSS_M, MAIN_M, Crossings
+from flexroad.tools.synthetic.centrelines import MAIN, SIDE
+from flexroad.tools.synthetic.crossings import CROSS_M, MAIN_M, Crossings
+from flexroad.tools.synthetic.scenes import write_scenes
+from flexroad.tools.view.driver import write_viewer
 from tests import validators
 from tests.command_line import call
 from tests.mesh_union import Union
 from tests.read_exports import on_mesh
 from tests.read_opendrive import numbers, plan, polynomial, quality_issues
-from tests.tasks.export.test_landxml import surfaces as landxml_surfaces
-from tests.tasks.export.test_viewer import content, heights
+from tests.tools.export.test_landxml import surfaces as landxml_surfaces
+from tests.tools.view.test_encoding import content, heights
 from tests.validators.gltf import gltf_issues
 from tests.validators.opendrive import by_sumo, in_crs
 

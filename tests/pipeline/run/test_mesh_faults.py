@@ -9,13 +9,13 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.report.browser.page import html_page
-from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.report.pages import markdown_page
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import sample
+from flexroad.tools.report.browser.page import html_page
+from flexroad.tools.report.content import gather
+from flexroad.tools.report.pages import markdown_page
 
 SPLINE = {"load": {"halo_m": 50}, "fit": {"method": "smoothing_spline", "spacing_m": 20}}
 VARIANTS = {

@@ -17,9 +17,7 @@ from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.report import write_report
-from flexroad.pipeline.results.points import Ground
-from flexroad.pipeline.results.run import open_run
+from flexroad.pipeline.run.points import Ground
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import summary
@@ -30,6 +28,8 @@ from flexroad.tasks import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.types import Source
+from flexroad.tools.report import write_report
+from flexroad.tools.results.run import open_run
 from tests.conftest import QUICK
 from tests.make_roads import write as write_roads
 from tests.s3_server import Fault

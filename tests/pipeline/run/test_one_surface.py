@@ -12,13 +12,13 @@ import trimesh
 import flexroad
 from flexroad.catalog import Catalog
 from flexroad.catalog.sources import rasters
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.report.steps import edge_steps
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.tasks.export import npz
+from flexroad.tasks.products import npz
+from flexroad.tools.report.steps import edge_steps
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests.mesh_union import Union
 from tests.read_exports import true_heights
 

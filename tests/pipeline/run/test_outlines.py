@@ -7,11 +7,11 @@ import shapely
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.sources import rasters
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests.make_roads import write
 from tests.mesh_union import Union
 from tests.pipeline.run.test_one_surface import glb_part, ply_part

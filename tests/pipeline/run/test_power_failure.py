@@ -16,7 +16,7 @@ from random import Random
 import pytest
 import yaml
 
-from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests import command_line
 from tests.faulty_files import Operation, intercepted
 from tests.power_loss import Disk, Recording, write_state

@@ -6,10 +6,10 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.report import write_report
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import METRICS, PREVIOUS, read_metrics
+from flexroad.tools.report import write_report
 
 
 @pytest.fixture

@@ -20,9 +20,8 @@ import rasterio
 from rasterio.merge import merge
 
 from flexroad.catalog import Catalog
-from flexroad.catalog.headers import kept_rasters, open_raster
+from flexroad.catalog.guard import kept_rasters, open_raster
 from flexroad.catalog.sources import rasters
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.cli.dry_run import Verdict, plan
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
@@ -34,8 +33,9 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import open_database, tile_states
 from flexroad.pipeline.store import checked_json, codec
-from flexroad.tasks.export import npz
 from flexroad.tasks.io import vectors
+from flexroad.tasks.products import npz
+from flexroad.tools.synthetic.scenes import write_scenes
 from tests.make_rasters import damage, write
 from tests.permissions import permissions_enforced
 from tests.whole_run import products, rows

@@ -16,9 +16,6 @@ from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.graph.graph import Pattern
-from flexroad.pipeline.report.browser.relief import relief
-from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.report.steps import edge_steps, find_results
 from flexroad.pipeline.run.conductor import rerun_filter
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -27,6 +24,9 @@ from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import TileResult
+from flexroad.tools.report.browser.relief import relief
+from flexroad.tools.report.content import gather
+from flexroad.tools.report.steps import edge_steps, find_results
 from tests.conftest import QUICK
 
 FIXED = (
@@ -219,7 +219,7 @@ def test_damaged_artefact_is_computed_again(finished, executor):
 
 
 def test_tiles_of_an_older_version_are_exported_again_from_the_store(finished, executor, monkeypatch):
-    monkeypatch.setattr("flexroad.tasks.export.cog.VERSION", 10**6)
+    monkeypatch.setattr("flexroad.tasks.products.cog.VERSION", 10**6)
     assert computed(results_of(finished, executor)) == times(4, {"export": 1})
     monkeypatch.setattr("flexroad.pipeline.graph.graph.ITEM_VERSION", 10**6)
     assert computed(results_of(Run.open(finished.path), executor)) == times(4, {"export": 1})

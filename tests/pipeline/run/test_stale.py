@@ -10,19 +10,19 @@ import pytest
 
 import flexroad as library
 from flexroad.catalog import Catalog
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.export.source import select
-from flexroad.pipeline.export.viewer import write_viewer
-from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.run.collection import write_states
 from flexroad.pipeline.run.garbage import find_garbage
+from flexroad.pipeline.run.points import Ground
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.products import TileProducts
+from flexroad.tools.export.source import select
+from flexroad.tools.report.content import gather
+from flexroad.tools.synthetic.scenes import write_scenes
+from flexroad.tools.view.driver import write_viewer
 
 ALL = frozenset({"load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export"})
 

@@ -12,15 +12,15 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.report.content import WITH_ROADS, gather
-from flexroad.pipeline.report.steps import edge_steps
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import open_database, recorded_summary, summary
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import QUALITY
-from flexroad.tasks.export import npz
+from flexroad.tasks.products import npz
 from flexroad.tasks.quality.assess import NO_ROAD
+from flexroad.tools.report.content import WITH_ROADS, gather
+from flexroad.tools.report.steps import edge_steps
 from tests.conftest import QUICK
 from tests.whole_run import LIGHT
 

@@ -20,9 +20,9 @@ from flexroad.tasks.filter.planar import (
     ground_consistency,
 )
 from flexroad.tasks.roads import flat_patches
-from flexroad.tasks.synthetic import gerod, make_scene
-from flexroad.tasks.synthetic.spoilers import BARE, Kind
 from flexroad.tasks.types import RoadMask, TileData
+from flexroad.tools.synthetic import gerod, make_scene
+from flexroad.tools.synthetic.spoilers import BARE, Kind
 
 NOISE_M = 0.05
 

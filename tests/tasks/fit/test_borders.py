@@ -19,8 +19,8 @@ from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.segment import mask
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import basis_matrix, uniform_knots
-from flexroad.tasks.synthetic import make_scene
 from flexroad.tasks.types import RoadMask, TileData
+from flexroad.tools.synthetic import make_scene
 from tests import exact_fit
 
 AROUND_M = 100

@@ -8,8 +8,8 @@ import pytest
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
-from flexroad.tasks.synthetic import make_scene
 from flexroad.tasks.types import RoadClusters, TileData
+from flexroad.tools.synthetic import make_scene
 from tests import exact_fit
 
 TILE = Grid("EPSG:25832", 500000, 5600500, 1.0, 120, 150)

@@ -7,7 +7,7 @@ import pytest
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.tasks.io.dsm_and_dtm import below_ground_note, survey_difference
-from flexroad.tasks.synthetic import make_scene
+from flexroad.tools.synthetic import make_scene
 from tests.make_rasters import UTM, write
 
 GRID = Grid(UTM, 295500.0, 5629500.0, 1.0, 20, 20)

@@ -5,7 +5,7 @@ import pytest
 
 from flexroad.catalog import Grid
 from flexroad.tasks.io.height_offset import is_offset, offset_note, on_tiles, open_offset
-from flexroad.tasks.synthetic import make_scene
+from flexroad.tools.synthetic import make_scene
 
 GRID = Grid("EPSG:25832", 500_000, 5_600_250, 1.0, 250, 250)
 ROW, COL = np.mgrid[:250, :250]

@@ -5,8 +5,8 @@ from scipy.ndimage import binary_dilation, label
 
 from flexroad.catalog import Grid
 from flexroad.tasks.quality.decks import AREA_M2, RISE_M, likely_decks
-from flexroad.tasks.synthetic import Kind, gerod, make_scene
-from flexroad.tasks.synthetic.crossings import CrossingOptions, Crossings, make_crossings
+from flexroad.tools.synthetic import Kind, gerod, make_scene
+from flexroad.tools.synthetic.crossings import CrossingOptions, Crossings, make_crossings
 
 GRID = Grid("EPSG:25832", 500_000, 5_600_060, 1.0, 100, 60)
 ROW, COL = np.mgrid[:60, :100]

@@ -6,9 +6,9 @@ import pytest
 
 from flexroad.catalog import Grid
 from flexroad.tasks.roads.coregistration import note, pair, shift
-from flexroad.tasks.synthetic import block, make_scene
-from flexroad.tasks.synthetic.orthophoto import SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG, orthophoto
 from flexroad.tasks.types import Orthophoto, TileData
+from flexroad.tools.synthetic import block, make_scene
+from flexroad.tools.synthetic.orthophoto import SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG, orthophoto
 
 GSD = 0.5
 

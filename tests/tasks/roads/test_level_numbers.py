@@ -5,7 +5,7 @@ import shapely
 
 from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.roads.level_numbers import columns, level_numbers
-from flexroad.tasks.synthetic.crossings import Crossings
+from flexroad.tools.synthetic.crossings import Crossings
 from tests.make_town import CRS, OPTIONS, write_streets
 
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from flexroad.tasks.roads.along_line import HeightGrid, Profiles, height_grid, profile_error, profiles
-from flexroad.tasks.roads.reference_line import Options as LineOptions
-from flexroad.tasks.roads.reference_line import ReferenceLine, reference_line
 from flexroad.tasks.roads.routes import CentreLine, Route
+from flexroad.tools.export.along_line import HeightGrid, Profiles, height_grid, profile_error, profiles
+from flexroad.tools.export.reference_line import Options as LineOptions
+from flexroad.tools.export.reference_line import ReferenceLine, reference_line
 
 
 def straight(length: float = 120.0) -> ReferenceLine:

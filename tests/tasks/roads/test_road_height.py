@@ -7,8 +7,6 @@ import pytest
 
 from flexroad.catalog import Grid
 from flexroad.catalog.borders import border_of
-from flexroad.tasks.acquire.points.to_rasters import Options as Rastering
-from flexroad.tasks.acquire.points.to_rasters import rasterise
 from flexroad.tasks.border import ENDS
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
@@ -16,9 +14,11 @@ from flexroad.tasks.quality import assess
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.road_height import dsm_offset, with_road_heights
 from flexroad.tasks.spline.frame import Frame
-from flexroad.tasks.synthetic import SceneOptions, make_scene
-from flexroad.tasks.synthetic.scene import scan
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+from flexroad.tools.prepare.points.to_rasters import Options as Rastering
+from flexroad.tools.prepare.points.to_rasters import rasterise
+from flexroad.tools.synthetic import SceneOptions, make_scene
+from flexroad.tools.synthetic.scene import scan
 
 GRID = Grid("EPSG:25832", 500000, 5600300, 1.0, 300, 300)
 AROUND_M = 75

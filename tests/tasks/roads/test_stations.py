@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from flexroad.tasks.roads.along_line import stations
-from flexroad.tasks.roads.reference_line import Options, ReferenceLine, reference_line
 from flexroad.tasks.roads.routes import CentreLine, Route
+from flexroad.tools.export.along_line import stations
+from flexroad.tools.export.reference_line import Options, ReferenceLine, reference_line
 
 
 def line(*points: tuple[float, float], width: float = 6.0) -> ReferenceLine:

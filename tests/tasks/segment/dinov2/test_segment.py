@@ -15,20 +15,12 @@ from flexroad.tasks import TaskError, load
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.segment.dinov2 import backbone, head
-from flexroad.tasks.segment.dinov2 import train as training
 from flexroad.tasks.segment.dinov2.backbone import MEAN, STD, load_backbone, normalised
 from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
 from flexroad.tasks.segment.dinov2.segment import Options, files, segment
-from flexroad.tasks.segment.dinov2.train import (
-    THRESHOLDS,
-    Labels,
-    Line,
-    Sample,
-    Windows,
-    at_cells,
-    best_threshold,
-)
 from flexroad.tasks.types import TileData
+from flexroad.tools.train import fit_head as training
+from flexroad.tools.train.fit_head import THRESHOLDS, Labels, Line, Sample, Windows, at_cells, best_threshold
 from tests.gpu import needs_gpu
 from tests.make_backbone import save_backbone
 
@@ -45,7 +37,7 @@ def backbones(tmp_path_factory) -> dict[int, Path]:
 @pytest.fixture(scope="session")
 def sample(tmp_path_factory) -> Sample:
     """A synthetic tile of 60 m with an orthophoto; a fifth of it is road."""
-    from flexroad.pipeline.benchmark.scenes import write_scenes
+    from flexroad.tools.synthetic.scenes import write_scenes
 
     catalog = Catalog.read(write_scenes(tmp_path_factory.mktemp("scene"), 2, seed=3, size_m=60, dop=True))
     data = load.load(catalog.tiles[1], load.Options())
@@ -438,7 +430,7 @@ def test_tokens_on_gpu_equal_those_of_the_cpu(backbones, registers):
 
 def test_import_method_imports_no_heavy_package():
     heavy = ["torch", "transformers", "safetensors", "huggingface_hub"]
-    code = "import sys, flexroad.tasks.segment.dinov2.segment, flexroad.tasks.segment.dinov2.train;"
+    code = "import sys, flexroad.tasks.segment.dinov2.segment, flexroad.tools.train.fit_head;"
     code += f"print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

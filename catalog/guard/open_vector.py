@@ -1,0 +1,247 @@
+"""Check of source vector files before GDAL opens them: regular files of known formats that lead nowhere else.
+
+pyogrio cannot be told which drivers to use, and GDAL chooses by content, whatever a file's name: an OGR VRT
+named ``roads.geojson`` would make it read other files or the web. So the format is told here from the first
+bytes, and only formats are let through that GDAL cannot take for another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import mmap
+import os
+import re
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+from weakref import finalize
+from xml.parsers import expat
+
+from flexroad.catalog.gdal_options import settle_vectors
+from flexroad.catalog.guard.refused import Refused, archive_note, head, require_beside
+from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, source_stat
+from flexroad.catalog.guard.sqlite_contents import require_sound_contents
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.storage.paths import FileStat
+from flexroad.catalog.storage.scratch import ScratchFolder
+
+pyogrio = lazy("pyogrio")
+
+UNKNOWN = (
+    "is not a vector file: it is no GeoPackage, SpatiaLite, FlatGeobuf, Shapefile, GeoJSON or OSM file; "
+    "convert it with ogr2ogr, e.g. ogr2ogr NEW.gpkg FILE"
+)
+SQLITE = b"SQLite format 3\0"
+GEOPACKAGES = (b"GPKG", b"GP10", b"GP11")
+WAL_MODE = b"\2\2"
+"""Bytes 18 and 19 of a SQLite file whose changes are first written to a ``-wal`` file."""
+MOST_COPIES = 8
+"""Largest number of copies of GeoPackages that a process keeps."""
+CRS = re.compile(rb"""["'](?:c|\\u00[46]3)(?:r|\\u00[57]2)(?:s|\\u00[57]3)["']\s*""", re.IGNORECASE)
+OTHER_THAN_OSM = re.compile(
+    rb"\0|<(?!/?(?:osm|bounds?|node|way|relation|tag|nd|member|note|meta)[\s/>]|\?xml\s)"
+)
+VIRTUAL = re.compile(r"create(\s|/\*.*?\*/|--.*?\n)+virtual\b", re.IGNORECASE | re.DOTALL)
+INDEX = re.compile(
+    r"""CREATE VIRTUAL TABLE\s+("[^"]*"|'[^']*'|\w+)\s+USING\s+"""
+    r"(rtree|fts[345]|VirtualSpatialIndex|VirtualElementary|VirtualKNN2?)\s*(\(|$)",
+    re.IGNORECASE,
+)
+"""Virtual tables that are made of the file's own tables."""
+MAX_CRS_BYTES = 65536
+"""Longest text of a CRS in GeoJSON."""
+ERRORS = (RuntimeError, ValueError, OSError, UnboundLocalError)
+"""What pyogrio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
+LINKS = ("link", "url")
+T = TypeVar("T")
+
+
+def vector_name(path: Path) -> str:
+    """Return the name by which GDAL opens a vector file, and no other file.
+
+    Raises
+    ------
+    Refused
+        If the file is of another format, is not a regular file, or names other files.
+    OSError
+        If it does not exist or cannot be read.
+    """
+    settle_vectors()
+    path = path.absolute()
+    data = head(path)
+    text = data.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if "!" in str(path) or "?" in str(path):
+        raise Refused("has a ! or ? in its path, which GDAL would not take for a part of it; rename it")
+    if text.startswith(b"{"):
+        _require_no_linked_crs(path)
+        # The prefix selects the driver, so that a mark of another format in the text has no effect.
+        return f"GeoJSON:{path}"
+    if data.startswith(b"\0\0\x27\x0a"):
+        _require_own_parts(path, (path.with_suffix(end) for s in SHAPEFILE_PARTS for end in (s, s.upper())))
+    elif data.startswith(SQLITE):
+        path = _complete(path, data)
+        is_geopackage = data[68:72] in GEOPACKAGES
+        if not (is_geopackage or _is_spatialite(path)):
+            raise Refused(UNKNOWN)
+        _require_own_tables(path)
+        require_sound_contents(path, _state(path))
+        if not is_geopackage:
+            # The prefix selects the driver, whatever the file's name ends in.
+            return f"SQLITE:{path}"
+    elif not (
+        data.startswith(b"fgb\x03") or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader") or _is_osm(text)
+    ):
+        raise Refused(UNKNOWN + archive_note(data))
+    return str(path)
+
+
+def _objects(path: Path, condition: str) -> list[tuple[str, str]]:
+    """Return names and statements of tables and views of an SQLite file; none if it is damaged."""
+    try:
+        with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as file:
+            return file.execute(f"SELECT name, sql FROM sqlite_master WHERE {condition}").fetchall()
+    except sqlite3.Error:
+        # GDAL reports what is wrong.
+        return []
+
+
+def _is_spatialite(path: Path) -> bool:
+    """Return whether an SQLite file has the tables of SpatiaLite, and GDAL can read it."""
+    tables = "name IN ('geometry_columns', 'spatial_ref_sys')"
+    return len(_objects(path, tables)) == 2 and "SQLite" in pyogrio.list_drivers()
+
+
+def _require_own_tables(path: Path) -> None:
+    """Raise an error if an SQLite file has a table that may be made of another file."""
+    for name, statement in _objects(path, "sql LIKE '%virtual%'"):
+        if VIRTUAL.match(statement) and not INDEX.match(statement):
+            raise Refused(
+                f"has the virtual table {name!r}, which may be made of another file; convert it with ogr2ogr"
+            )
+
+
+def _complete(path: Path, data: bytes) -> Path:
+    """Return an SQLite file that has all changes: itself, or a copy if some are not yet written into it."""
+    parts = [path.with_name(path.name + end) for end in SQLITE_PARTS]
+    _require_own_parts(path, [*parts, path.with_name(path.name + "-shm")])
+    if data[18:20] != WAL_MODE and not any(part.exists() for part in parts):
+        return path
+    return _copied(path, _state(path)).path
+
+
+def _state(path: Path) -> FileStat:
+    state = source_stat(path)
+    if state is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+    return state
+
+
+def in_its_encoding(read: Callable[..., T]) -> tuple[T, str]:
+    """Return what a function reads of a vector file, and the encoding of its text; empty if as declared.
+
+    Text that is not in the declared encoding, mostly UTF-8, is taken for cp1252, else for latin1, which has
+    all bytes.
+
+    Parameters
+    ----------
+    read : callable
+        Takes the option ``encoding`` of pyogrio.
+    """
+    try:
+        return read(), ""
+    except UnicodeDecodeError:
+        pass
+    try:
+        return read(encoding="cp1252"), "cp1252"
+    except UnicodeDecodeError:
+        return read(encoding="latin1"), "latin1"
+
+
+def layer_info(file: str, layer: str, **more: Any) -> dict[str, Any]:
+    """Return what pyogrio knows of a layer; names of columns may be in another encoding than declared."""
+    info: dict[str, Any] = in_its_encoding(partial(pyogrio.read_info, file, layer=layer, **more))[0]
+    return info
+
+
+def encoding_note(name: str, encoding: str) -> str:
+    """Return a line about a file whose text `in_its_encoding` has read in another encoding than declared."""
+    return (
+        f"the text of {name} is not in the encoding that it declares, and was read as {encoding}; "
+        "write it as UTF-8, or name its encoding in the .cpg of a Shapefile"
+    )
+
+
+class _Copy:
+    """A copy of an SQLite file with its unwritten changes, deleted when this object is garbage-collected."""
+
+    def __init__(self, path: Path) -> None:
+        folder = ScratchFolder()
+        finalize(self, folder.cleanup)
+        self.path = Path(folder.name, path.name)
+        for end in (*SQLITE_PARTS, ""):
+            with contextlib.suppress(FileNotFoundError) if end else contextlib.nullcontext():
+                shutil.copyfile(path.with_name(path.name + end), self.path.with_name(path.name + end))
+        # GDAL reports what is wrong. It cannot undo an interrupted change, as it opens files for reading.
+        with contextlib.suppress(sqlite3.Error), closing(sqlite3.connect(self.path)) as file:
+            file.execute("PRAGMA journal_mode=DELETE")
+
+
+@lru_cache(maxsize=MOST_COPIES)
+def _copied(path: Path, state: FileStat) -> _Copy:
+    """Return a copy, as SQLite would write the changes into the file that it reads; cached by its state."""
+    return _Copy(path)
+
+
+def _is_osm(text: bytes) -> bool:
+    """Return whether a text begins as OSM's XML, without the mark of another format."""
+    if OTHER_THAN_OSM.search(text):
+        return False
+    names: list[str] = []
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = lambda name, _: names.append(name)
+    try:
+        parser.Parse(text, False)
+    except expat.ExpatError:
+        return False
+    return names[:1] == ["osm"]
+
+
+def _require_own_parts(path: Path, parts: Iterable[Path]) -> None:
+    """Raise an error if a part of a file is not a regular file of its folder."""
+    for part in parts:
+        try:
+            require_beside(part, path)
+        except FileNotFoundError:
+            continue
+        except Refused as error:
+            raise Refused(f"has the part {part.name}, which {error}") from error
+
+
+def _require_no_linked_crs(path: Path) -> None:
+    """Raise an error if a GeoJSON file has its CRS by a web address, which GDAL would ask."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for found in CRS.finditer(data):
+            rest = bytes(data[found.end() : found.end() + MAX_CRS_BYTES])
+            if rest[:1] in (b",", b"}", b"]"):
+                # A value, not a key.
+                continue
+            if not rest.startswith(b":") or _is_link(rest[1:]):
+                raise Refused("has its CRS by a link; give it one, e.g. ogr2ogr -a_srs EPSG:25832 NEW FILE")
+
+
+def _is_link(rest: bytes) -> bool:
+    """Return whether the text after ``"crs":`` is an object that links to a CRS, or none that can be read."""
+    pairs: list[tuple[str, Any]] = []
+    decoder = json.JSONDecoder(object_pairs_hook=pairs.extend)
+    try:
+        decoder.raw_decode(rest.decode(errors="replace").lstrip())
+    except ValueError:
+        return True
+    return any(key.lower() == "type" and str(value).lower() in LINKS for key, value in pairs)

@@ -1,0 +1,170 @@
+"""Checks of an SQLite file before GDAL sees it: views, computed columns, and stated numbers of features.
+
+GDAL runs the queries of all views when it lists the layers, without any limit. Here each is run once by
+Python's SQLite, with limits. pyogrio reads as many features as the file states, and no more.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import shlex
+import sqlite3
+from contextlib import closing
+from functools import lru_cache
+from pathlib import Path
+from urllib.parse import quote
+
+from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.storage.paths import FileStat
+from flexroad.catalog.text import one_line
+
+STEPS = 50_000_000
+"""Steps of SQLite's machine that any query may take: about a second. A row of a join takes about 30."""
+STEPS_PER_BYTE = 2
+"""Further steps for each byte of the file: to read all rows takes fewer."""
+STRIDE = 100_000
+"""Steps between two looks at their number."""
+MAX_VALUE_BYTES = 2**26
+"""Largest text or geometry."""
+FUNCTIONS = frozenset(
+    "abs avg coalesce count dense_rank ifnull iif instr length lower ltrim max min nullif rank round "
+    "row_number rtrim substr substring sum total trim typeof upper".split()
+)
+"""Functions that a query may call: their result is the same each time, and no longer than what they get."""
+NO_ROWS = re.compile(r"no such (table|column)|circularly defined|no such function: XB_", re.IGNORECASE)
+"""Errors of queries that GDAL cannot run, either; the last one is of views that SpatiaLite makes itself."""
+COUNTS = (
+    ("gpkg_ogr_contents", "table_name", "feature_count", "DELETE FROM gpkg_ogr_contents"),
+    (
+        "geometry_columns_statistics",
+        "f_table_name",
+        "row_count",
+        "UPDATE geometry_columns_statistics SET row_count = NULL",
+    ),
+)
+"""Tables with numbers of features, their columns, and a statement after which GDAL counts by itself."""
+VIRTUAL_COLUMN = 2
+"""Mark of columns that are computed when they are read, in SQLite's table of columns."""
+
+
+def require_sound_contents(path: Path, state: FileStat) -> None:
+    """Raise an error if an SQLite file may need endless time or memory, or hides features.
+
+    Parameters
+    ----------
+    path : Path
+        A file that has all changes.
+    state : FileStat
+        Its state, by which the answer is kept.
+
+    Raises
+    ------
+    Refused
+        If a view does not end within the limits or calls another function than `FUNCTIONS`, if a table has
+        columns that are computed, or more features than the file states.
+    """
+    if fault := _fault(path, state):
+        raise Refused(fault)
+
+
+@lru_cache(maxsize=256)
+def _fault(path: Path, state: FileStat) -> str:
+    """Return what is wrong, to follow the name of the file; empty if nothing is."""
+    try:
+        with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as file:
+            names = file.execute(
+                "SELECT type, name FROM sqlite_master WHERE type IN ('table', 'view')"
+            ).fetchall()
+            for kind, name in names:
+                fault = _of_view(file, name, path, state) if kind == "view" else _of_table(file, name, path)
+                if fault:
+                    return fault
+            return _of_counts(file, {name.lower() for kind, name in names if kind == "table"}, path)
+    except sqlite3.Error as error:
+        if "malformed database schema" in str(error):
+            return f"has a schema that SQLite {sqlite3.sqlite_version} cannot read: {one_line(error)}"
+        # GDAL reports what is wrong.
+    return ""
+
+
+def _of_table(file: sqlite3.Connection, name: str, path: Path) -> str:
+    try:
+        columns = file.execute("SELECT name, hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()
+    except sqlite3.OperationalError:
+        # A virtual table, of a module that Python's SQLite does not have.
+        return ""
+    computed = [column for column, hidden in columns if hidden == VIRTUAL_COLUMN]
+    if not computed:
+        return ""
+    remedy = _command(path, f"ALTER TABLE {_bracketed(name)} DROP COLUMN {_bracketed(computed[0])}")
+    return f"has the computed column {computed[0]!r}, whose values may have no end; remove it: {remedy}"
+
+
+def _of_counts(file: sqlite3.Connection, tables: set[str], path: Path) -> str:
+    for statistics, name, number, statement in COUNTS:
+        if statistics not in tables:
+            continue
+        stated = file.execute(
+            f"SELECT {name}, {number} FROM {statistics} WHERE {number} IS NOT NULL"
+        ).fetchall()
+        for table, features in stated:
+            if str(table).lower() not in tables:
+                continue
+            ((rows,),) = file.execute(f"SELECT count(*) FROM {_quoted(table)}").fetchall()
+            if rows > features:
+                remedy = f"have them counted again: {_command(path, statement)}"
+                return f"states {features:,} features of {table!r}, which has {rows:,}; {remedy}"
+    return ""
+
+
+def _of_view(file: sqlite3.Connection, name: str, path: Path, state: FileStat) -> str:
+    why = _trial(file, name, STEPS + STEPS_PER_BYTE * state.size)
+    if not why:
+        return ""
+    remedy = _command(path, f"DROP VIEW {_bracketed(name)}")
+    return f"has the view {name!r}, which {why}; write its result to a table, or remove it: {remedy}"
+
+
+def _trial(file: sqlite3.Connection, view: str, most_steps: int) -> str:
+    """Run the query of a view; return why it is not read, empty if it ends."""
+    others: list[str] = []
+
+    def authorize(action: int, _: str | None, function: str | None, *__: str | None) -> int:
+        if action != sqlite3.SQLITE_FUNCTION or str(function).lower() in FUNCTIONS:
+            return sqlite3.SQLITE_OK
+        others.append(str(function))
+        return sqlite3.SQLITE_DENY
+
+    looks = itertools.count(1)
+    file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
+    file.set_authorizer(authorize)
+    file.set_progress_handler(lambda: next(looks) * STRIDE > most_steps, STRIDE)
+    try:
+        for _ in file.execute(f"SELECT * FROM {_quoted(view)}"):
+            pass
+    except sqlite3.Error as error:
+        if others:
+            return f"calls the function {others[0]}"
+        if NO_ROWS.search(str(error)):
+            return ""
+        return "does not end" if "interrupted" in str(error) else f"cannot be checked ({one_line(error)})"
+    finally:
+        file.set_authorizer(None)
+        file.set_progress_handler(None, 0)
+    return ""
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
+
+
+def _bracketed(name: str) -> str:
+    return _quoted(name) if "]" in name else f"[{name}]"
+
+
+def _command(path: Path, statement: str) -> str:
+    """Return a shell command that changes an SQLite file; it needs nothing but Python."""
+    connection = f"sqlite3.connect({json.dumps(str(path))}, isolation_level=None)"
+    return f"python -c {shlex.quote(f'import sqlite3; {connection}.execute({json.dumps(statement)})')}"

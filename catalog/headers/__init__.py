@@ -1,1 +1,0 @@
-"""Headers of input files: extent, CRS, units, bands; one module per kind of data."""

@@ -1,0 +1,294 @@
+"""Point clouds (LAS, LAZ, COPC): read their headers, and their points in chunks."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds
+from flexroad.catalog.guard import las_header
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.text import access_reason, one_line
+
+laspy = lazy("laspy")
+
+T = TypeVar("T")
+Floats = NDArray[np.float64]
+
+SUFFIXES = (".las", ".laz")
+NOISE = (7, 18)
+"""Classes of low and high noise (ASPRS LAS 1.4)."""
+CHUNK = 1_000_000
+"""Points decoded at a time, so that memory does not grow with the file."""
+CHUNK_BYTES = 256 * 2**20
+"""Largest size of points decoded at a time; a point of an absurd format has 64 KiB."""
+RGB = ("red", "green", "blue")
+USED = ("Z", "CLASSIFICATION", "FLAGS", "RGB", "GPS_TIME")
+"""Fields that are decoded besides the coordinates in plan, as laspy calls them."""
+DEGREES = 360.0
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(seconds=10**9)
+"""The zero of adjusted standard GPS time (ASPRS LAS 1.4), without leap seconds."""
+FIRST_GPS = (datetime(1990, 1, 1, tzinfo=UTC) - GPS_EPOCH).total_seconds()
+WEEK_S = 604_800
+SLACK = 0.01
+"""Points may exceed the header's bounds by this fraction of the extent plus one unit."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The header of a point cloud; coordinates and heights in the file's own units."""
+
+    path: Path
+    points: int
+    bounds: Bounds
+    """West, south, east, north."""
+    heights: tuple[float, float]
+    """Lowest and highest."""
+    crs: str | None
+    """As WKT, or None if the file has no valid CRS."""
+    has_colours: bool
+    """Whether the point format has colours; they may all be zero."""
+    created: date | None
+    """Date when the file was written (not of the survey), or None."""
+    has_dates: bool = False
+    """Whether the header declares GPS times as standard, so that they are dates and not seconds of a week."""
+    chunk: int = 0
+    """Number of points of the largest chunk of a compressed file, which are decoded together; 0 if there are
+    none."""
+
+    def parts(self, size: int) -> list[range]:
+        """Return ranges of about ``size`` points that can be decoded apart; larger if chunks are larger."""
+        step = size * max(1, math.ceil(self.chunk / size))
+        return [range(first, min(first + step, self.points)) for first in range(0, self.points, step)]
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Some points of a cloud, ``(n,)`` each, in the file's own units."""
+
+    x: Floats
+    y: Floats
+    z: Floats
+    kind: NDArray[np.uint8]
+    """Class by ASPRS, ``(n,)``."""
+    colour: NDArray[np.uint16] | None
+    """Red, green, blue as stored, ``(n, 3)``, or None if the file has none."""
+    gps: Floats | None = None
+    """Seconds of GPS since 1980-01-06, less 10^9, ``(n,)``, or None if the file has no standard GPS times."""
+
+
+def find(inputs: Collection[Path]) -> tuple[Path, ...]:
+    """Return the clouds among files and folders, each once, ordered by path.
+
+    Raises
+    ------
+    CatalogError
+        If a folder has no cloud, or a file or folder does not exist.
+    """
+    clouds: dict[Path, Path] = {}
+    for path in inputs:
+        files = [path]
+        if path.is_dir():
+            files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
+        elif not path.exists():
+            raise CatalogError(f"{path} does not exist; give LAS or LAZ files, or folders of them")
+        if not files:
+            raise CatalogError(f"no LAS or LAZ file in {path}; give the files, or the folder they lie in")
+        clouds.update({file.resolve(): file for file in files})
+    return tuple(clouds[path] for path in sorted(clouds))
+
+
+def inspect(path: Path) -> Cloud:
+    """Read the header of a cloud.
+
+    Raises
+    ------
+    CatalogError
+        If the file is missing, not LAS or LAZ, truncated, or without points.
+    """
+    largest = _checked(path)
+    with _opened(path) as reader:
+        cloud = _attempt(path, lambda: _cloud(path, reader.header, largest))
+        needed = reader.header.offset_to_point_data + cloud.points * reader.header.point_format.size
+        plain = not reader.header.are_points_compressed
+    if cloud.points == 0:
+        raise CatalogError(f"{path} has no points; leave it out, or write it again")
+    if not np.isfinite((*cloud.bounds, *cloud.heights)).all():
+        raise CatalogError(f"{path} is damaged: its header gives no bounds; download it again")
+    if plain and path.stat().st_size < needed:
+        raise CatalogError(
+            f"{path} is cut short: {path.stat().st_size:,} of {needed:,} bytes; download it again"
+        )
+    return cloud
+
+
+def _cloud(path: Path, header: Any, largest: int) -> Cloud:
+    west, south, low = map(float, header.mins)
+    east, north, high = map(float, header.maxs)
+    bounds = west, south, east, north
+    return Cloud(
+        path,
+        header.point_count,
+        bounds,
+        (low, high),
+        _crs(header, bounds),
+        set(RGB) <= set(header.point_format.dimension_names),
+        header.creation_date if header.creation_date and header.creation_date.year > 1 else None,
+        _has_dates(header),
+        largest // header.point_format.size,
+    )
+
+
+def _has_dates(header: Any) -> bool:
+    has_times = "gps_time" in header.point_format.dimension_names
+    # 1 in LAS: adjusted standard GPS time; 0: seconds of the week.
+    return has_times and int(header.global_encoding.gps_time_type) == 1
+
+
+def survey_dates(gps: Floats) -> tuple[datetime, datetime] | None:
+    """Return the dates of the first and the last point, or None if no time can be one of a survey.
+
+    Parameters
+    ----------
+    gps : (n,) array
+        See `Chunk.gps`. Times of a week (0 to 604,800 s) are left out, as some files have them although
+        their header declares standard times; so are times before 1990 and in the future.
+    """
+    latest = (datetime.now(UTC) - GPS_EPOCH).total_seconds()
+    times = gps[np.isfinite(gps) & ((gps < 0) | (gps > WEEK_S)) & (gps > FIRST_GPS) & (gps < latest)]
+    if not len(times):
+        return None
+    first, last = (GPS_EPOCH + timedelta(seconds=float(time)) for time in (times.min(), times.max()))
+    return first, last
+
+
+def chunks(
+    path: Path, size: int = CHUNK, drop: Collection[int] = NOISE, points: range | None = None
+) -> Iterator[Chunk]:
+    """Yield the points of a cloud, decoded once; withheld points are left out.
+
+    Parameters
+    ----------
+    path : Path
+        LAS, LAZ or COPC file.
+    size : int
+        Points decoded at a time, at most.
+    drop : Collection[int]
+        Classes to leave out.
+    points : range, optional
+        Points to decode, in the order of the file; None: all.
+
+    Raises
+    ------
+    CatalogError
+        If the file is missing, unreadable, truncated or damaged. LAZ has no checksum: a file is taken as
+        damaged if points lie beyond the header's bounds.
+    """
+    _checked(path)
+    with _opened(path, fields=USED) as reader:
+        header = reader.header
+        wanted = range(header.point_count) if points is None else points
+        done = wanted.start
+        low, high = np.asarray(header.mins), np.asarray(header.maxs)
+        slack = SLACK * (high - low) + 1
+        size = max(1, min(size, CHUNK_BYTES // header.point_format.size))
+        limits = low - slack, high + slack
+        if done:
+            _attempt(path, lambda: reader.seek(done))
+        while done < wanted.stop:
+            number = min(size, wanted.stop - done)
+            read = _attempt(path, functools.partial(reader.read_points, number), f" after {done:,} points")
+            if not len(read):
+                break
+            done += len(read)
+            yield _attempt(path, functools.partial(_chunk, path, read, limits, drop, _has_dates(header)))
+    if done != wanted.stop:
+        raise CatalogError(
+            f"{path} is cut short: {done:,} of {header.point_count:,} points; download it again"
+        )
+
+
+def _chunk(
+    path: Path, points: Any, limits: tuple[Floats, Floats], drop: Collection[int], has_dates: bool
+) -> Chunk:
+    x, y, z = (np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z))
+    for axis, low, high in zip((x, y, z), *limits, strict=True):
+        if axis.min() < low or axis.max() > high:
+            raise CatalogError(
+                f"{path} is damaged: its header gives {low:.0f} to {high:.0f} where its points have "
+                f"{axis.min():.0f} to {axis.max():.0f}; download it again"
+            )
+    kind = np.asarray(points.classification, np.uint8)
+    colour = None
+    if set(RGB) <= set(points.point_format.dimension_names):
+        colour = np.stack([np.asarray(points[name], np.uint16) for name in RGB], axis=1)
+    kept = ~(np.asarray(points.withheld, bool) | np.isin(np.arange(256), list(drop))[kind])
+    gps = np.asarray(points.gps_time, np.float64) if has_dates else None
+    if kept.all():
+        return Chunk(x, y, z, kind, colour, gps)
+    colour = None if colour is None else colour[kept]
+    return Chunk(x[kept], y[kept], z[kept], kind[kept], colour, None if gps is None else gps[kept])
+
+
+def _checked(path: Path) -> int:
+    """Check that a file is there and its header; return the size of its largest chunk (bytes)."""
+    if not _attempt(path, path.is_file):
+        missing = "is not a file" if path.exists() else "does not exist"
+        raise CatalogError(f"{path} {missing}; give LAS or LAZ files, or folders of them")
+    return _attempt(path, lambda: las_header.check(path))
+
+
+def _opened(path: Path, fields: Collection[str] = ()) -> Any:
+    """Open a checked cloud; of compressed points only some fields are decoded, all if none are named."""
+    selection = {"decompression_selection": _selection(fields)} if fields else {}
+    # The parallel decoder allocates a complete chunk, which the header may give as 2^32 points, and goes to
+    # wrong points of files with chunks of different sizes, as COPC has (laz-rs #62).
+    return _attempt(path, lambda: laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, **selection))
+
+
+def _selection(fields: Collection[str]) -> Any:
+    """Return what laspy decodes; formats before LAS 1.4 are always decoded completely."""
+    chosen = laspy.DecompressionSelection.xy_returns_channel()
+    for name in fields:
+        chosen |= laspy.DecompressionSelection[name]
+    return chosen
+
+
+def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:
+    """Return the result of ``read``; turn any error of the decoders into a `CatalogError` of one line."""
+    try:
+        return read()
+    except CatalogError:
+        raise
+    except BaseException as error:
+        # For a damaged file, laspy raises exceptions of many types, and lazrs one that is no `Exception`.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        if isinstance(error, ImportError):
+            raise
+        if why := access_reason(error):
+            raise CatalogError(f"{path} {why}{when}") from error
+        raise CatalogError(
+            f"{path} cannot be read as a point cloud{when}: {one_line(error)}; download it again"
+        ) from error
+
+
+def _crs(header: Any, bounds: Bounds) -> str | None:
+    try:
+        crs = header.parse_crs()
+    except Exception:  # laspy and pyproj raise many types for damaged records
+        return None
+    # GeoTIFF keys of a user-defined projection also name its geographic base CRS, which laspy then returns.
+    if crs is None or (crs.is_geographic and max(map(abs, bounds)) > DEGREES):
+        return None
+    text: str = crs.to_wkt()
+    return text

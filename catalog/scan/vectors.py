@@ -1,0 +1,262 @@
+"""Vector files of roads, and the tiles that they reach."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from flexroad.catalog.crs import bounds_in, transformer
+from flexroad.catalog.crs_checks import angle_fault, crs_of, elsewhere
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds, union
+from flexroad.catalog.guard.open_vector import ERRORS, layer_info, vector_name
+from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.spatial_index import real_bounds
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.scan.rasters import matching
+from flexroad.catalog.skipped import Skipped
+from flexroad.catalog.text import access_reason, count, reason
+from flexroad.catalog.tile import REACH_M, RECENT, Layer, Tile
+
+pyogrio = lazy("pyogrio")
+
+MARGIN_M = 1.0
+"""Extents are larger than the features' bounds by this much (m): those of a straight road are empty."""
+EVERYWHERE: Bounds = (-1e9, -1e9, 1e9, 1e9)
+"""Extent of a file that may have features anywhere (m)."""
+NOWHERE: Bounds = (math.inf, math.inf, 0.0, 0.0)
+"""Extent of a file that reaches nothing: it has no features, or they have no place in the tiles' CRS."""
+
+
+@dataclass(frozen=True)
+class VectorFile:
+    """The header of a vector file."""
+
+    path: Path
+    """Absolute."""
+    has_crs: bool
+    """False if the file has no CRS, or none that can be its own, and the caller's is used."""
+    extents: tuple[tuple[str, Bounds], ...] | None
+    """CRS and bounds of each layer with features, or None if the format does not store them."""
+    sublayer: str | None = None
+    """The layer of the roads, if it was chosen."""
+
+
+def find(
+    root: Path, given: str, crs: str | None, sublayer: str | None = None
+) -> tuple[list[VectorFile], list[Skipped]]:
+    """Open vector files; return the usable ones, and the others.
+
+    Parameters
+    ----------
+    root : Path
+        The folder of the catalog's rasters.
+    given : str
+        A file, or a glob pattern relative to ``root``.
+    crs : str, optional
+        CRS of files without one.
+    sublayer : str, optional
+        Layer of files with several.
+
+    Raises
+    ------
+    CatalogError
+        If there is no such file or none can be used: it is not a vector file or has no CRS, the layer is not
+        in it, or it has several and ``sublayer`` is None.
+    """
+    root = root.resolve()
+    paths, unlisted = ([Path(given)], []) if Path(given).is_file() else matching(root, "roads", given)
+    files, errors = list[VectorFile](), dict[Path, CatalogError]()
+    for path in paths:
+        try:
+            files.append(opened(path, crs, sublayer))
+        except CatalogError as error:
+            errors[path] = error
+    if not files:
+        raise next(iter(errors.values()))
+    skipped = (Skipped(str(path.absolute()), "", str(error)) for path, error in errors.items())
+    return files, [*skipped, *unlisted]
+
+
+def layers(path: Path) -> dict[str, str]:
+    """Return the layers with geometries of a vector file, each with its type and number of features.
+
+    Raises
+    ------
+    Refused, or one of `ERRORS`
+        If the file cannot be read as vectors.
+    """
+    file = vector_name(path)
+    kinds = {name: kind for name, kind in pyogrio.list_layers(file) if kind is not None}
+    counts = {name: layer_info(file, name)["features"] for name in kinds}
+    # OSM files do not know their number of features.
+    return {
+        name: f"{kind}, {count(counts[name], 'feature')}" if counts[name] >= 0 else kind
+        for name, kind in kinds.items()
+    }
+
+
+def listed(found: Mapping[str, str]) -> str:
+    """Return the layers of a vector file for a message: ``roads (LineString, 12 features), ...``."""
+    return ", ".join(f"{name} ({about})" for name, about in found.items())
+
+
+def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFile:
+    """Open one vector file; see `find`."""
+    try:
+        file = vector_name(path)
+        found = layers(path)
+        names = [name for name in found if sublayer in (None, name)]
+        infos = [layer_info(file, name) for name in names]
+        # The bounds of an OSM file are known only after reading all of it.
+        no_bounds = any(info["driver"] == "OSM" for info in infos)
+        if not no_bounds:
+            infos = [layer_info(file, name, force_total_bounds=True) for name in names]
+            infos = [info | {"total_bounds": real_bounds(file, info)} for info in infos]
+    except Refused as error:
+        raise CatalogError(f"--roads {path} {error}") from error
+    except ERRORS as error:
+        if why := access_reason(error):
+            raise CatalogError(f"--roads {path} {why}") from error
+        raise CatalogError(f"--roads {path} is not a vector file: {reason(error)}") from error
+    if found and not names:
+        raise CatalogError(f"--roads {path} has no layer {sublayer!r}; it has {listed(found)}")
+    if len(names) > 1 and not no_bounds:
+        raise CatalogError(
+            f"--roads {path} has {count(len(names), 'layer')}: {listed(found)}; name one with --roads-layer"
+        )
+    if not infos:
+        raise CatalogError(f"--roads {path} is not a vector file: it has no layer with geometries")
+    systems = [_system(path, info, crs) for info in infos]
+    has_crs = [info["crs"] for info in infos] == systems
+    # An empty layer has no bounds.
+    extents = tuple(
+        (system, tuple(info["total_bounds"]))
+        for info, system in zip(infos, systems, strict=True)
+        if info["total_bounds"] is not None
+    )
+    return VectorFile(path.resolve(), has_crs, None if no_bounds else extents, sublayer)
+
+
+def _system(path: Path, info: Mapping[str, Any], given: str | None) -> str:
+    """Return the CRS of an opened layer; see `crs_of`."""
+    bounds = bounds_of(info)
+    system = crs_of(info["crs"], given, bounds)
+    if system is None:
+        raise CatalogError(
+            f"--roads {path} has no CRS; give it with --crs, or add it to the file with ogr2ogr -a_srs"
+        )
+    if angles := angle_fault(system, bounds):
+        raise CatalogError(
+            f"--roads {path} {angles}; give its CRS with --crs, or add it to the file with ogr2ogr -a_srs"
+        )
+    return system
+
+
+def bounds_of(info: Mapping[str, Any]) -> Bounds:
+    """Return the bounds of an opened layer (pyogrio's), NaN if they are unknown or it has no feature."""
+    bounds = info["total_bounds"]
+    return (math.nan,) * 4 if bounds is None else tuple(bounds)
+
+
+def with_roads(
+    tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | None
+) -> tuple[tuple[Tile, ...], list[Skipped]]:
+    """Return the tiles with a layer ``roads`` of the files within `REACH_M` of each tile.
+
+    Returns
+    -------
+    tiles : tuple of Tile
+    far : list of Skipped
+        The files that reach no tile.
+
+    Raises
+    ------
+    CatalogError
+        If no file reaches a tile.
+    """
+    if not files:
+        return tuple(tiles), []
+    extents = {
+        target: np.array([_extent(file, target) for file in files])
+        for target in {tile.grid.crs for tile in tiles}
+    }
+    # As a tree: in a state there are as many files as tiles.
+    trees = {target: shapely.STRtree(_boxes(bounds)) for target, bounds in extents.items()}
+    near = [
+        np.sort(trees[tile.grid.crs].query(shapely.box(*tile.grid.buffered(REACH_M).bounds)))
+        for tile in tiles
+    ]
+    reached = np.bincount(np.concatenate(near), minlength=len(files))
+    far = [
+        Skipped(str(file.path), "", f"--roads {file.path} {_far(file, tiles)}")
+        for file, number in zip(files, reached, strict=True)
+        if not number
+    ]
+    if len(far) == len(files):
+        raise CatalogError(far[0].reason)
+    # A CRS is that of the complete layer, so that all tiles describe the layer in the same way.
+    bare = None if all(file.has_crs for file in files) else crs
+
+    @lru_cache(RECENT)
+    def layer(numbers: tuple[int, ...], target: str, root: Path) -> Layer:
+        """Return the layer of files given by their numbers; neighbouring tiles share it."""
+        chosen = [files[number] for number in numbers]
+        names = tuple(
+            file.path.relative_to(root).as_posix() if file.path.is_relative_to(root) else str(file.path)
+            for file in chosen
+        )
+        bounds = tuple(map(tuple, extents[target][list(numbers)].tolist()))
+        return Layer("roads", names, crs=bare, extents=bounds, sublayer=chosen[0].sublayer)
+
+    with_layer = (
+        replace(tile, layers=(*tile.layers, layer(tuple(numbers.tolist()), tile.grid.crs, Path(tile.root))))
+        if numbers.size
+        else tile
+        for tile, numbers in zip(tiles, near, strict=True)
+    )
+    return tuple(with_layer), far
+
+
+def _boxes(extents: NDArray[np.float64]) -> NDArray[np.object_]:
+    """Return extents, ``(n, 4)``, as polygons, None where a file reaches nothing."""
+    boxes: NDArray[np.object_] = np.full(len(extents), None, object)
+    known = np.isfinite(extents).all(axis=1)
+    boxes[known] = shapely.box(*extents[known].T)
+    return boxes
+
+
+def _far(file: VectorFile, tiles: Sequence[Tile]) -> str:
+    """Return that a file reaches no tile, and where both lie."""
+    text = "reaches no tile; check its CRS and its extent"
+    if not file.extents:
+        return text
+    target = tiles[0].grid.crs
+    ground = union([tile.grid.bounds for tile in tiles if tile.grid.crs == target])
+    return f"{text}: it {elsewhere(*file.extents[0], target, ground, REACH_M)}"
+
+
+def _extent(file: VectorFile, target: str) -> Bounds:
+    """Return the extent of a file in a CRS (m): all of the ground if its bounds are unknown there."""
+    if file.extents is None:
+        return EVERYWHERE
+    placed = [_placed(crs, target, bounds) for crs, bounds in file.extents]
+    west, south, east, north = union(placed or [NOWHERE])
+    return west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
+
+
+def _placed(crs: str, target: str, bounds: Bounds) -> Bounds:
+    placed = bounds_in(target, crs, bounds)
+    if np.isfinite(placed).all():
+        return placed
+    west, south, east, north = bounds
+    corners = transformer(crs, target).transform((west, east, west, east), (south, south, north, north))
+    return EVERYWHERE if np.isfinite(corners).all(axis=0).any() else NOWHERE

@@ -1,1 +1,0 @@
-"""Synthetic surveys with known truth, written as rasters and a catalog."""

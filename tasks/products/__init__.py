@@ -1,0 +1,1 @@
+"""Files of a finished tile: encoders of meshes, rasters and surfaces."""

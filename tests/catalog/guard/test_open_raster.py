@@ -1,0 +1,232 @@
+"""Source rasters are opened only in known formats; neither they nor their side-cars lead to other files."""
+
+import os
+import shutil
+import socket
+
+import numpy as np
+import pytest
+import rasterio
+
+from flexroad.catalog.guard.open_raster import open_raster
+from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.trust import AllowedFolders
+from tests.make_rasters import UTM, write, write_xyz
+
+FLAT = np.full((32, 32), 7.0, np.float32)
+
+
+def vrt(name, relative=0, kind="SimpleSource"):
+    return (
+        f'<VRTDataset rasterXSize="32" rasterYSize="32"><SRS>{UTM}</SRS>'
+        "<GeoTransform>295500,1,0,5629500,0,-1</GeoTransform>"
+        f'<VRTRasterBand dataType="Float32" band="1"><{kind}>'
+        f'<SourceFilename relativeToVRT="{relative}">{name}</SourceFilename><SourceBand>1</SourceBand>'
+        f"</{kind}></VRTRasterBand></VRTDataset>"
+    )
+
+
+def read(path, allowed=None):
+    """Read all that the stages read of a raster."""
+    with open_raster(path, allowed) as src:
+        return src.read(1), src.read_masks(1), src.overviews(1), src.read(1, out_shape=(8, 8))
+
+
+def check_refused(path, match, allowed=None):
+    with pytest.raises(Refused, match=match):
+        read(path, allowed)
+
+
+@pytest.mark.parametrize("driver", ["GTiff", "AAIGrid", "PNG", "JPEG", "JP2OpenJPEG"])
+def test_formats_are_read_whatever_the_suffix(tmp_path, driver):
+    kind = np.uint8 if driver in ("PNG", "JPEG", "JP2OpenJPEG") else np.float32
+    path = write(tmp_path / "a.raster", FLAT.astype(kind), driver=driver)
+    with open_raster(path) as src:
+        assert src.driver == driver
+        np.testing.assert_allclose(src.read(1), FLAT, atol=1)
+        assert src.transform.c == 295500
+
+
+def test_points_and_plain_vrt_are_read(tmp_path):
+    write_xyz(tmp_path / "a.xyz", FLAT, 295500, 5629500)
+    write(tmp_path / "a.tif", FLAT)
+    (tmp_path / "a.vrt").write_text('<?xml version="1.0"?>\n' + vrt("a.tif", 1))
+    (tmp_path / "of a vrt.vrt").write_text(vrt(tmp_path / "a.vrt"))
+    for name in ("a.xyz", "a.vrt", "of a vrt.vrt"):
+        assert (read(tmp_path / name)[0] == 7).all(), name
+
+
+CONTENT = {
+    "vrt": vrt("/vsicurl/{url}/x.tif"),
+    "curl": vrt("/vsicurl?url={url}/x.tif"),
+    "wms": '<GDAL_WMS><Service name="TMS"><ServerUrl>{url}/${{z}}/${{x}}/${{y}}.png</ServerUrl></Service>'
+    "<DataWindow><UpperLeftX>0</UpperLeftX><UpperLeftY>9</UpperLeftY><LowerRightX>9</LowerRightX>"
+    "<LowerRightY>0</LowerRightY><TileLevel>1</TileLevel></DataWindow><Projection>EPSG:3857</Projection>"
+    "<BandsCount>1</BandsCount></GDAL_WMS>",
+    "wcs": "<WCS_GDAL><ServiceURL>{url}/wcs?</ServiceURL><CoverageName>a</CoverageName></WCS_GDAL>",
+    "wmts": "<GDAL_WMTS><GetCapabilitiesUrl>{url}/wmts</GetCapabilitiesUrl></GDAL_WMTS>",
+    "capabilities": '<Capabilities xmlns="http://www.opengis.net/wmts/1.0"></Capabilities>',
+    "stac": '{{"type":"FeatureCollection","stac_version":"1.0.0","features":[{{"assets":{{"a":'
+    '{{"href":"{url}/a.tif"}}}}}}]}}',
+    "mosaic": "<GDALTileIndexDataset><IndexDataset>{url}/a.gpkg</IndexDataset></GDALTileIndexDataset>",
+    "text": "ncols 2\nnrows 2 <VRTDataset></VRTDataset>",
+}
+
+
+@pytest.mark.parametrize("content", CONTENT.values(), ids=CONTENT)
+@pytest.mark.parametrize("name", ["a.tif", "a.asc", "a.vrt"])
+def test_content_under_another_name_asks_no_server(tmp_path, web, content, name):
+    (tmp_path / name).write_text(content.format(url=web.url))
+    check_refused(tmp_path / name, "VRT|it is no GeoTIFF")
+    assert web.requests == []
+
+
+def test_image_with_mark_of_a_vrt_is_refused(tmp_path):
+    """GDAL searches the mark of a VRT before the first zero byte."""
+    path = tmp_path / "a.jpg"
+    path.write_bytes(b"\xff\xd8\xff\xfe<V<VRTDataset></VRTDataset>\0\0")
+    check_refused(path, "it is no GeoTIFF")
+
+
+@pytest.mark.parametrize("broken", [b"", b"\0" * 99, b"<html>not found</html>", b"PK\3\4"])
+def test_files_of_no_known_format_are_named_as_such(tmp_path, broken):
+    (tmp_path / "a.tif").write_bytes(broken)
+    check_refused(tmp_path / "a.tif", "cannot be read: it is no GeoTIFF.* fetch it again")
+
+
+def test_sources_of_a_vrt_must_lie_in_allowed_folders(tmp_path):
+    outside, home = write(tmp_path / "data" / "a.tif", FLAT), tmp_path / "home"
+    write(home / "a.tif", FLAT)
+    allowed = AllowedFolders.of(home)
+    for name, relative in (("../data/a.tif", 1), (outside, 0)):
+        (home / "a.vrt").write_text(vrt(name, relative))
+        check_refused(
+            home / "a.vrt", f"is a VRT that names {outside}, outside .* --allow {outside.parent}", allowed
+        )
+        assert (read(home / "a.vrt", AllowedFolders.of(home, [outside.parent]))[0] == 7).all()
+    (home / "outer.vrt").write_text(vrt("a.vrt", 1))
+    check_refused(
+        home / "outer.vrt", f"is a VRT of {home}/a.vrt, which is a VRT that names {outside}", allowed
+    )
+    # GDAL takes relative names from the folder of the file that a link leads to.
+    (tmp_path / "data" / "linked.vrt").write_text(vrt("a.tif", 1))
+    (home / "link.vrt").symlink_to(tmp_path / "data" / "linked.vrt")
+    check_refused(home / "link.vrt", f"names {outside}", allowed)
+
+
+def test_source_of_a_vrt_in_another_format_asks_no_server(tmp_path, web):
+    (tmp_path / "source.tif").write_text(CONTENT["wms"].format(url=web.url))
+    (tmp_path / "a.vrt").write_text(vrt("source.tif", 1))
+    check_refused(tmp_path / "a.vrt", "is a VRT of .*source.tif, which cannot be read: it is no")
+    assert web.requests == []
+
+
+def test_vrt_that_names_itself_is_refused(tmp_path):
+    (tmp_path / "a.vrt").write_text(vrt("a.vrt", 1))
+    check_refused(tmp_path / "a.vrt", "is a VRT of VRTs")
+
+
+def overviews(url):
+    return (
+        '<PAMDataset><Metadata domain="OVERVIEWS">'
+        f'<MDI key="&#79;VERVIEW_FILE">/vsicurl/{url}/o.tif</MDI></Metadata></PAMDataset>'
+    )
+
+
+@pytest.mark.parametrize("kind", ["tif", "vrt"])
+def test_side_cars_that_lead_elsewhere_are_refused(tmp_path, web, kind):
+    raster = write(tmp_path / "a.tif", FLAT)
+    opened = tmp_path / f"a.{kind}"
+    if kind == "vrt":
+        opened.write_text(vrt("a.tif", 1))
+    for name, content in {
+        "a.tif.ovr": vrt(f"/vsicurl/{web.url}/x.tif"),
+        "a.tif.msk": vrt(f"/vsicurl/{web.url}/x.tif"),
+        "a.tif.aux.xml": overviews(web.url),
+        "a.aux": "EHFA_HEADER_TAG",
+    }.items():
+        side = tmp_path / name
+        side.write_text(content)
+        check_refused(opened, "side-car file|overviews")
+        side.unlink()
+    assert (read(opened)[0] == 7).all()
+    with rasterio.open(raster, "r+") as src:
+        src.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"/vsicurl/{web.url}/x.tif")
+    check_refused(opened, "names another file as its overviews")
+    assert web.requests == []
+
+
+def test_overviews_of_overviews_are_checked(tmp_path, web):
+    path = write(tmp_path / "a.tif", FLAT)
+    write(tmp_path / "a.tif.ovr", FLAT[:16, :16], driver="GTiff")
+    (tmp_path / "a.tif.ovr.aux.xml").write_text(overviews(web.url))
+    check_refused(path, "a.tif.ovr, which names another file")
+    (tmp_path / "a.tif.ovr.aux.xml").unlink()
+    (tmp_path / "a.tif.ovr.ovr").write_text(vrt(f"/vsicurl/{web.url}/x.tif"))
+    check_refused(path, "a.tif.ovr, which has the side-car file a.tif.ovr.ovr, which is no TIFF")
+    assert web.requests == []
+
+
+def test_harmless_side_cars_are_used(tmp_path):
+    path = write(
+        tmp_path / "a.png", FLAT.astype(np.uint8), driver="PNG", transform=rasterio.Affine.identity()
+    )
+    path.with_name("a.png.aux.xml").unlink(missing_ok=True)
+    path.with_suffix(".pgw").write_text("1\n0\n0\n-1\n295500.5\n5629499.5\n")
+    path.with_name("a.png.aux.xml").write_text(f"<PAMDataset><SRS>{UTM}</SRS></PAMDataset>")
+    with open_raster(path) as src:
+        assert (src.transform.c, src.crs) == (295500, UTM)
+
+
+def irregular(path, kind):
+    """Put something at a path that is no regular file."""
+    path.unlink(missing_ok=True)
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "link to a pipe":
+        os.mkfifo(path.with_name("pipe"))
+        path.symlink_to(path.with_name("pipe"))
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as made:
+            # The name of a socket may have about 100 characters.
+            here = os.open(path.parent, os.O_RDONLY)
+            made.bind(f"/proc/self/fd/{here}/{path.name}")
+            os.close(here)
+    else:
+        os.mkfifo(path)
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "link to a pipe", "socket"])
+@pytest.mark.parametrize("name", ["a.tif", "a.tif.aux.xml", "a.tfw", "a.tif.msk", "a.prj"])
+def test_only_regular_files_are_opened(tmp_path, kind, name):
+    path = write(tmp_path / "a.tif", FLAT)
+    irregular(tmp_path / name, kind)
+    check_refused(path, "is not a regular file")
+    (tmp_path / "m.vrt").write_text(vrt("a.tif", 1))
+    check_refused(tmp_path / "m.vrt", "is a VRT of .*a.tif, which .*is not a regular file")
+
+
+@pytest.mark.parametrize("name", ["a.tif.aux.xml", "a.tfw", "a.tif.ovr", "a.prj"])
+def test_side_car_is_no_link_to_another_folder(tmp_path, name):
+    path = write(tmp_path / "home" / "a.tif", FLAT)
+    secret = write(tmp_path / "secret.tif", FLAT)
+    (path.parent / name).symlink_to(secret)
+    check_refused(path, f"has the side-car file {name}, which is a link to another folder")
+
+
+def test_side_car_of_a_folder_of_links_is_used(tmp_path):
+    path = write(tmp_path / "a.tif", FLAT, crs=None)
+    path.with_name("a.tif.aux.xml").write_text(f"<PAMDataset><SRS>{UTM}</SRS></PAMDataset>")
+    (tmp_path / "home").mkdir()
+    for name in ("a.tif", "a.tif.aux.xml"):
+        (tmp_path / "home" / name).symlink_to(tmp_path / name)
+    with open_raster(tmp_path / "home" / "a.tif") as src:
+        assert src.crs == UTM
+
+
+def test_missing_file_is_told_from_a_refused_one(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        read(tmp_path / "a.tif")
+    path = write(tmp_path / "a.tif", FLAT)
+    shutil.copy(path, tmp_path / "b.tif")
+    assert (read(tmp_path / "b.tif")[0] == 7).all()

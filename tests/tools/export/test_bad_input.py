@@ -1,0 +1,243 @@
+"""Whatever is wrong, an export writes all of its tiles or ends with one line that says what to do."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run.lock import run_lock
+from flexroad.tools.export.driver import BEGUN, export
+from flexroad.tools.export.formats import FORMATS
+from flexroad.tools.export.source import select
+from tests.permissions import permissions_enforced
+
+from .conftest import OPTIONS, contents
+
+DATUM = ("--height-offset", "47.5", "--allow-steps")
+"""Options of each format; the tiles of the run do not meet."""
+WRITTEN_WHOLE = ("mosaic",)
+"""Formats that have no markers: each export writes them again."""
+each_format = pytest.mark.parametrize("name", FORMATS)
+
+
+@pytest.fixture(scope="module")
+def whole(made_city, tmp_path_factory):
+    """An export in all formats, one after the other: OpenDRIVE refers to OpenCRG files of the same export."""
+    out, source = tmp_path_factory.mktemp("whole"), select(made_city.path)
+    for name in FORMATS:
+        export(source, out, [name], OPTIONS, SerialExecutor())
+    return out
+
+
+@pytest.fixture
+def refused(flexroad):
+    """Calls the command, which must end with exit code 2 and one line; returns the line."""
+
+    def call(*words):
+        said = flexroad("export", *words)
+        assert said.code == 2, said
+        (line,) = said.errors
+        assert [text for text in said.err.splitlines() if text.startswith("error: ")] == [line]
+        return line
+
+    return call
+
+
+@each_format
+def test_tiles_that_failed_or_are_missing_are_left_out(made_city, whole, flexroad, tmp_path, name):
+    said = flexroad("export", made_city.path, "--format", name, *DATUM, "-o", tmp_path / "out").expected(0)
+    assert "note: left out 2 unfinished tiles" in said.err.splitlines()
+    assert contents(tmp_path / "out" / name) == contents(whole / name)
+    manifest = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert manifest["tiles"] == 2
+    assert manifest["left_out"] == [made_city.failed, made_city.pending]
+    assert list(manifest["formats"]) == [name]
+
+
+@each_format
+def test_no_finished_tile_is_refused_and_nothing_is_written(made_city, refused, tmp_path, name):
+    words = [made_city.path, "--format", name, *DATUM, "-o", tmp_path / "out"]
+    line = refused(*words, "--tile", made_city.failed, made_city.pending)
+    assert line.endswith(f"has no finished tile to export; see `flexroad status {made_city.path}`")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"), [(["--bbox", 0, 0, 1, 1], "no tile"), (["--tile", "4711"], "4711")]
+)
+def test_selection_without_tiles_is_refused(made_city, refused, tmp_path, words, message):
+    line = refused(made_city.path, "--format", "obj", "-o", tmp_path / "out", *words)
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_folder_that_is_no_run_is_refused(refused, tmp_path):
+    line = refused(tmp_path, "--format", "obj", "-o", tmp_path / "out")
+    assert "is no run: run.json is missing or damaged" in line
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("lanxml", "--format lanxml is unknown; did you mean landxml?; known are "),
+        ("OBJ", "--format OBJ is unknown; did you mean obj?; known are "),
+        ("usd", "--format usd is unknown; known are "),
+        ("", "--format names no format; known are "),
+        ("3dtiles", "3dtiles needs heights above the ellipsoid of WGS 84"),
+    ],
+)
+def test_unknown_format_or_missing_datum_is_refused(made_city, refused, tmp_path, given, message):
+    line = refused(made_city.path, "--format", given, "-o", tmp_path / "out")
+    assert line.startswith(f"error: {message}")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("part", ["", "tiles", "store/x", "delivery"])
+def test_output_in_the_run_is_refused(made_city, refused, part):
+    before = sorted(made_city.path.rglob("*"))
+    line = refused(made_city.path, "--format", "obj", "-o", made_city.path / part)
+    assert f"lies in the run ({made_city.path}" in line
+    assert line.endswith("choose a folder outside")
+    assert sorted(made_city.path.rglob("*")) == before
+
+
+def test_output_that_is_a_file_is_refused_and_stays(made_city, refused, tmp_path):
+    (tmp_path / "out").write_text("mine")
+    line = refused(made_city.path, "--format", "obj", "-o", tmp_path / "out")
+    assert str(tmp_path / "out") in line
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_output_that_cannot_be_written_is_refused(made_city, refused, tmp_path):
+    (tmp_path / "out").mkdir(mode=0o555)
+    with permissions_enforced():
+        line = refused(made_city.path, "--format", "obj", "-o", tmp_path / "out")
+    assert "Permission denied" in line
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_manifest_that_is_a_folder_is_refused_before_any_work(made_city, refused, tmp_path):
+    (tmp_path / "out" / "export.json").mkdir(parents=True)
+    line = refused(made_city.path, "--format", "obj", "-o", tmp_path / "out")
+    assert "export.json" in line
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["export.json"]
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"formats": 3}', "\x00"])
+def test_damaged_or_read_only_manifest_is_replaced(made_city, flexroad, tmp_path, content):
+    (tmp_path / BEGUN).write_text("obj\n")
+    (tmp_path / "export.json").write_text(content)
+    (tmp_path / "export.json").chmod(0o444)
+    with permissions_enforced():
+        flexroad("export", made_city.path, "--format", "obj", "-o", tmp_path).expected(0)
+    assert json.loads((tmp_path / "export.json").read_text())["tiles"] == 2
+
+
+@pytest.mark.parametrize("content", ["", "mine", "[]", '{"formats": {}}'])
+@pytest.mark.parametrize("file", ["export.json", "mosaic/height.tif"])
+def test_files_of_others_are_refused_and_stay(made_city, refused, tmp_path, file, content):
+    (tmp_path / "mosaic").mkdir()
+    (tmp_path / file).write_text(content)
+    line = refused(made_city.path, "--format", "mosaic", "-o", tmp_path)
+    assert line.startswith(
+        f"error: {tmp_path / file} is not of an earlier `flexroad export` and would be replaced; "
+    )
+    assert [path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()] == [Path(file)]
+    assert (tmp_path / file).read_text() == content
+
+
+def test_files_of_others_in_the_folder_of_another_format_are_refused(made_city, refused, flexroad, tmp_path):
+    (tmp_path / "mosaic").mkdir()
+    (tmp_path / "mosaic" / "height.tif").write_text("mine")
+    (tmp_path / "notes.txt").write_text("mine")
+    flexroad("export", made_city.path, "--format", "obj", "-o", tmp_path).expected(0)
+    line = refused(made_city.path, "--format", "obj,mosaic", "-o", tmp_path)
+    assert str(tmp_path / "mosaic" / "height.tif") in line
+    assert (tmp_path / "mosaic" / "height.tif").read_text() == "mine"
+
+
+def test_folder_that_another_export_writes_is_refused(made_city, refused, flexroad, tmp_path):
+    words = [made_city.path, "--format", "obj", "-o", tmp_path]
+    with run_lock(tmp_path):
+        line = refused(*words)
+        assert f"{tmp_path} is in use by pid " in line
+        assert not (tmp_path / "obj").exists()
+    flexroad("export", *words).expected(0)
+    assert not (tmp_path / "lock.json").exists()
+
+
+@each_format
+def test_folder_with_spaces_and_other_letters(made_city, whole, flexroad, tmp_path, name):
+    out = tmp_path / "für die Stadt (neu)" / "道路"
+    flexroad("export", made_city.path, "--format", name, *DATUM, "-o", out).expected(0)
+    assert contents(out / name) == contents(whole / name)
+
+
+@each_format
+def test_files_of_tiles_no_longer_selected_are_removed(made_city, flexroad, tmp_path, name):
+    # Along the roads of the other tile alone there is none of the least length.
+    second, first = made_city.done
+    words = ["export", made_city.path, "--format", name, *DATUM, "-o"]
+    flexroad(*words, tmp_path / "one", "--tile", first).expected(0)
+    flexroad(*words, tmp_path / "both").expected(0)
+    before = len(contents(tmp_path / "both" / name))
+    (tmp_path / "both" / name / "mine.txt").write_text("of the user")
+    said = flexroad(*words, tmp_path / "both", "--tile", first).expected(0)
+    (tmp_path / "both" / name / "mine.txt").unlink()
+    assert contents(tmp_path / "both" / name) == contents(tmp_path / "one" / name)
+    left = contents(tmp_path / "one" / name)
+    assert not any(second in path for path in left)
+    assert ("note: removed " in said.err) == (before > len(left))
+
+
+def test_formats_of_other_results_are_named_and_leave_the_manifest(made_city, flexroad, tmp_path):
+    words = ["export", made_city.path, "-o", tmp_path, "--format"]
+
+    def formats():
+        return list(json.loads((tmp_path / "export.json").read_text())["formats"])
+
+    flexroad(*words, "obj,step").expected(0)
+    said = flexroad(*words, "landxml").expected(0)
+    assert formats() == ["obj", "step", "landxml"]
+    assert "earlier" not in said.err
+    said = flexroad(*words, "obj", "--tile", made_city.done[0]).expected(0)
+    assert formats() == ["obj"]
+    for name in ("step", "landxml"):
+        assert f"note: {tmp_path / name} is of an earlier export with other results; write" in said.err
+
+
+def test_files_that_the_user_changed_are_not_removed(made_city, flexroad, tmp_path):
+    words = ["export", made_city.path, "--format", "obj", "-o", tmp_path]
+    flexroad(*words).expected(0)
+    changed = tmp_path / "obj" / f"{made_city.done[1]}.obj"
+    changed.write_text("# painted by hand")
+    flexroad(*words, "--tile", made_city.done[0]).expected(0)
+    assert changed.read_text() == "# painted by hand"
+    assert not changed.with_suffix(".json").exists()
+
+
+@pytest.mark.parametrize("name", ["../outside", "/outside", "a/../../outside"])
+def test_marker_that_names_files_elsewhere_removes_nothing(made_city, flexroad, tmp_path, name):
+    words = ["export", made_city.path, "--format", "obj", "-o", tmp_path / "out"]
+    flexroad(*words).expected(0)
+    outside = tmp_path / "outside"
+    outside.write_text("kept")
+    name = str(outside) if name.startswith("/") else name.replace("outside", "../outside", 1)
+    marker = tmp_path / "out" / "obj" / ".pieces" / f"{made_city.done[1]}.json"
+    content = json.loads(marker.read_text())
+    marker.write_text(json.dumps(content | {"sizes": {name: 4, "../../outside": 4}}))
+    flexroad(*words, "--tile", made_city.done[0]).expected(0)
+    assert outside.read_text() == "kept"
+
+
+@each_format
+def test_damaged_markers_are_as_none(made_city, whole, flexroad, tmp_path, name):
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    hidden = [*tmp_path.glob(f"{name}/.pieces/**/*.json"), *tmp_path.glob(f".{name}.json")]
+    assert hidden or name in WRITTEN_WHOLE
+    for number, file in enumerate(hidden):
+        file.write_text(["", "{", "[1]", '{"key": 1, "sizes": 3, "row": 2}'][number % 4])
+    flexroad("export", made_city.path, "--format", name, *DATUM, "-o", tmp_path).expected(0)
+    assert contents(tmp_path / name) == contents(whole / name)

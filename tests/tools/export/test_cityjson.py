@@ -1,0 +1,155 @@
+import io
+import json
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Mesh
+from flexroad.tools.export import cityjson
+from tests import validators
+from tests.crossing import Crossing
+
+ORIGIN = (295000.0, 5629000.0, 100.0)
+
+
+def tile(column: int = 0, n: int = 5, road_from: float = 4.0, name: str = "EPSG:25832") -> Mesh:
+    """Return a 10 m square of hills; its faces east of ``road_from`` (m, over all tiles) are road."""
+    x, y = np.meshgrid(np.linspace(0, 10, n), np.linspace(0, 10, n))
+    origin = (295500.0 + 10 * column, 5629250.0, 150.0)
+    z = 13.2 + np.sin((x + 10 * column) / 3) + 0.1 * y
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
+    faces = np.concatenate([np.c_[a, b, c], np.c_[a, c, d]]).astype(np.int32)
+    vertices = np.c_[x.ravel(), y.ravel(), z.ravel()]
+    return Mesh(name, origin, vertices, faces, vertices[faces].mean(axis=1)[:, 0] + 10 * column > road_from)
+
+
+def written(meshes: list[Mesh], vertical: str | None = None) -> list[dict]:
+    file = io.BytesIO()
+    tiles = [(f"t{k}", mesh) for k, mesh in enumerate(meshes)]
+    assert cityjson.write(file, tiles, "EPSG:25832", ORIGIN, vertical) == len(meshes)
+    return [json.loads(line) for line in file.getvalue().splitlines()]
+
+
+def read(lines: list[dict], kind: str) -> np.ndarray:
+    """Return the triangles of all city objects of a kind, ``(F, 3, 3)``, by the CityJSON specification."""
+    scale, shift = (np.array(lines[0]["transform"][key]) for key in ("scale", "translate"))
+    found = []
+    for line in lines[1:]:
+        vertices = np.array(line["vertices"]) * scale + shift
+        item = line["CityObjects"][line["id"]]
+        if item["type"] == kind:
+            (geometry,) = item["geometry"]
+            assert all(len(rings) == 1 for rings in geometry["boundaries"])
+            found.append(vertices[np.array(geometry["boundaries"])[:, 0]])
+    return np.concatenate(found)
+
+
+def test_write_reads_back_within_half_a_millimetre():
+    meshes = [tile(0), tile(1)]
+    lines = written(meshes)
+    for kind, road in (("Road", True), ("TINRelief", False)):
+        truth = np.concatenate([(m.vertices + m.origin)[m.faces[m.road == road]] for m in meshes])
+        np.testing.assert_allclose(read(lines, kind), truth, rtol=0, atol=0.5e-3 + 1e-8)
+
+
+@pytest.mark.parametrize(("number", "kind"), [(1, "Bridge"), (-1, "Tunnel")])
+def test_write_deck_is_a_bridge_and_tube_a_tunnel(number, kind):
+    mesh, _ = Crossing((40.0, 30.0), number=number).mesh()
+    lines = written([mesh])
+    deck = mesh.at(number)
+    truth = (deck.vertices + deck.origin)[deck.faces]
+    np.testing.assert_allclose(read(lines, kind), truth, rtol=0, atol=0.5e-3 + 1e-8)
+    (item,) = (line["CityObjects"][line["id"]] for line in lines[1:] if line["id"] == f"t0-{kind.lower()}1")
+    assert item["attributes"]["level"] == number
+    assert item["geometry"][0]["semantics"]["surfaces"] == [{"type": "OuterFloorSurface"}]
+    ground = mesh.at(0)
+    faces = sum(len(read(lines, other)) for other in ("Road", "TINRelief"))
+    assert faces == len(ground.faces)
+
+
+@pytest.mark.slow
+def test_write_read_by_cjio_has_all_tiles_at_their_places(tmp_path):
+    meshes = [tile(0), tile(1), replace(Crossing((40.0, 30.0)).mesh()[0], origin=tile(0).origin)]
+    lines = "".join(json.dumps(line) + "\n" for line in written(meshes))
+    command = [validators.program("cjio"), "--suppress_msg", "stdin", "save", "city.json"]
+    subprocess.run(command, cwd=tmp_path, input=lines, text=True, check=True)
+    city = json.loads((tmp_path / "city.json").read_text())
+    kinds = [item["type"] for item in city["CityObjects"].values()]
+    assert (kinds.count("TINRelief"), kinds.count("Road")) == (2, 3)  # the second tile is all road
+    assert kinds.count("Bridge") == 1
+    transform = city["transform"]
+    found = np.array(city["vertices"]) * transform["scale"] + transform["translate"]
+    truth = np.concatenate([mesh.vertices + mesh.origin for mesh in meshes])
+    for least in (np.min, np.max):
+        np.testing.assert_allclose(least(found, axis=0), least(truth, axis=0), rtol=0, atol=0.5e-3 + 1e-8)
+
+
+def test_header_has_version_transform_and_crs():
+    assert json.loads(cityjson.header("EPSG:25832", ORIGIN)) == {
+        "type": "CityJSON",
+        "version": "2.0",
+        "transform": {"scale": [0.001, 0.001, 0.001], "translate": list(ORIGIN)},
+        "metadata": {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/25832"},
+        "CityObjects": {},
+        "vertices": [],
+    }
+
+
+@pytest.mark.parametrize(("vertical", "code"), [("EPSG:5783", "5555"), ("EPSG:7837", "25832")])
+def test_header_compound_crs_has_its_code_if_it_is_registered(vertical, code):
+    head, *lines = written([tile()], vertical)
+    assert head["metadata"]["referenceSystem"].endswith(f"/EPSG/0/{code}")
+    for line in lines:
+        assert line["CityObjects"][line["id"]]["attributes"] == {"tile": "t0", "verticalCRS": vertical}
+
+
+def test_features_have_one_object_with_their_id_and_whole_vertices():
+    _, *lines = written([tile(0), tile(1, road_from=99)])
+    assert [line["id"] for line in lines] == ["t0-road", "t0-tinrelief", "t1-tinrelief"]
+    for line in lines:
+        assert list(line["CityObjects"]) == [line["id"]]
+        vertices = np.array(line["vertices"])
+        assert vertices.dtype == np.int64
+        assert len(np.unique(vertices, axis=0)) == len(vertices)
+        (geometry,) = line["CityObjects"][line["id"]]["geometry"]
+        np.testing.assert_array_equal(np.unique(geometry["boundaries"]), np.arange(len(vertices)))
+
+
+def test_features_road_is_traffic_area_and_terrain_a_composite():
+    _, road, terrain = written([tile()])
+    (geometry,) = road["CityObjects"]["t0-road"]["geometry"]
+    assert geometry["type"] == "MultiSurface"
+    assert geometry["semantics"]["surfaces"] == [{"type": "TrafficArea"}]
+    assert geometry["semantics"]["values"] == [0] * len(geometry["boundaries"])
+    (geometry,) = terrain["CityObjects"]["t0-tinrelief"]["geometry"]
+    assert (geometry["type"], "semantics" in geometry) == ("CompositeSurface", False)
+
+
+def test_features_vertices_within_a_millimetre_are_one():
+    mesh = tile(road_from=-1)
+    vertices = mesh.vertices.copy()
+    vertices[1] = vertices[0] + (2e-4, 0, 0)
+    close = Mesh(mesh.crs, mesh.origin, vertices, mesh.faces, mesh.road)
+    _, line = written([close])
+    (geometry,) = line["CityObjects"]["t0-road"]["geometry"]
+    assert len(line["vertices"]) == len(vertices) - 1
+    corners = np.array(geometry["boundaries"])[:, 0]
+    assert len(corners) == len(mesh.faces) - 1
+    assert all(len(set(face)) == 3 for face in corners.tolist())
+
+
+def test_header_crs_without_code_is_refused():
+    from pyproj import CRS
+
+    local = CRS.from_proj4("+proj=tmerc +lat_0=50 +lon_0=6 +k=1 +units=m").to_wkt()
+    with pytest.raises(TaskError, match="has none; choose another format"):
+        cityjson.header(local, ORIGIN)
+
+
+def test_write_other_crs_names_the_tile():
+    with pytest.raises(TaskError, match="t1: mesh in EPSG:25833, the file is in EPSG:25832"):
+        written([tile(), tile(name="EPSG:25833")])

@@ -1,0 +1,64 @@
+from datetime import UTC, datetime
+
+import geopandas
+import numpy as np
+import pytest
+import shapely
+from pyproj import CRS
+
+from flexroad.catalog.crs import compound
+from flexroad.tasks.errors import TaskError
+from flexroad.tools.export import road_lines
+from flexroad.tools.export.road_lines import RoadLine
+
+DATE = datetime(2025, 3, 1, tzinfo=UTC)
+
+
+def road(number: int, segments: int, lanes: int | None = None) -> RoadLine:
+    x = np.arange(segments + 1.0)
+    points = np.column_stack([500_000 + x, np.full_like(x, 5_600_000 + number), 100 + x / 8])
+    error = np.where(np.arange(segments) % 2, 0.05, np.nan)
+    support = np.arange(segments, dtype=np.uint8) % 4
+    columns = {"id": number, "name": f"Road {number}", "lanes": lanes}
+    return RoadLine(columns, points, {"grade_percent": np.full(segments, 12.5), "error_m": error}, support)
+
+
+@pytest.mark.parametrize("batch", [1, 50_000])
+def test_write_lines_and_segments_have_heights_and_columns(tmp_path, monkeypatch, batch):
+    monkeypatch.setattr(road_lines, "BATCH", batch)
+    path = tmp_path / "roads.gpkg"
+    road_lines.write(path, (road(k, 3 + k, 2) for k in (1, 2)), compound("EPSG:25832", "EPSG:7837"), DATE)
+    roads = geopandas.read_file(path, layer="roads")
+    assert roads["id"].tolist() == [1, 2]
+    assert roads["name"].tolist() == ["Road 1", "Road 2"]
+    assert roads["lanes"].tolist() == [2, 2]
+    assert CRS(roads.crs).is_compound
+    np.testing.assert_array_equal(
+        shapely.get_coordinates(roads.geometry[1], include_z=True), road(2, 5).points
+    )
+    segments = geopandas.read_file(path, layer="segments")
+    assert segments.road_id.tolist() == [1] * 4 + [2] * 5
+    assert segments.support.fillna("").tolist()[:4] == ["", "measured", "dtm", "inferred"]
+    np.testing.assert_array_equal(
+        shapely.get_coordinates(segments.geometry[8], include_z=True), road(2, 5).points[-2:]
+    )
+
+
+def test_write_unknown_numbers_are_null(tmp_path):
+    path = tmp_path / "roads.gpkg"
+    road_lines.write(path, [road(1, 4)], "EPSG:25832", DATE)
+    segments = geopandas.read_file(path, layer="segments")
+    assert segments.error_m.isna().tolist() == [True, False, True, False]
+    assert geopandas.read_file(path, layer="roads").lanes.isna().all()
+    assert len(geopandas.read_file(path, layer="segments", where="error_m IS NULL")) == 2
+
+
+def test_write_to_a_missing_folder_is_an_error(tmp_path):
+    with pytest.raises(TaskError, match=r"roads.gpkg cannot be written: .*; check the disk"):
+        road_lines.write(tmp_path / "none" / "roads.gpkg", [road(1, 4)], "EPSG:25832", DATE)
+
+
+def test_write_equal_roads_give_equal_bytes(tmp_path):
+    for name in ("one.gpkg", "two.gpkg"):
+        road_lines.write(tmp_path / name, [road(1, 4)], "EPSG:25832", DATE)
+    assert (tmp_path / "one.gpkg").read_bytes() == (tmp_path / "two.gpkg").read_bytes()

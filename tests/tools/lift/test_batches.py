@@ -1,0 +1,26 @@
+"""Heights of many parts at a time, each with its own."""
+
+import numpy as np
+
+from flexroad.tools.lift import batches
+from flexroad.tools.lift.types import Heights
+
+
+def test_each_part_has_its_heights_in_order_whatever_the_batch(monkeypatch):
+    asked = []
+
+    def heights(x, y):
+        asked.append(len(x))
+        return Heights((0,), (x + y)[None])
+
+    parts = [*"ab", 3, 0, *"c", 5]
+    for size in (1, 4, 100):
+        monkeypatch.setattr(batches, "POINTS", size)
+        found = batches.with_heights(
+            parts, lambda part: None if isinstance(part, str) else (np.arange(part), np.ones(part)), heights
+        )
+        result = [(part, own if own is None else own.ground.tolist()) for part, own in found]
+        assert [part for part, _ in result] == parts
+        assert [own for part, own in result if isinstance(part, str)] == [None] * 3
+        assert [own for part, own in result if not isinstance(part, str)] == [[1, 2, 3], [], [1, 2, 3, 4, 5]]
+    assert asked[-1] == 8

@@ -1,0 +1,149 @@
+"""Points, lines and polygons on surfaces of known heights: tolerance, levels, limits and batches."""
+
+import numpy as np
+import pytest
+import shapely
+from shapely import LineString, Point, Polygon
+
+from flexroad.tools.lift import features
+from flexroad.tools.lift.features import Feature, grades, level_columns, lifted, wanted_levels
+from flexroad.tools.lift.levels import ANY
+from flexroad.tools.lift.shapes import of_wkb, to_wkb
+from flexroad.tools.lift.types import Heights, Options
+
+
+class Waves:
+    """A surface of waves, with a deck 6 m above it from x = 40 to 60 if it is to have one."""
+
+    bounds = (0.0, -50.0, 1000.0, 50.0)
+
+    def __init__(self, deck: bool = False) -> None:
+        self.deck, self.calls, self.largest = deck, 0, 0
+
+    def to_run(self, x, y):
+        return x, y
+
+    def height(self, x, y):
+        return 2 * np.sin(x / 9) + 0.3 * np.cos(y / 4)
+
+    def at(self, x, y):
+        self.calls, self.largest = self.calls + 1, max(self.largest, len(x))
+        inside = (x >= 0) & (x <= 1000)
+        ground = np.where(inside, self.height(x, y), np.nan)
+        if not self.deck:
+            return Heights((0,), ground[None])
+        return Heights((0, 1), np.stack([ground, np.where((x >= 40) & (x <= 60), ground + 6, np.nan)]))
+
+    def errors(self, x, y, numbers):
+        return np.full(len(x), 0.01) + x / 1e5
+
+
+def feature(shape, wanted=int(ANY)) -> Feature:
+    return Feature("a", of_wkb(shapely.to_wkb(shape)), wanted)
+
+
+def one(shape, run, wanted=int(ANY), **options):
+    ((new, row),) = lifted([feature(shape, wanted)], run, Options(**options))
+    return shapely.from_wkb(to_wkb(new)), row
+
+
+def distance(shape, run) -> float:
+    """Largest distance in height of a line from a surface, at points 1 cm apart."""
+    x, y, z = shapely.get_coordinates(shape, include_z=True).T
+    s = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    at = np.arange(0, s[-1], 0.01)
+    on = run.height(np.interp(at, s, x), np.interp(at, s, y))
+    return float(np.abs(np.interp(at, s, z) - on).max())
+
+
+@pytest.mark.parametrize("tolerance", [0.005, 0.05])
+@pytest.mark.parametrize("shape", [LineString([(1, 2), (90, 30)]), Polygon([(5, 5), (60, 8), (30, 30)])])
+def test_lines_and_rings_stay_within_the_tolerance(shape, tolerance):
+    run = Waves()
+    new, row = one(shape, run, tolerance_m=tolerance)
+    ring = new.exterior if new.geom_type == "Polygon" else new
+    # The surface is looked up every 0.5 m: between, it bends by less than a millimetre here.
+    assert distance(ring, run) <= tolerance + 0.001
+    assert row.elevation_m <= tolerance
+    assert row.length_m == pytest.approx(shape.length)
+    x, y, z = shapely.get_coordinates(new, include_z=True).T
+    np.testing.assert_allclose(z, run.height(x, y), atol=1e-9)
+    assert new.is_valid
+
+
+def test_fewer_vertices_with_a_larger_tolerance_and_none_if_not_wanted():
+    line, run = LineString([(1, 2), (90, 30)]), Waves()
+    counts = [len(one(line, run, tolerance_m=t)[0].coords) for t in (0.002, 0.02, 0.2)]
+    assert counts == sorted(counts, reverse=True)
+    assert counts[0] > counts[2] > 2
+    assert len(one(line, run, add_vertices=False)[0].coords) == 2
+
+
+def test_line_over_a_deck_takes_it_by_its_level_or_by_continuity():
+    run, line = Waves(deck=True), LineString([(10, 0), (90, 0)])
+    below, row = one(line, run)
+    assert row.levels == (0,)
+    assert distance(below, run) < 0.006
+    on_deck, row = one(LineString([(41, 0), (59, 0)]), run)
+    assert row.levels == (1,)
+    assert on_deck.coords[0][2] == pytest.approx(run.height(41, 0) + 6)
+    _, row = one(LineString([(41, 0), (59, 0)]), run, wanted=0)
+    assert row.levels == (0,)
+    _, row = one(line, run, wanted=1)
+    assert row.unknown_deck_m == pytest.approx(60, abs=1)
+
+
+def test_point_without_a_level_takes_the_highest():
+    run = Waves(deck=True)
+    assert one(Point(50, 0), run)[0].z == pytest.approx(run.height(50, 0) + 6)
+    assert one(Point(50, 0), run, wanted=0)[0].z == pytest.approx(run.height(50, 0))
+
+
+def test_batches_of_points_give_what_one_does(monkeypatch):
+    shapes = [LineString([(x, 0), (x + 20, 5)]) for x in range(0, 200, 3)] + [Point(5, 5)] * 10
+    wanted = [feature(shape) for shape in shapes]
+    whole = [(to_wkb(shape), row) for shape, row in lifted(wanted, Waves(), Options())]
+    monkeypatch.setattr(features, "POINTS", 100)
+    run = Waves()
+    parts = [(to_wkb(shape), row) for shape, row in lifted(wanted, run, Options())]
+    assert [data for data, _ in parts] == [data for data, _ in whole]
+    assert [row.length_m for _, row in parts] == pytest.approx(
+        [row.length_m for _, row in whole], nan_ok=True
+    )
+    assert run.largest <= 100 < run.calls * 100
+
+
+def test_a_line_far_longer_than_the_run_is_not_sampled_off_it():
+    run = Waves()
+    _, row = one(LineString([(-5e7, 500), (5e7, 500)]), run)
+    assert run.largest == 2
+    assert row.without_ground_m == pytest.approx(1e8)
+    _, row = one(LineString([(-5e7, 0), (5e7, 0)]), run)
+    assert run.largest <= features.MOST_PIECES + 2
+
+
+def test_places_above_limits_are_the_steepest_of_each_stretch():
+    _, row = one(LineString([(0, 0), (100, 0)]), Waves(), grade_limit=0.2)
+    # The wave is steepest at its zeros, every 28.3 m.
+    assert [place.x for place in row.steep] == pytest.approx(9 * np.pi * np.arange(4), abs=0.6)
+    assert row.grade == pytest.approx(2 / 9, rel=0.01)
+
+
+def test_columns_have_the_crossfall_of_lines_and_the_largest_error():
+    _, row = one(LineString([(0, 2 * np.pi), (900, 2 * np.pi)]), Waves(), columns=True)
+    assert row.crossfall == pytest.approx(0.3 / 4, rel=0.02)
+    assert row.error_m == pytest.approx(0.019, abs=1e-4)
+
+
+def test_grades_of_short_segments_are_over_the_wanted_distance():
+    s, z = np.array([0.0, 0.1, 0.2, 0.6, 1.2]), np.array([0.0, 0.1, 0.0, 0.0, 0.6])
+    np.testing.assert_allclose(grades(s, z, 0.5), [0, -0.2, 0.6, 1, np.nan])
+    np.testing.assert_allclose(grades(s[:2], z[:2], 0.5), [1, np.nan])
+    np.testing.assert_allclose(grades(np.zeros(2), z[:2], 0.5), [np.nan, np.nan])
+
+
+def test_levels_are_read_from_columns_that_say_them():
+    assert level_columns(["name", "Layer"]) == []
+    assert level_columns(["Bridge", "layer", "b"]) == ["Bridge", "layer"]
+    assert wanted_levels({"Bridge": ["yes", None], "layer": ["2", "1"]}, 2) == [2, 0]
+    assert wanted_levels({}, 2) == [ANY, ANY]

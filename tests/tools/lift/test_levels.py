@@ -1,0 +1,93 @@
+"""The level of each point of a line."""
+
+import numpy as np
+import pytest
+
+from flexroad.tools.lift.levels import ANY, along, level_of, tagged_level
+from flexroad.tools.lift.types import Heights
+
+S = np.arange(60.0)
+GROUND = 100 + 0.01 * S
+NAN = np.nan
+
+
+def heights(deck=NAN, ground=GROUND):
+    return Heights((0, 1), np.stack([ground, np.broadcast_to(deck, ground.shape)]))
+
+
+def any_level(n=60):
+    return np.full(n, ANY)
+
+
+def test_a_street_that_passes_below_a_deck_stays_below():
+    deck = np.where((S > 20) & (S < 32), 106.0, NAN)
+    z, numbers = along(heights(deck), any_level())
+    np.testing.assert_array_equal(z, GROUND)
+    assert not numbers.any()
+
+
+def test_a_road_that_goes_over_a_deck_is_on_it():
+    on_deck = (S > 20) & (S < 32)
+    road = 106 + 0.01 * S
+    ground = np.where((S > 22) & (S < 30), 100.0, road)
+    z, numbers = along(heights(np.where(on_deck, road, NAN), ground), any_level())
+    np.testing.assert_array_equal(z, road)
+    np.testing.assert_array_equal(numbers, on_deck)
+
+
+@pytest.mark.parametrize("ends", ["first", "last"])
+def test_a_road_that_ends_on_a_deck_is_on_it(ends):
+    road = 106 + 0.01 * S
+    ground = np.where(S > 25, 100.0, road)
+    deck = np.where(S > 22, road, NAN)
+    order = slice(None) if ends == "last" else slice(None, None, -1)
+    z, _ = along(heights(deck[order], ground[order]), any_level())
+    np.testing.assert_array_equal(z, road[order])
+
+
+def test_a_line_with_two_levels_from_end_to_end_is_on_the_higher_one():
+    z, numbers = along(heights(106.0), any_level())
+    assert (z == 106).all()
+    assert (numbers == 1).all()
+
+
+def test_a_line_over_a_tube_from_end_to_end_is_on_the_ground():
+    z, numbers = along(Heights((-1, 0), np.stack([GROUND - 6, GROUND])), any_level())
+    np.testing.assert_array_equal(z, GROUND)
+    assert not numbers.any()
+
+
+def test_attributes_decide_where_there_are_any():
+    deck = np.where((S > 20) & (S < 32), 106.0, NAN)
+    z, numbers = along(heights(deck), np.ones(60, np.int8))
+    np.testing.assert_array_equal(numbers, np.isfinite(deck))
+    assert (z[numbers == 1] == 106).all()
+    assert not along(heights(deck), np.zeros(60, np.int8))[1].any()
+
+
+def test_points_beyond_the_surface_have_no_height():
+    ground = np.where(S < 10, NAN, GROUND)
+    z, _ = along(heights(ground=ground), any_level())
+    np.testing.assert_array_equal(z, ground)
+
+
+@pytest.mark.parametrize(("number", "level"), [(1, 2), (3, 2), (-1, -1), (-2, -1)])
+def test_a_bridge_has_the_level_of_its_kind_whose_number_is_nearest(number, level):
+    row = np.where(S > 30, 1.0, NAN)
+    found = Heights((-1, 0, 2, 4), np.stack([row, GROUND, row, row]))
+    assert level_of(found, number) == level
+    assert level_of(found[S < 20], number) is None
+
+
+@pytest.mark.parametrize(
+    ("tags", "level"),
+    [
+        ({}, 0),
+        ({"layer": "1"}, 0),
+        ({"bridge": "yes"}, 1),
+        ({"bridge": "viaduct", "layer": "2", "name": "A"}, 2),
+        ({"tunnel": "yes", "bridge": "no"}, -1),
+    ],
+)
+def test_tags_name_levels_of_bridges_and_tunnels_alone(tags, level):
+    assert tagged_level(tags) == level

@@ -1,0 +1,447 @@
+"""Roads of OpenDRIVE on surfaces of known heights, read back literally."""
+
+import gzip
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+
+from flexroad.tools.lift import opendrive, plan_view
+from flexroad.tools.lift.lanes import extent
+from flexroad.tools.lift.types import Frame, Heights, Lifted, Options
+from tests.read_opendrive import place, polynomial
+
+LEVEL = 'level="false"'
+LANES = """<lanes>
+      <laneSection s="0">
+        <left><lane id="1" type="driving" {0}><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></left>
+        <center><lane id="0" type="none" {0}/></center>
+        <right>
+          <lane id="-1" type="driving" {0}><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
+          <lane id="-2" type="sidewalk" level="true"><height sOffset="0" inner="0.12" outer="0.12"/>
+            <width sOffset="0" a="2" b="0" c="0" d="0"/><userData code="x" value="1"/></lane>
+        </right>
+      </laneSection>
+    </lanes>"""
+PROFILES = """<elevationProfile>
+      <elevation s="0" a="1" b="0.01" c="0" d="0"/>
+      <!-- a comment -->
+      <elevation s="30" a="1.3" b="0" c="0" d="0"/>
+    </elevationProfile>
+    <lateralProfile/>"""
+LINE = '<geometry s="0" x="10" y="20" hdg="0" length="{length}"><line/></geometry>'
+ARC = '<geometry s="0" x="0" y="-100" hdg="0" length="{length}"><arc curvature="0.01"/></geometry>'
+
+
+def road(
+    plan: str = LINE,
+    length: float = 60.0,
+    name: str = "7",
+    lanes: str | None = None,
+    profiles: str = PROFILES,
+    more: str = "",
+) -> str:
+    return f"""  <road name="R&amp;B" length="{length}" id="{name}" junction="-1">
+    <link/>
+    <planView>
+      {plan.format(length=length)}
+    </planView>
+    {profiles}
+    {LANES.format(LEVEL) if lanes is None else lanes}{more}
+  </road>
+"""
+
+
+def write(folder: Path, *roads: str, header: str = "", minor: int = 6) -> Path:
+    path = folder / "in.xodr"
+    head = f'<header revMajor="1" revMinor="{minor}" name="ä">{header}</header>'
+    path.write_text(f'<?xml version="1.0"?>\n<OpenDRIVE>\n  {head}\n{"".join(roads)}</OpenDRIVE>\n')
+    return path
+
+
+def lifted(source: Path, height, **options) -> tuple[ET.Element, list[Lifted]]:
+    """Lift a file with heights of level 0; return the copy and its rows."""
+
+    def heights(x, y):
+        found = height(x, y)
+        return found if isinstance(found, Heights) else Heights((0,), found[None])
+
+    out = source.with_name("out" + "".join(source.suffixes[-2:]))
+    rows = list(opendrive.lift(source, out, heights, Options(**options)))
+    data = gzip.decompress(out.read_bytes()) if out.suffix == ".gz" else out.read_bytes()
+    return ET.fromstring(data), rows
+
+
+def places(element: ET.Element, right: float = -3.5, left: float = 3.5) -> np.ndarray:
+    """Return places on the lanes of a road, read literally, ``(n, 3)``."""
+    plan = plan_view.read(element)
+    s = np.linspace(0, float(element.get("length")), 97)
+    at = np.column_stack(plan.at(s))
+    across = np.linspace(right, left, 9)
+    return np.array([place(element, at[k], s[k], t) for k in range(len(s)) for t in across])
+
+
+def plane(x, y):
+    return 100 + 0.05 * x - 0.03 * y
+
+
+def twisted(x, y):
+    """Planar across a road along y = 20."""
+    return 100 + np.sin(x / 12) + (0.02 + 0.03 * np.cos(x / 20)) * (y - 20)
+
+
+def cone(x, y):
+    """Planar across circles around the origin."""
+    return 100 + 0.05 * np.hypot(x, y) + 0.5 * np.sin(7 * np.arctan2(x, -y))
+
+
+def crowned(x, y):
+    return 100 + 0.04 * x - 0.03 * np.sqrt((y - 20) ** 2 + 1) + 0.1 * np.sin(x / 9) * np.cos(y / 3)
+
+
+@pytest.mark.parametrize(
+    ("surface", "plan", "within"),
+    [(plane, LINE, 1e-6), (twisted, LINE, 0.012), (cone, ARC, 0.012), (plane, ARC, 0.012)],
+)
+def test_lanes_lie_on_ground_that_is_planar_across(tmp_path, surface, plan, within):
+    root, (row,) = lifted(write(tmp_path, road(plan)), surface)
+    x, y, z = places(root.find("road")).T
+    missed = np.abs(z - surface(x, y)).max()
+    assert missed < within
+    assert row.superelevation_m == pytest.approx(missed, abs=2e-3)
+    assert row.elevation_m > 3 * row.superelevation_m
+    assert row.without_ground_m == 0
+    assert row.note == ""
+
+
+def test_a_profile_on_a_plane_is_one_piece_with_its_slopes(tmp_path):
+    root, (row,) = lifted(write(tmp_path, road()), plane)
+    (elevation,) = root.findall("road/elevationProfile/elevation")
+    (across,) = root.findall("road/lateralProfile/superelevation")
+    assert float(elevation.get("a")) == pytest.approx(plane(10, 20), abs=1e-9)
+    assert float(elevation.get("b")) == pytest.approx(0.05, abs=1e-9)
+    assert float(across.get("a")) == pytest.approx(np.arctan(-0.03), abs=1e-9)
+    assert (row.grade, row.crossfall) == (pytest.approx(0.05), pytest.approx(0.03))
+    # The file had heights of 1 to 1.3 m.
+    x, y = np.meshgrid(np.linspace(10, 70, 61), [16.5, 23.5])
+    old = np.where(x < 40, 1 + 0.01 * (x - 10), 1.3)
+    assert row.before_m == pytest.approx(np.abs(plane(x, y) - old).max())
+
+
+def test_roads_that_meet_have_one_height_and_one_grade(tmp_path):
+    # The second comes from the other side, the third turns away on an arc, the fourth begins with a spiral.
+    plans = [
+        LINE,
+        '<geometry s="0" x="110" y="20" hdg="3.141592653589793" length="{length}"><line/></geometry>',
+        '<geometry s="0" x="70" y="20" hdg="0" length="{length}"><arc curvature="0.05"/></geometry>',
+        '<geometry s="0" x="70" y="20" hdg="0" length="{length}"><spiral curvStart="0" curvEnd="-0.1"/>'
+        "</geometry>",
+    ]
+    lengths = [60.0, 40.0, 9.4, 0.7]
+    roads = [road(plan, long, str(k)) for k, (plan, long) in enumerate(zip(plans, lengths, strict=True))]
+    root, _ = lifted(write(tmp_path, *roads), crowned)
+    ends = []
+    for element, at_end in zip(root.findall("road"), (True, True, False, False), strict=True):
+        length = float(element.get("length"))
+        s = length if at_end else 0.0
+        z = polynomial(element, "elevationProfile/elevation", s)
+        step = 1e-4 * (-1 if at_end else 1)
+        grade = (polynomial(element, "elevationProfile/elevation", s + step) - z) / step
+        ends.append((z, -grade if element.get("id") == "1" else grade))
+    np.testing.assert_allclose(ends, [ends[0]] * 4, atol=1e-5)
+    assert ends[0][0] == pytest.approx(float(crowned(70.0, 20.0)), abs=1e-9)
+
+
+@pytest.mark.parametrize("lateral", ["superelevation", "none"])
+@pytest.mark.parametrize(
+    "profiles",
+    [
+        PROFILES,
+        "",
+        "<elevationProfile/>",
+        "<lateralProfile></lateralProfile>",
+        "<elevationProfile></elevationProfile>"
+        '<lateralProfile><superelevation s="0" a="0.1" b="0" c="0" d="0"/>'
+        '<crossfall side="left" s="0" a="0" b="0" c="0" d="0"/><shape s="0" t="0" a="0" b="0" c="0" d="0"/>'
+        "<userData code='b'/></lateralProfile>",
+    ],
+)
+def test_all_but_the_profiles_stays_as_it_was_written(tmp_path, lateral, profiles):
+    more = (
+        '\n    <objects><object id="1" s="3" t="1" zOffset="0.5"/></objects>\n    <myOwn a=\'1\'/><!-- b -->'
+    )
+    source = write(tmp_path, road(profiles=profiles, more=more), road(name="8", profiles=profiles))
+    root, rows = lifted(source, twisted, lateral=lateral)
+    assert [row.id for row in rows] == ["7", "8"]
+
+    def rest(text: str) -> str:
+        tree = ET.fromstring(text)
+        for element in tree.iter("road"):
+            for name, removed in (("elevationProfile", "elevation"), ("lateralProfile", "")):
+                profile = element.find(name)
+                for child in [] if profile is None else list(profile):
+                    if child.tag in (removed, "superelevation", "crossfall", "shape"):
+                        profile.remove(child)
+                if profile is not None and not len(profile):
+                    element.remove(profile)
+        return ET.canonicalize(ET.tostring(tree, "unicode"), strip_text=True)
+
+    before, after = source.read_text(), (tmp_path / "out.xodr").read_text()
+    assert rest(before) == rest(after)
+    for element in root.findall("road"):
+        names = [each.tag for each in element]
+        assert names[:3] == ["link", "planView", "elevationProfile"]
+        assert (names[3] == "lateralProfile") == (lateral != "none" or "lateral" in profiles)
+        assert element.find("elevationProfile/elevation") is not None
+        assert len(element.findall("lateralProfile/crossfall")) == (
+            lateral == "none" and "crossf" in profiles
+        )
+    # Text between the profiles and behind them is the same byte by byte.
+    for part in ("<!-- a comment -->",) * (profiles is PROFILES) + (LANES.format(LEVEL) + more,):
+        assert part in after
+    assert before.partition("<road")[0] == after.partition("<road")[0]
+
+
+def test_a_packed_file_is_packed_again(tmp_path):
+    plain = write(tmp_path, road())
+    source = tmp_path / "in.xodr.gz"
+    source.write_bytes(gzip.compress(plain.read_bytes()))
+    root, (row,) = lifted(source, plane)
+    assert row.superelevation_m < 1e-6
+    assert root.find("road/elevationProfile/elevation").get("b").startswith("0.05")
+
+
+@pytest.mark.parametrize("profiles", [PROFILES, ""])
+def test_without_ground_a_road_keeps_its_profile(tmp_path, profiles):
+    def until(x, y):
+        return np.where(x < 40.5, plane(x, y), np.nan)
+
+    root, (row,) = lifted(write(tmp_path, road(profiles=profiles)), until)
+    first = root.find("road")
+    for s in (0.0, 12.0, 29.9):
+        assert polynomial(first, "elevationProfile/elevation", s) == pytest.approx(plane(10 + s, 20))
+    old = {30.1: 1.3, 59.0: 1.3} if profiles else {30.1: 0.0, 59.0: 0.0}
+    for s, z in old.items():
+        assert polynomial(first, "elevationProfile/elevation", s) == pytest.approx(z)
+    assert row.without_ground_m == pytest.approx(30.0)
+    assert row.superelevation_m < 1e-6
+
+
+def test_without_ground_a_road_goes_on_level_if_asked(tmp_path):
+    def inner(x, y):
+        return np.where((x > 20.5) & (x < 50.5), plane(x, y), np.nan)
+
+    root, (row,) = lifted(write(tmp_path, road()), inner, flat_ends=True)
+    first = root.find("road")
+    for s, z in ((0.0, plane(21, 20)), (11.0, plane(21, 20)), (25, plane(35, 20)), (60, plane(50, 20))):
+        assert polynomial(first, "elevationProfile/elevation", s) == pytest.approx(z)
+    assert row.without_ground_m == pytest.approx(31.0)
+
+
+def test_a_road_off_the_survey_stays_byte_by_byte(tmp_path):
+    source = write(tmp_path, road())
+    _, (row,) = lifted(source, lambda x, y: np.full(len(x), np.nan))
+    assert (tmp_path / "out.xodr").read_bytes() == source.read_bytes()
+    assert row.without_ground_m == row.length_m == 60
+
+
+def decked(x, y):
+    """A deck of level 1 from x = 30 to 50, 6 m above a dip in the ground."""
+    dip = np.where((x > 30) & (x < 50), -6.0, 0.0)
+    on = (x >= 30) & (x <= 50) & (np.abs(y - 20) < 5)
+    return Heights((0, 1), np.stack([plane(x, y) + dip, np.where(on, plane(x, y), np.nan)]))
+
+
+def tubed(x, y):
+    hill = np.where((x > 30) & (x < 50), 9.0, 0.0)
+    return Heights((0,), (plane(x, y) + hill)[None])
+
+
+def structure(kind: str, s: float = 20.0, length: float = 20.0) -> str:
+    return f'<objects><{kind} id="1" s="{s}" length="{length}" type="concrete"/></objects>'
+
+
+@pytest.mark.parametrize("more", ["", structure("bridge")])
+def test_a_bridge_is_on_its_deck(tmp_path, more):
+    root, (row,) = lifted(write(tmp_path, road(more=more)), decked)
+    x, y, z = places(root.find("road")).T
+    assert np.abs(z - plane(x, y)).max() < 0.02
+    assert row.levels == (0, 1)
+    assert row.unknown_deck_m == 0
+
+
+def test_a_road_below_a_deck_stays_on_the_ground(tmp_path):
+    plan = '<geometry s="0" x="40" y="-10" hdg="1.5707963267948966" length="{length}"><line/></geometry>'
+
+    def above(x, y):
+        on = (np.abs(x - 40) < 20) & (np.abs(y - 20) < 5)
+        return Heights((0, 1), np.stack([plane(x, y), np.where(on, plane(x, y) + 6, np.nan)]))
+
+    root, (row,) = lifted(write(tmp_path, road(plan)), above)
+    x, y, z = places(root.find("road")).T
+    assert np.abs(z - plane(x, y)).max() < 1e-6
+    assert row.levels == (0,)
+
+
+def test_a_bridge_without_a_level_has_the_surface_and_is_named(tmp_path):
+    _, (row,) = lifted(write(tmp_path, road(more=structure("bridge"))), plane)
+    assert row.unknown_deck_m == 20
+    assert row.superelevation_m < 1e-6
+
+
+def test_a_tunnel_without_a_level_joins_its_portals(tmp_path):
+    more = structure("tunnel", 19.5, 21.0)
+    root, (row,) = lifted(write(tmp_path, road(more=more)), tubed)
+    x, y, z = places(root.find("road")).T
+    assert np.abs(z - plane(x, y)).max() < 0.02
+    assert row.unknown_deck_m == 21
+    assert row.without_ground_m == 0
+
+
+def test_level_lanes_are_not_superelevated_and_named(tmp_path):
+    lanes = LANES.format('level="true"')
+    _, (row,) = lifted(write(tmp_path, road(lanes=lanes)), plane)
+    assert row.elevation_m == row.superelevation_m > 0.1
+    assert 'level="true"' in row.note
+
+
+def linked(name: str, x: float, heading: float, before: str = "", after: str = "") -> str:
+    """A road of 12 m with links to the start of the one after it and to the end of the one before."""
+    plan = f'<geometry s="0" x="{x}" y="20" hdg="{heading}" length="{{length}}"><line/></geometry>'
+    links = "".join(
+        f'<{kind} elementType="road" elementId="{other}" contactPoint="{end}"/>'
+        for kind, other, end in (("predecessor", before, "end"), ("successor", after, "start"))
+        if other
+    )
+    return road(plan, 12.0, name, profiles="").replace("<link/>", f"<link>{links}</link>")
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_road_with_several_levels_goes_on_where_its_links_do(tmp_path, order):
+    # Three roads in line below a wide deck, of which the first comes from outside; one alone is on the deck.
+    def covered(x, y):
+        return Heights((0, 1), np.stack([plane(x, y), np.where(x > 15, plane(x, y) + 6, np.nan)]))
+
+    roads = [
+        linked("1", 8, 0, after="2"),
+        linked("2", 20, 0, before="1", after="3"),
+        linked("3", 32, 0, before="2"),
+        linked("4", 60, 0),
+    ]
+    root, rows = lifted(write(tmp_path, *roads[::order]), covered)
+    levels = {row.id: row.levels for row in rows}
+    assert levels == {"1": (0,), "2": (0,), "3": (0,), "4": (1,)}
+    heights = {
+        each.get("id"): polynomial(each, "elevationProfile/elevation", 6) for each in root.iter("road")
+    }
+    assert heights["3"] == pytest.approx(plane(38, 20))
+    assert heights["4"] == pytest.approx(plane(66, 20) + 6)
+
+
+LANE = '<lane id="{0}" type="driving"><width sOffset="0" a="{1}" b="{2}" c="0" d="0"/></lane>'
+OTHER_LANES = [
+    # Shifted, and wider along the road.
+    (
+        '<lanes><laneOffset s="0" a="2" b="0.01" c="0" d="0"/><laneSection s="0"><right>'
+        f"{LANE.format(-1, 3, 0.02)}{LANE.format(-2, 1, 0)}</right></laneSection></lanes>",
+        lambda s: (2 + 0.01 * s - (4 + 0.02 * s), 2 + 0.01 * s),
+    ),
+    # Borders; the second section has a side of its own.
+    (
+        '<lanes><laneSection s="0"><left><lane id="1" type="driving"><border sOffset="0" a="4" b="0" c="0" '
+        f'd="0"/></lane></left><right>{LANE.format(-1, 3, 0)}</right></laneSection>'
+        f'<laneSection s="20" singleSide="true"><right>{LANE.format(-1, 5, 0)}</right></laneSection></lanes>',
+        lambda s: (np.where(s < 20, -3, -5), 4.0 + 0 * s),
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "expected"), OTHER_LANES)
+def test_extent_of_lanes_follows_offsets_widths_borders_and_sections(text, expected):
+    s = np.linspace(0, 60, 13)
+    found = extent(ET.fromstring(f"<road>{text}</road>"), s)
+    right, left = expected(s)
+    np.testing.assert_allclose(found.right, right)
+    np.testing.assert_allclose(found.left, left)
+
+
+BAD = [
+    (road(length=0.0), "has a length of 0 m"),
+    (road().replace('length="60.0" id', "id"), "has road without length"),
+    (road().replace('length="60.0" id', 'length="1e9" id'), "has a length of 1e+09 m"),
+    (road().replace('x="10"', 'x="nan"'), "x 'nan', which is no number"),
+    (road().replace("<line/>", ""), "no line, arc"),
+    (road(plan=""), "no planView with a geometry"),
+    (road(plan=LINE.replace('s="0"', 's="9"') + LINE), "s that does not ascend"),
+    (road().replace('b="0.01"', 'b="x"'), "elevation with b 'x'"),
+    (road().replace('a="3.5"', 'a="inf"'), "width with a 'inf'"),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), BAD)
+def test_a_road_that_cannot_be_read_stays_and_is_named(tmp_path, text, words):
+    root, (bad, good) = lifted(write(tmp_path, text, road(name="8")), plane)
+    assert words in bad.note
+    assert bad.id == "7"
+    assert bad.note.endswith("; it stays as it was")
+    assert "\n" not in bad.note
+    assert text in (tmp_path / "out.xodr").read_text()
+    assert good.superelevation_m < 1e-6
+    assert len(root.findall("road")) == 2
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("", Frame(None)),
+        ("<geoReference/>", Frame(None)),
+        ("<geoReference>EPSG:25832</geoReference>", Frame("EPSG:25832")),
+        (
+            "<geoReference>\n <![CDATA[\n+proj=utm  +zone=32\n]]></geoReference>"
+            '<offset x="1.5" y="-2" z="3" hdg="0.1"/>',
+            Frame("+proj=utm +zone=32", 1.5, -2.0, 3.0, 0.1),
+        ),
+    ],
+)
+def test_the_frame_is_that_of_the_header(tmp_path, header, expected):
+    assert opendrive.frame(write(tmp_path, road(), header=header)) == expected
+
+
+def test_places_above_limits_are_the_steepest_of_their_stretch(tmp_path):
+    _, (row,) = lifted(write(tmp_path, road()), twisted, grade_limit=0.08, crossfall_limit=0.0499)
+    grades = [each for each in row.steep if each.kind == "grade"]
+    # The slope is cos(x / 12) / 12: steepest at x = 12 pi.
+    assert [round(each.value, 4) for each in grades] == [0.0833]
+    assert grades[0].x == pytest.approx(12 * np.pi, abs=0.6)
+    assert grades[0].y == pytest.approx(20)
+    # 0.02 + 0.03 cos(x / 20) is 0.046 at most here.
+    assert [each.kind for each in row.steep] == ["grade"]
+
+
+def test_a_reference_to_opencrg_stays(tmp_path):
+    own = '<surface><CRG file="a.crg" sStart="0" sEnd="60" orientation="same" mode="attached"/></surface>'
+    root, (row,) = lifted(write(tmp_path, road(more=own)), plane)
+    assert [each.get("file") for each in root.iter("CRG")] == ["a.crg"]
+    assert row.note == ""
+
+
+def test_large_roads_have_no_more_points_than_they_need(tmp_path):
+    asked = []
+
+    def counted(x, y):
+        asked.append(len(x))
+        return plane(x, y)
+
+    narrow = ARC.replace("0.01", "5")
+    wide = LANES.format(LEVEL).replace('a="3.5"', 'a="150"')
+    roads = [road(narrow, 9000.0), road(LINE, 6000.0, "8", lanes=wide)]
+    lifted(write(tmp_path, *roads), counted)
+    assert sum(asked) < 800_000
+
+
+def test_places_that_are_no_numbers_leave_the_road(tmp_path):
+    huge = LINE.replace('hdg="0"', 'hdg="1e308"').replace("<line/>", '<arc curvature="1e308"/>')
+    _, (bad, good) = lifted(write(tmp_path, road(huge, name="8"), road()), plane)
+    assert "places that are no numbers" in bad.note
+    assert good.note == ""

@@ -1,0 +1,227 @@
+"""Each option of the spoilers changes what it describes, and nothing else."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation, distance_transform_edt, maximum_filter, minimum_filter
+
+from flexroad.catalog import Grid
+from flexroad.tools.synthetic import Kind, Scene, SceneOptions, block, make_scene
+from flexroad.tools.synthetic.gerod import PRESET
+from flexroad.tools.synthetic.network import Plan
+from flexroad.tools.synthetic.noise import generator
+from flexroad.tools.synthetic.spoilers import BARE
+from flexroad.tools.synthetic.surfaces import CIRCLE_M, ISLAND_M
+
+GRID = block(1)[0][1]
+QUIET = {"dsm_noise_m": (0, 0), "dtm_noise_m": 0, "flight_offset_m": 0}
+INNER = np.s_[25:-25, 25:-25]
+"""Cells whose neighbourhood lies on the tile."""
+EMPTY = {**QUIET, "density": 0, "mask_errors": 0, "stream_share": 0}
+
+
+@lru_cache
+def made(base: str = "empty", seed: int = 2, stratum: str = "urban", **options: float) -> Scene:
+    defaults = EMPTY if base == "empty" else QUIET
+    return make_scene(GRID, seed, stratum, SceneOptions(**{**defaults, **options}))
+
+
+@pytest.mark.parametrize("stratum", PRESET)
+def test_all_spoilers_truth_does_not_depend_on_cell_size(stratum):
+    fine = Grid(GRID.crs, GRID.west, GRID.north, 1.0, 240, 240)
+    coarse = Grid(
+        GRID.crs, GRID.west, GRID.north, 3.0, 80, 80
+    )  # its centres are also centres of the fine grid
+    fine_scene, coarse_scene = (make_scene(grid, 3, stratum, PRESET[stratum]) for grid in (fine, coarse))
+    assert np.allclose(fine_scene.reference[1::3, 1::3], coarse_scene.reference, atol=1e-6)
+    assert np.array_equal(fine_scene.reference_road[1::3, 1::3], coarse_scene.reference_road)
+
+
+@pytest.mark.parametrize("stratum", PRESET)
+def test_all_spoilers_only_raise_and_have_a_kind(stratum):
+    options = PRESET[stratum].model_copy(update={**QUIET, "rails": 0.5, "wires": 1, "car_parks": 0.5})
+    scene = make_scene(GRID, 5, stratum, options)
+    void = np.isnan(scene.dsm)
+    bare = np.isin(scene.kind, BARE) & ~void
+    assert np.array_equal(scene.dsm[bare], scene.reference[bare])
+    assert (scene.dsm >= scene.reference)[~void].all()
+    assert 0 < void.mean() < 0.1
+    assert {Kind.PLANTS, Kind.WIRE, Kind.RAIL, Kind.MIXED} <= set(np.unique(scene.kind).tolist())
+
+
+def test_preset_neighbouring_tiles_join():
+    west, east = GRID, block(2)[1][1]
+    both = make_scene(Grid(GRID.crs, GRID.west, GRID.north, 1.0, 500, 250), 4, "urban", PRESET["urban"])
+    for half, tile in ((slice(0, 250), west), (slice(250, 500), east)):
+        part = make_scene(tile, 4, "urban", PRESET["urban"])
+        assert np.mean(np.abs(part.reference - both.reference[:, half]) > 1e-6) < 1e-4
+        assert np.mean(part.reference_road != both.reference_road[:, half]) < 1e-4
+        assert np.mean(part.road_mask != both.road_mask[:, half]) < 1e-4
+
+
+def test_curb_raises_pavement_only():
+    flat, curbed = made(), made(curb_m=0.12)
+    lift = curbed.reference - flat.reference
+    away = distance_transform_edt(~flat.reference_road)
+    assert np.abs(lift[flat.reference_road]).max() == 0
+    assert np.allclose(lift[(away > 1.5) & (away < 2)], 0.12)
+    assert np.abs(lift[INNER][away[INNER] > 6]).max() < 1e-9
+    assert np.array_equal(flat.reference_road, curbed.reference_road)
+
+
+@pytest.mark.parametrize("height", [4.0, -4.0])
+def test_wall_raises_ground_beside_streets_only(height):
+    level, walled = made(), made(wall_m=height)
+    lift = walled.reference - level.reference
+    away = distance_transform_edt(~level.reference_road)
+    assert np.abs(lift[level.reference_road]).max() == 0
+    assert np.allclose(lift[(away > 1.5) & (away < 6)], height)
+    assert np.abs(lift[INNER][away[INNER] > 22]).max() < 1e-9
+    assert np.array_equal(level.reference_road, walled.reference_road)
+
+
+def test_hump_raises_streets_over_streams_only():
+    flat, humped = (made(stream_share=1, hump_m=rise) for rise in (0, 1))
+    lift = humped.reference - flat.reference
+    deck = flat.kind == Kind.DECK
+    assert deck.sum() > 100
+    assert lift[deck].max() == pytest.approx(1, abs=0.05)
+    away = distance_transform_edt(~(deck & flat.reference_road))
+    assert np.abs(lift[flat.reference_road & (away > 30)]).max() < 1e-9
+    road = flat.reference_road
+    assert np.abs(np.diff(lift, axis=0))[road[1:] & road[:-1]].max() < 0.15
+
+
+def test_embankment_changes_streets_only():
+    level, banked = made(), made(embankment_m=2)
+    lift = banked.reference - level.reference
+    away = distance_transform_edt(~level.reference_road)
+    assert 0.5 < np.sqrt(np.mean(lift[level.reference_road] ** 2)) < 5
+    assert np.abs(lift[INNER][away[INNER] > 13]).max() < 1e-9
+    steps = np.abs(np.diff(lift, axis=0))[level.reference_road[1:] & level.reference_road[:-1]]
+    assert steps.max() < 0.3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cross_slope_has_no_step(seed):
+    """No step where streets meet, or at a dead end, where the two sides differ most."""
+    level, leaning = (made(seed=seed, stratum="rural", cross_slope=slope) for slope in (0, 0.08))
+    lift = leaning.reference - level.reference
+    assert np.abs(lift).max() > 0.05
+    for axis in (0, 1):
+        assert np.abs(np.diff(lift, axis=axis)).max() < 0.25
+
+
+def test_median_is_no_road():
+    single, dual = made(), made(medians=1)
+    assert dual.reference_road.sum() > single.reference_road.sum()
+    strips = made(medians=1).reference_road < binary_dilation(dual.reference_road, iterations=2)
+    inside = strips & (distance_transform_edt(~single.reference_road) == 0)
+    assert inside.sum() > 200
+
+
+def test_roundabout_has_ring_and_island():
+    plan = Plan(2, 100.0, 0.0, "urban", roundabouts=1)
+    scene = made(roundabouts=1)
+    x, y = plan.from_map(*np.meshgrid(GRID.eastings, GRID.northings))
+    island_cells = 0
+    box = (x.min(), y.min(), x.max(), y.max())
+    for cx, cy in plan.circles(box, 0):
+        away = np.hypot(x - cx, y - cy)
+        island_cells += (away < ISLAND_M).sum()
+        assert not scene.reference_road[away < ISLAND_M].any()
+        assert scene.reference_road[(away > ISLAND_M) & (away < CIRCLE_M)].all()
+    assert island_cells > 100
+
+
+def test_sunken_road_is_crossed_on_bridges():
+    scene = made(sunken_share=1)
+    deck = scene.kind == Kind.DECK
+    over = scene.reference - scene.dtm
+    assert deck.sum() > 50
+    assert over[deck].max() > 4
+    # The sunken road continues on both sides of the bridge, 5 m below.
+    without = made()
+    below = scene.reference_road & ~without.reference_road & ~deck
+    assert below.sum() > 200
+    assert np.median((without.reference - scene.reference)[below]) > 3.5
+
+
+def test_rails_and_wires_are_thin_and_have_their_height():
+    railed, wired = made(density=1, rails=1, trees=0), made(density=1, wires=1, trees=0)
+    height = railed.dsm - railed.reference
+    rail, wire = railed.kind == Kind.RAIL, wired.kind == Kind.WIRE
+    assert rail.sum() > 200
+    assert np.median(height[rail]) == pytest.approx(0.8, abs=0.1)
+    assert wire.sum() > 50
+    assert 5 < np.median((wired.dsm - wired.reference)[wire]) < 8
+    # No wider than two cells anywhere.
+    assert not minimum_filter(rail, 3).any()
+
+
+def test_mixed_cells_lie_between_foot_and_top():
+    sharp, mixed = made("quiet"), made("quiet", mixed=0.5)
+    changed = sharp.dsm != mixed.dsm
+    low, high = minimum_filter(sharp.dsm, 3), maximum_filter(sharp.dsm, 3)
+    assert changed.sum() > 500
+    assert (mixed.dsm >= sharp.reference).all()
+    assert (mixed.dsm <= high + 1e-9)[INNER].all()
+    assert np.mean(changed[high - low > 1.5]) == pytest.approx(0.5, abs=0.05)
+    assert not changed[INNER][(high - low)[INNER] < 1.5].any()
+
+
+def test_growth_is_off_the_road():
+    scene = made("quiet", stratum="rural", growth_m=0.6)
+    plants = scene.kind == Kind.PLANTS
+    assert plants.mean() > 0.1
+    assert not (plants & scene.reference_road).any()
+    assert 0.1 < np.mean((scene.dsm - scene.reference)[plants]) < 0.6
+
+
+def test_scars_are_under_houses_only():
+    whole, scarred = made("quiet"), made("quiet", scars_m=0.5)
+    off = np.abs(scarred.dtm - whole.dtm)
+    assert np.array_equal(whole.dsm, scarred.dsm)
+    near_houses = binary_dilation(whole.kind == Kind.BUILDING, iterations=9)
+    assert off[INNER][~near_houses[INNER]].max() < 1e-3
+    assert 0.1 < off[whole.kind == Kind.BUILDING].mean() < 1
+
+
+def test_car_parks_and_fields_are_partly_in_road_mask():
+    parks, fields = made("quiet", car_parks=1), made("quiet", stratum="rural", fields=1)
+    for scene, kind in ((parks, Kind.PAVED), (fields, Kind.FIELD)):
+        area = scene.kind == kind
+        assert area.sum() > 100
+        assert not (area & scene.reference_road).any()
+        assert scene.road_mask[area].mean() > 0.2
+    assert (parks.kind == Kind.PARKED_CAR).sum() > (made("quiet").kind == Kind.PARKED_CAR).sum()
+
+
+def test_false_roofs_are_in_road_mask():
+    right, wrong = made("quiet"), made("quiet", false_roofs=1)
+    roofs = right.kind == Kind.BUILDING
+    assert right.road_mask[roofs].mean() < 0.1
+    assert wrong.road_mask[roofs].mean() > 0.5
+    assert np.array_equal(right.dsm, wrong.dsm)
+
+
+def test_towers_overhang_and_storeys_change_roofs():
+    plain = made("quiet", trees=0)
+    assert np.max(made("quiet", trees=0, towers=1).dsm - plain.reference) > 25
+    eaves = made("quiet", trees=0, overhang_m=1)
+    assert (eaves.kind == Kind.BUILDING).sum() > 1.1 * (plain.kind == Kind.BUILDING).sum()
+    low = made("quiet", trees=0, storeys=0.5)
+    roofs = (plain.kind == Kind.BUILDING) & (low.kind == Kind.BUILDING)
+    ratio = np.mean((low.dsm - low.reference)[roofs]) / np.mean((plain.dsm - plain.reference)[roofs])
+    assert 0.4 < ratio < 0.75
+
+
+def test_rails_and_wires_without_streets_are_empty():
+    from flexroad.tools.synthetic.population import rails, wires
+
+    def unused(x, y):
+        raise AssertionError("the ground is not needed")
+
+    assert rails([], 0, unused, 1).x.size == wires([], 0, unused, 1).x.size == 0
+    assert generator(1, "a", 2).random() == generator(1, "a", 2).random()

@@ -1,0 +1,226 @@
+"""`flexroad train` on synthetic tiles; its report is compared with their known truth."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+import yaml
+from scipy import ndimage
+
+from flexroad.catalog import Catalog, Layer
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run.record import Run, check_models
+from flexroad.tasks import load
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.mask_cleanup import NOTHING
+from flexroad.tasks.segment.dinov2 import segment
+from flexroad.tools.synthetic.scenes import write_scenes
+from flexroad.tools.train.driver import LabelledTiles, Samples, TrainOptions, train
+from flexroad.tools.train.spatial_split import inside, split
+from tests.command_line import call
+from tests.make_backbone import save_backbone
+from tests.pipeline.cli.test_main import flexroad
+
+
+@pytest.fixture(scope="module")
+def land(tmp_path_factory):
+    return write_scenes(tmp_path_factory.mktemp("land"), 4, seed=3, size_m=80, dop=True)
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    """Options of a quick training on a backbone with random weights."""
+    backbone = save_backbone(tmp_path_factory.mktemp("backbone") / "tiny", hidden_size=96)
+    quick = {"layers": 3, "gsd_m": 0.2, "window_px": 112, "epochs": 40, "learning_rate": 0.03}
+    return {"backbone": str(backbone), **quick}
+
+
+def words(settings, **changes):
+    return [word for name, value in {**settings, **changes}.items() for word in ("--set", f"{name}={value}")]
+
+
+@pytest.fixture(scope="module")
+def trained(land, settings, tmp_path_factory):
+    model = tmp_path_factory.mktemp("model") / "roads.safetensors"
+    flexroad("train", land, "--labels", "mask", "-o", model, "--gap-m", 20, *words(settings))
+    return model, json.loads(model.with_name("roads.safetensors.json").read_text())
+
+
+def with_layers(catalog, **layers):
+    """The catalog with layers removed (None), or with the files of another layer instead (its name)."""
+
+    def changed(tile):
+        kept = [layer for layer in tile.layers if layers.get(layer.name, "") is not None]
+        return replace(
+            tile,
+            layers=tuple(
+                replace(layer, files=tile.layer(layers[layer.name]).files) if layer.name in layers else layer
+                for layer in kept
+            ),
+        )
+
+    return Catalog(tuple(changed(tile) for tile in catalog.tiles))
+
+
+def test_train_report_equals_segmenter_on_validation_tiles(land, trained):
+    model, report = trained
+    right = wrong = missed = 0
+    options = segment.Options(model=model, cleanup=NOTHING)
+    for tile in Catalog.read(land).select(report["asked"]["judged by"]).tiles:
+        data = load.load(tile, load.Options())
+        mask = segment.segment(data, options).mask
+        right += (mask & data.reference_road).sum()
+        wrong += (mask & ~data.reference_road).sum()
+        missed += (~mask & data.reference_road).sum()
+    assert report["all"]["iou"] == pytest.approx(right / (right + wrong + missed))
+    assert report["all"]["recall"] == pytest.approx(right / (right + missed))
+    # A mask that is road everywhere would have their fraction of road as IoU, below a third.
+    assert report["all"]["iou"] > 0.6
+    assert report["off_label_edges"]["iou"] > report["all"]["iou"]
+    assert report["all"]["edge_mean_m"] < 5
+    assert {*report["asked"]["judged by"], *report["asked"]["learnt from"]} == {
+        t.id for t in Catalog.read(land).tiles
+    }
+    # At most the requested epochs; the loss on the validation tiles sets the number.
+    losses = [entry["train_loss"] for entry in report["history"]]
+    assert 1 < len(losses) <= 40
+    assert losses[-1] < losses[0]
+
+
+def test_train_with_poor_result_says_so_and_does_not_recommend_it(land, settings, tmp_path):
+    survey = shutil.copytree(land.parent, tmp_path / "land")
+    blobs = np.random.default_rng(0)
+    for path in (survey / "reference_road").glob("*.tif"):
+        with rasterio.open(path, "r+") as file:
+            # Labels that nothing in the rasters tells: squares of 8 m at random places.
+            squares = np.kron(blobs.random((10, 10)) < 0.15, np.ones((8, 8)))
+            file.write(squares.astype(file.dtypes[0]), 1)
+    model = tmp_path / "poor.safetensors"
+    options = ("--labels", "mask", "--gap-m", 20, *words(settings, epochs=1))
+    said = call("train", survey / land.name, *options, "-o", model).expected(0)
+    report = json.loads(model.with_name("poor.safetensors.json").read_text())
+    iou = report["all"]["iou"]
+    assert iou < 0.4
+    assert f"warning: an IoU of {iou:.2f} is poor (below 0.5)" in said.err
+    assert "next:" not in said.out
+    assert "segment: {" not in said.out
+    page = model.with_name("poor.safetensors.html").read_text()
+    assert f"Warning: an IoU of {iou:.2f} is poor" in page
+    assert len(report["history"]) == 1
+    assert "Loss by epoch" not in page
+
+
+def test_train_with_good_result_says_how_to_use_it(land, settings, tmp_path):
+    model = tmp_path / "good.safetensors"
+    options = ("--labels", "mask", "--gap-m", 20, *words(settings))
+    said = call("train", land, *options, "-o", model).expected(0)
+    assert f"next: in a configuration, segment: {{method: dinov2, model: {model}}}" in said.out
+    assert "warning" not in said.err
+    assert "Loss by epoch" in model.with_name("good.safetensors.html").read_text()
+
+
+def test_train_page_is_self_contained_and_shows_tiles(trained):
+    model, report = trained
+    page = model.with_name("roads.safetensors.html").read_text()
+    assert 'src="data:image/png' in page
+    assert "http" not in page
+    assert all(tile in page for tile in report["asked"]["judged by"])
+
+
+def test_run_with_trained_model_completes(land, trained, quick_config, tmp_path):
+    model, _ = trained
+    quick = yaml.safe_load(quick_config.read_text()) | {"segment": {"method": "dinov2", "model": str(model)}}
+    config = tmp_path / "segment.yaml"
+    config.write_text(yaml.safe_dump(quick))
+    options = ("--config", config, "--catalog", land, "--out", tmp_path / "run", "--executor", "serial")
+    assert "4 done" in flexroad("run", *options)
+
+
+def test_training_samples_keep_off_edges_and_validation_tiles(land):
+    tiles = LabelledTiles(TrainOptions("mask", ignore_m=2.0), load.Options(halo_m=10.0), rasterise.DEFAULTS)
+    catalog = Catalog.read(land)
+    blocks = [block for tile in catalog.tiles for block in tiles.blocks(tile, [tile.grid.bounds])]
+    sides = split(blocks, 0.3, 30.0, 0)
+    for sample in Samples(tiles, sides, "train"):
+        grid = sample.data.grid
+        assert sample.labelled.any()
+        assert not (sample.labelled & ~inside(grid, sample.data.core.bounds)).any()
+        distance = np.maximum(
+            ndimage.distance_transform_edt(sample.road), ndimage.distance_transform_edt(~sample.road)
+        )
+        assert distance[sample.labelled].min() > 2.0
+
+
+def test_train_single_tile_is_split_in_two(land, settings):
+    catalog = Catalog.read(land)
+    single = Catalog(catalog.tiles[:1])
+    options = TrainOptions("mask", gap_m=10, settings={**settings, "epochs": 2})
+    outcome = train(single, load_config("paper"), options, print)
+    assert outcome.split.train[0].tile == outcome.split.validate[0].tile
+    assert outcome.split.train[0].bounds[2] == outcome.split.validate[0].bounds[0]
+
+
+def test_labelled_reads_vector_labels(land, tmp_path):
+    import geopandas
+    from shapely.geometry import box
+
+    tile = Catalog.read(land).tiles[0]
+    west, south, east, _ = tile.grid.bounds
+    path = tmp_path / "roads.gpkg"
+    geopandas.GeoDataFrame(geometry=[box(west, south + 20, east, south + 30)], crs=tile.grid.crs).to_file(
+        path
+    )
+    bare = replace(tile, layers=tuple(layer for layer in tile.layers if layer.name != "roads"))
+    drawn = replace(bare, layers=(*bare.layers, Layer("roads", (str(path),))), allowed=None)
+    tiles = LabelledTiles(TrainOptions("vector"), load.Options(), rasterise.DEFAULTS)
+    _, road = tiles.labelled(drawn)
+    assert road[-30:-20].all()
+    assert road.sum() == 10 * tile.grid.width
+    assert tiles.labelled(bare) is None
+
+
+def check_refused(catalog, match, **options):
+    with pytest.raises(ConfigError, match=match):
+        train(
+            catalog,
+            load_config("paper"),
+            TrainOptions(**{"labels": "mask"} | options),
+            print,
+        )
+
+
+def test_train_unusable_labels_or_settings_raise(land):
+    catalog = Catalog.read(land)
+    check_refused(
+        with_layers(catalog, road_mask=None, reference_road=None), "--reference-road or --road-mask"
+    )
+    check_refused(with_layers(catalog, roads=None), "--roads", labels="vector")
+    check_refused(with_layers(catalog, dop=None), "orthophoto")
+    check_refused(with_layers(catalog, reference_road="dsm"), "are road")
+    check_refused(catalog, "lower --gap-m", gap_m=1000)
+    check_refused(catalog, "--set epoch:.*epochs", settings={"epoch": 3})
+
+
+def test_run_missing_model_raises_before_start(land, tmp_path, quick_config):
+    quick = yaml.safe_load(quick_config.read_text()) | {
+        "segment": {"method": "dinov2", "model": "gone.safetensors"}
+    }
+    config = tmp_path / "segment.yaml"
+    config.write_text(yaml.safe_dump(quick))
+    with pytest.raises(
+        ConfigError, match=r"gone.safetensors does not exist; make it with `flexroad train CATALOG"
+    ):
+        check_models(load_config(config))
+    with pytest.raises(ConfigError, match="does not exist"):
+        Run.create(tmp_path / "run", load_config(config), Catalog.read(land))
+    assert not (tmp_path / "run").exists()
+
+
+def test_train_help_lists_options():
+    text = flexroad("train", "--help")
+    for word in ("--labels", "--validation", "--gap-m", "--ignore-m", "--set", "--seed"):
+        assert word in text

@@ -1,0 +1,1 @@
+"""Tools before and after a run: each folder has one, with its command."""

@@ -1,0 +1,489 @@
+"""Roads of an export as OpenCRG and OpenDRIVE, one route after the other, and the report of their errors."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.storage.paths import Location, read, stat, write
+from flexroad.catalog.text import count, no_formula
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.run.finished import FinishedTile, GroundTile, passing
+from flexroad.pipeline.run.tile_steps import LARGEST_M, length_text
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
+from flexroad.tasks.quality.flagged import flag_names
+from flexroad.tasks.roads.routes import Route
+from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.export import opencrg, opendrive
+from flexroad.tools.export import reference_line as lines
+from flexroad.tools.export.along_line import (
+    HeightAt,
+    HeightGrid,
+    Profiles,
+    across,
+    elevation_error,
+    grid_error,
+    height_grid,
+    largest_steps,
+    on_carriageway,
+    profile_error,
+    profiles,
+)
+from flexroad.tools.export.ground import SMOOTH, Ground, steps_left_out
+from flexroad.tools.export.local_frame import LocalFrame
+from flexroad.tools.export.network import Network, network
+from flexroad.tools.export.pieces import MARKERS, Encode, Piece, Row, write_pieces, write_whole
+from flexroad.tools.export.reference_line import ReferenceLine
+from flexroad.tools.export.source import Options, Source
+
+VERSION = 7
+"""Of the roads themselves: their division, lines, grids and errors."""
+INTERNAL = {"bounds", "lanes_assumed"}
+"""Entries of a road's row that the report does not show."""
+REPORT = "roads.csv"
+NO_ROAD = "no road lies on the tiles"
+MOST_NAMED = 3
+"""Number of roads that a message names."""
+SHOWN_M = 10.0
+"""Length of centre lines left out from which the user is told (m); the ends of routes are always a bit."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What all roads of an export have in common."""
+
+    frame: LocalFrame
+    vertical: str | None
+    left_hand: bool = False
+    crg: str | None = None
+    """Folder of the OpenCRG files, relative to the OpenDRIVE file; None if it refers to none."""
+
+    @classmethod
+    def of(cls, source: Source, roads: Network, **more: Any) -> Work:
+        """Return the work of an export."""
+        return cls(roads.frame, source.vertical, **more)
+
+
+@dataclass(frozen=True, eq=False)
+class RouteUnit:
+    """One route of an export, with the tiles that it touches."""
+
+    number: int
+    """From 1."""
+    route: Route
+    tiles: tuple[GroundTile, ...]
+    levelled: bool = False
+    """Whether the roads of the export have levels."""
+
+    @property
+    def id(self) -> str:
+        """Number of the route."""
+        return str(self.number)
+
+    @property
+    def label(self) -> str:
+        """Name of the route in messages."""
+        return f"road {self.number}"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Name of its lines and of the surfaces below."""
+        text = sha256(repr(self.tiles).encode())
+        for part in self.route.parts:
+            text.update(repr((part.width_m, part.lanes, part.oneway, part.name)).encode())
+            text.update(part.points.tobytes())
+            if self.levelled:
+                text.update(repr(part.level).encode())
+        return text.hexdigest()
+
+    def height(self, work: Work) -> HeightAt:
+        """Return the surface without steps in the local frame."""
+        return self._local(Ground(self.tiles).height, work)
+
+    def step(self, work: Work) -> HeightAt:
+        """Return the height of the surface with steps above it, in the local frame."""
+        return self._local(Ground(self.tiles).step, work)
+
+    def tile_step(self, line: ReferenceLine, v: Floats, inside: Bools, work: Work) -> float:
+        """Return the largest step between the tiles below a road (m); 0 on one tile.
+
+        Parameters
+        ----------
+        v : ndarray, (m,)
+            Distances from the line.
+        inside : ndarray, (n, m)
+            The places beside the line's points that count.
+        """
+        x, y = line.beside(v)
+        return Ground(self.tiles).largest_tile_step(*work.frame.to_run(x, y), inside, self.levels(x, y))
+
+    def levels(self, x: Floats, y: Floats) -> PlaceLevels | None:
+        """Return the levels of places in the local frame; None if the route is on level 0 alone."""
+        return None if self._levels is None else self._levels.at(x, y)
+
+    def levels_on(self, x: Floats, y: Floats) -> NDArray[np.int8]:
+        """Return the levels of the centre line at places on it."""
+        found = self.levels(x, y)
+        return np.zeros(x.shape, np.int8) if found is None else found.of_line
+
+    @cached_property
+    def _levels(self) -> RouteLevels | None:
+        return RouteLevels.of(self.route)
+
+    def _local(self, of: Callable[[Floats, Floats, PlaceLevels | None], Floats], work: Work) -> HeightAt:
+        return lambda x, y: of(*work.frame.to_run(x, y), self.levels(x, y))
+
+    def flags(self, line: ReferenceLine, work: Work) -> str:
+        """Return the flags that the carriageway of one of its roads passes, by name."""
+        v = across(line, 1.0, 0.0)
+        x, y = line.beside(v)
+        on = np.abs(v) <= line.width[:, None] / 2
+        x, y = x[on], y[on]
+        bits = Ground(self.tiles).flags(*work.frame.to_run(x, y), self.levels(x, y))
+        return ", ".join(flag_names(bits))
+
+    def road_id(self, part: int) -> int:
+        """Return the number of a road: OpenDRIVE's readers want whole numbers."""
+        return self.number * 1000 + part
+
+
+def units(roads: Network, tiles: Iterable[FinishedTile]) -> Iterator[RouteUnit]:
+    """Yield each route as soon as its last tile has passed."""
+    waiting: defaultdict[int, list[int]] = defaultdict(list)
+    passed: dict[int, GroundTile] = {}
+    for number, touched in enumerate(roads.tiles):
+        if len(touched):
+            waiting[int(touched[-1])].append(number)
+    for index, tile in enumerate(tiles):
+        passed[index] = GroundTile.of(tile)
+        for number in waiting.pop(index, ()):
+            touching = tuple(passed[int(k)] for k in roads.tiles[number])
+            yield RouteUnit(number + 1, roads.routes[number], touching, roads.levels)
+
+
+def write_crg(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> dict[str, Any]:
+    """Write an OpenCRG file per road and the report; return the summary."""
+    roads = network(source, options)
+    rows, _ = write_units(opencrg.VERSION, crg_piece, Work.of(source, roads), roads, tiles, folder, executor)
+    summary = report(folder, rows, roads)
+    error, steps = summary["crg_max_mm"], steps_left_out(_metres(summary["crg_steps_max_mm"]))
+    surface = SMOOTH if steps else "the surface"
+    text = f"misses {surface} by at most {length_text(error / 1000, 1)}{steps}" if error is not None else ""
+    return with_line(summary, text)
+
+
+def write_xodr(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> dict[str, Any]:
+    """Write all roads as one OpenDRIVE file, which refers to the OpenCRG files if there are any."""
+    roads = network(source, options)
+    crg = "../crg/" if "crg" in options.formats else None
+    work = Work.of(source, roads, left_hand=options.left_hand, crg=crg)
+    rows, key = write_units(opendrive.VERSION, xodr_piece, work, roads, tiles, folder, executor)
+    summary = report(folder, rows, roads)
+    edges = np.array([road["bounds"] for row in rows for road in row["roads"]])
+    bounds = (*edges[:, :2].min(axis=0), *edges[:, 2:].max(axis=0))
+
+    def fill(local: Path) -> None:
+        with local.open("wb") as file:
+            texts = (read(folder / _fragment(row["route"])) for row in rows if row["roads"])
+            opendrive.write(file, texts, roads.frame.proj, bounds, source.run.path.name)
+
+    write_whole(folder / f"{source.run.path.name}{opendrive.NAME}", key, {}, fill)
+    summary["notes"] += lane_notes(rows)
+    return with_line(summary, _without_crg(summary))
+
+
+def _without_crg(summary: Mapping[str, Any]) -> str:
+    """Return how far the profiles miss the surface, for the user; empty if that is not known."""
+    if summary["profiles_mean_mm"] is None:
+        return ""
+    errors = [
+        "{} on average, at most {}".format(
+            *(length_text(summary[f"{name}_{of}_mm"] / 1000) for of in ("mean", "max"))
+        )
+        for name in ("profiles", "elevation")
+    ]
+    steps = steps_left_out(_metres(summary["carriageway_steps_max_mm"]))
+    surface = SMOOTH if steps else "the surface"
+    alone = f"by elevation alone (CARLA, SUMO) by {errors[1]}"
+    return f"misses {surface} by {errors[0]}, without OpenCRG; {alone}{steps}"
+
+
+def write_units(
+    version: int,
+    encode: Encode,
+    work: Work,
+    roads: Network,
+    tiles: Iterable[FinishedTile],
+    folder: Location,
+    executor: Executor,
+) -> tuple[list[Row], str]:
+    """Write the files of each route; return their rows, in order, and a fingerprint of all of them."""
+    whole = sha256(f"{version} {VERSION} {work}".encode())
+
+    def counted() -> Iterator[RouteUnit]:
+        for unit in units(roads, tiles):
+            whole.update(f"{unit.id} {unit.fingerprint}".encode())
+            yield unit
+
+    versions = version * 1000 + VERSION
+    rows = write_pieces(counted(), folder, versions, encode, work, executor)
+    return sorted(rows, key=lambda row: int(row["route"])), whole.hexdigest()
+
+
+def crg_piece(unit: RouteUnit, work: Work) -> Piece:
+    """Return the OpenCRG files of a route."""
+    files, rows = dict[str, bytes](), list[Row]()
+    grids_of, problem = _grids(unit, work)
+    step = unit.step(work)
+    for part, (grid, height) in enumerate(grids_of):
+        road = unit.road_id(part)
+        heights = work.vertical or "as in the run"
+        comment = f"FlexRoad: {grid.line.name}\nx, y: {work.frame.proj}\nheights: {heights}"
+        files[f"{road}{opencrg.NAME}"] = opencrg.encode(grid, comment)
+        found = row(road, grid, height, step, profiles(grid), _tile_step(unit, work, grid))
+        rows.append(found | {"flags": unit.flags(grid.line, work)})
+    return Piece(files, _route_row(unit, rows, problem))
+
+
+def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
+    """Return the roads of a route as XML of OpenDRIVE."""
+    texts, rows = list[bytes](), list[Row]()
+    grids_of, problem = _grids(unit, work)
+    step = unit.step(work)
+    for part, (grid, height) in enumerate(grids_of):
+        road = unit.road_id(part)
+        fitted = profiles(grid)
+        crg = None if work.crg is None else f"{work.crg}{road}{opencrg.NAME}"
+        decks = structures(unit.levels_on(grid.line.x, grid.line.y), grid.line.s)
+        written = opendrive.Road(str(road), grid.line, fitted, crg, decks)
+        texts.append(opendrive.encode(written, work.left_hand))
+        found = row(road, grid, height, step, fitted, _tile_step(unit, work, grid))
+        rows.append(found | {"flags": unit.flags(grid.line, work)})
+    return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, rows, problem))
+
+
+def _fragment(route: int) -> str:
+    return f"{MARKERS}/{route}.xml"
+
+
+def _grids(unit: RouteUnit, work: Work) -> tuple[list[tuple[HeightGrid, HeightAt]], str]:
+    """Return the grids of a route's roads, and why it has none."""
+    height = unit.height(work)
+    line, problem = reference_line(unit)
+    if line is None:
+        return [], problem
+    parts = lines.usable(line, height(line.x, line.y), lines.Options())
+    return [(height_grid(part, height), height) for part in parts], ""
+
+
+def _tile_step(unit: RouteUnit, work: Work, grid: HeightGrid) -> float:
+    return unit.tile_step(grid.line, grid.v, on_carriageway(grid), work)
+
+
+def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
+    """Return the line of a route, or why it has none."""
+    options = lines.Options()
+    try:
+        line = lines.reference_line(unit.route, options)
+    except TaskError as error:
+        return None, str(error)
+    return line, f"shorter than {options.min_length_m:g} m" if line is None else ""
+
+
+def _route_row(unit: RouteUnit, rows: list[Row], problem: str) -> Row:
+    if not rows and not problem:
+        problem = "no part of it has a surface for long enough"
+    return {"route": unit.number, "roads": rows, "problem": problem}
+
+
+def row(
+    road: int, grid: HeightGrid, height: HeightAt, step: HeightAt, fitted: Profiles, tile_step: float
+) -> Row:
+    """Return a road's row of the report.
+
+    Parameters
+    ----------
+    height, step : callable
+        The surface without steps, and how much higher that with steps is, in the line's coordinates.
+    tile_step : float
+        The largest step between the tiles below its carriageway (m).
+    """
+    line = grid.line
+    (crg_median, crg_max), (mean, most) = grid_error(grid, height), profile_error(grid, fitted)
+    level_mean, level_most = elevation_error(grid, fitted)
+    crg_steps, carriageway_steps = largest_steps(grid, step)
+    half, lanes = float(line.width.max()) / 2, opendrive.lane_count(line)
+    errors = {
+        "crg_median_mm": crg_median,
+        "crg_max_mm": crg_max,
+        "profiles_mean_mm": mean,
+        "profiles_max_mm": most,
+        "elevation_mean_mm": level_mean,
+        "elevation_max_mm": level_most,
+        "crg_steps_max_mm": crg_steps,
+        "carriageway_steps_max_mm": carriageway_steps,
+        "tile_steps_max_mm": tile_step,
+        "off_centre_line_mm": line.offset_m,
+    }
+    return {
+        "id": road,
+        "name": line.name,
+        "length_m": round(float(line.s[-1]), 3),
+        "width_m": round(2 * half, 3),
+        "lanes": lanes,
+        "lanes_assumed": not line.lanes and lanes > (1 if line.oneway else 2),
+        **{key: millimetres(value) for key, value in errors.items()},
+        "bounds": [
+            float(line.x.min()) - half,
+            float(line.y.min()) - half,
+            float(line.x.max()) + half,
+            float(line.y.max()) + half,
+        ],
+    }
+
+
+def millimetres(metres: float) -> float | None:
+    """Return a length in mm for JSON; None if it is not known."""
+    return round(metres * 1000, 3) if np.isfinite(metres) else None
+
+
+def _metres(length_mm: float | None) -> float | None:
+    return None if length_mm is None else length_mm / 1000
+
+
+def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
+    """Write the report of the roads, if it is new; return the summary for the manifest.
+
+    Raises
+    ------
+    ConfigError
+        If no route has a road.
+    """
+    every = [road for row in rows for road in row["roads"]]
+    if not every:
+        raise ConfigError(f"no road could be written: {rows[0]['problem']}, and so on" if rows else NO_ROAD)
+    write_new(
+        folder / REPORT, _table([{k: v for k, v in road.items() if k not in INTERNAL} for road in every])
+    )
+    return {
+        **totals(rows, roads),
+        "crg_max_mm": _largest(every, "crg_max_mm"),
+        "profiles_mean_mm": _mean(every, "profiles_mean_mm"),
+        "profiles_max_mm": _largest(every, "profiles_max_mm"),
+        "elevation_mean_mm": _mean(every, "elevation_mean_mm"),
+        "elevation_max_mm": _largest(every, "elevation_max_mm"),
+        "crg_steps_max_mm": _largest(every, "crg_steps_max_mm"),
+        "carriageway_steps_max_mm": _largest(every, "carriageway_steps_max_mm"),
+        "tile_steps_max_mm": _largest(every, "tile_steps_max_mm"),
+        "faults": tile_faults(every),
+    }
+
+
+def tile_faults(roads: list[Row]) -> list[str]:
+    """Return a line that names the roads on tiles that do not meet; empty if all tiles do."""
+    name = "tile_steps_max_mm"
+    apart = sorted((road for road in roads if road[name] > 1000 * LARGEST_M), key=lambda road: -road[name])
+    if not apart:
+        return []
+    named = [f"{road['id']} {road['name'] or ''}".strip() for road in apart]
+    listed = ", ".join(
+        f"road {text}: {length_text(road[name] / 1000)}"
+        for text, road in zip(named[:MOST_NAMED], apart[:MOST_NAMED], strict=True)
+    )
+    more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
+    verb = "lie" if len(apart) > 1 else "lies"
+    return [f"{count(len(apart), 'road')} {verb} on tiles that do not meet ({listed}{more})"]
+
+
+def lane_notes(rows: list[Row]) -> list[str]:
+    """Return notes on roads with lanes of unusual width, and on those divided into lanes by their width."""
+    every = [road for row in rows for road in row["roads"]]
+    assumed = [road for road in every if road["lanes_assumed"]]
+    unusual = [road for road in every if _has_unusual_lanes(road)]
+    notes = []
+    for roads, text in (
+        (assumed, "so wide that its lanes are assumed; give the number of lanes"),
+        (unusual, "with lanes of less than 2 m or more than 6 m; correct width or number of lanes"),
+    ):
+        if roads:
+            widest = max(roads, key=lambda road: float(road["width_m"]))
+            named = f"road {widest['id']}: {widest['width_m']:g} m, {count(widest['lanes'], 'lane')}"
+            notes.append(f"{count(len(roads), 'road')} {text} ({named})")
+    return notes
+
+
+def _has_unusual_lanes(road: Row) -> bool:
+    """Return whether lanes are too wide, or several too narrow."""
+    width = road["width_m"] / road["lanes"]
+    return bool(width > opendrive.WIDEST_M or (road["lanes"] > 1 and width < opendrive.NARROWEST_M))
+
+
+def totals(rows: list[Row], roads: Network) -> dict[str, Any]:
+    """Return number, length and flags of the roads, and what was left out of centre lines on the tiles."""
+    length = sum(road["length_m"] for row in rows for road in row["roads"])
+    flagged = {str(road["id"]): road["flags"] for row in rows for road in row["roads"] if road["flags"]}
+    return {
+        "roads": sum(len(row["roads"]) for row in rows),
+        "length_m": round(length, 1),
+        "left_out_m": round(max(0.0, sum(roads.lengths) - length), 1),
+        "left_out_areas": roads.areas,
+        "flagged_roads": flagged,
+        "notes": [*roads.notes, *([passing(flagged, "road")] if flagged else [])],
+    }
+
+
+def with_line(figures: Mapping[str, Any], error: str = "") -> dict[str, Any]:
+    """Return figures with a line for the user, the summary: number and length of the roads, their error."""
+    text = f"{count(figures['roads'], 'road')}, {figures['length_m'] / 1000:.2f} km"
+    if figures["left_out_m"] >= SHOWN_M:
+        text += f", {figures['left_out_m'] / 1000:.2f} km of centre lines left out"
+    if figures["left_out_areas"]:
+        text += f", {count(figures['left_out_areas'], 'area')} without centre line left out"
+    return {**figures, "summary": f"{text}; {error}" if error else text}
+
+
+def write_new(where: Location, data: bytes) -> None:
+    """Write a small file unless it has this content."""
+    known = stat(where)
+    if known is None or known.size != len(data) or read(where) != data:
+        write(where, data)
+
+
+def _table(rows: list[Row]) -> bytes:
+    file = io.StringIO(newline="")
+    if rows:
+        table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        table.writeheader()
+        table.writerows({name: no_formula(value) for name, value in row.items()} for row in rows)
+    return file.getvalue().encode()
+
+
+def _known(roads: list[Row], key: str) -> list[Row]:
+    return [road for road in roads if road[key] is not None]
+
+
+def _largest(roads: list[Row], key: str) -> float | None:
+    return max((road[key] for road in _known(roads, key)), default=None)
+
+
+def _mean(roads: list[Row], key: str) -> float | None:
+    """Return the mean over the length of the roads."""
+    known = _known(roads, key)
+    length = sum(road["length_m"] for road in known)
+    return round(sum(road[key] * road["length_m"] for road in known) / length, 3) if known else None

@@ -1,0 +1,150 @@
+"""``flexroad export``: write the finished tiles of a run in the formats of other programs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from flexroad.catalog.area import Area
+from flexroad.catalog.storage.paths import Location, parse_location
+from flexroad.catalog.text import count
+from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.command import Command, group
+from flexroad.pipeline.cli.signals import INTERRUPTED
+from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS
+from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.tile_steps import REMEDY
+from flexroad.tools.export.driver import check_formats
+from flexroad.tools.export.driver import export as write
+from flexroad.tools.export.ellipsoidal import Datum
+from flexroad.tools.export.source import Options, select
+
+app = group()
+
+
+@app.command(cls=Command)
+@options.with_options
+def export(
+    path: options.Run,
+    formats: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="Formats, separated by commas: 3dtiles, landxml, cityjson, obj, step, crg, xodr, "
+            "lines, mosaic.",
+            rich_help_panel=OUTPUTS,
+        ),
+    ],
+    output: options.OutputFolder,
+    *,
+    vertical: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CRS",
+            help="Vertical CRS of the run's heights, for 3dtiles.",
+            rich_help_panel=INPUTS,
+        ),
+    ] = None,
+    geoid: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Geoid of the heights (.gtx, .tif), instead.", rich_help_panel=INPUTS
+        ),
+    ] = None,
+    height_offset: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="Height of the vertical datum above the ellipsoid, instead.",
+            rich_help_panel=INPUTS,
+        ),
+    ] = None,
+    chosen: Options,
+    allow_steps: Annotated[
+        bool,
+        typer.Option(
+            "--allow-steps", help="End with exit code 0 although roads lie on tiles that do not meet."
+        ),
+    ] = False,
+    tile: options.TileIds = None,
+    bbox: options.Box = None,
+    area: options.Area = None,
+    area_layer: options.AreaLayer = None,
+    allow: options.Allow = None,
+    executor: options.Executor = "serial",
+    workers: options.Workers = None,
+) -> None:
+    """Write finished tiles in the formats of other programs.
+
+    The same command goes on after an interruption. FOLDER/export.json says what was written.
+    """
+    chosen = replace(chosen, datum=_datum(vertical, geoid, height_offset))
+    if chosen.roads_layer and not chosen.roads:
+        raise ConfigError("--roads-layer needs --roads; of the catalog, the layer is known")
+    folder = parse_location(output)
+    names = [name.strip() for name in formats.split(",") if name.strip()]
+    check_formats(names, chosen)
+    track = StepProgress(Console(stderr=True))
+    runner = SerialExecutor() if executor == "serial" else DaskExecutor(workers)
+    try:
+        source = select(
+            parse_location(path),
+            tile or (),
+            bbox,
+            allow=[str(place) for place in allow or ()],
+            area=Area.read(area, area_layer) if area else None,
+            track=track,
+        )
+        if source.left_out:
+            _note(f"left out {count(len(source.left_out), 'unfinished tile')}")
+        manifest = write(source, folder, names, chosen, runner, track, _note)
+    except KeyboardInterrupt:
+        echo("interrupted; the same command goes on from here", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    except ClusterLost as error:
+        echo(f"error: {error}; the same command goes on from here", err=True)
+        raise typer.Exit(1) from None
+    written = {name: manifest["formats"][name] for name in names}
+    for name in names:
+        _say(name, written[name], folder / name)
+    faults = [f"{name}: {line}" for name in names for line in written[name].get("faults", ())]
+    for line in faults:
+        echo(f"{'note' if allow_steps else 'error'}: {line}; {REMEDY}", err=True)
+    if faults and not allow_steps:
+        echo("the files are written; --allow-steps takes them as they are", err=True)
+        raise typer.Exit(1)
+
+
+def _say(name: str, written: dict[str, Any], folder: Location) -> None:
+    """Print what the manifest says of a format."""
+    echo(f"{name}: {count(written['files'], 'file')}, {written['bytes'] / 1e6:.1f} MB in {folder}")
+    if summary := written.get("summary"):
+        echo(f"  {summary}")
+    for note in written["notes"]:
+        _note(f"{name}: {note}")
+
+
+def _note(line: str) -> None:
+    echo(f"note: {line}", err=True)
+
+
+def _datum(vertical: str | None, geoid: Path | None, offset: float | None) -> Datum | None:
+    given = {
+        "crs": vertical,
+        "geoid": None if geoid is None else str(geoid),
+        "offset": None if offset is None else f"{offset:g}",
+    }
+    chosen = {kind: value for kind, value in given.items() if value is not None}
+    if len(chosen) > 1:
+        raise ConfigError("give one of --vertical, --geoid and --height-offset")
+    for kind, value in chosen.items():
+        return Datum(kind, value)  # type: ignore[arg-type]
+    return None

@@ -1,0 +1,279 @@
+"""Write exports of a run in several formats, and the manifest that says what they are.
+
+The folder lies outside the run, and one export at a time writes it; existing files of others stay.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from difflib import get_close_matches
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.storage.paths import (
+    PROBE,
+    Location,
+    absolute,
+    check_writable,
+    exists,
+    listing,
+    read,
+    visible_entry,
+    write,
+)
+from flexroad.catalog.text import count
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.graph.borders import has_borders
+from flexroad.pipeline.run.lock import run_lock
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import Track, ended, untracked
+from flexroad.pipeline.run.tile_steps import REMEDY
+from flexroad.tasks.errors import TaskError
+from flexroad.tools.export.formats import FORMATS, Format
+from flexroad.tools.export.source import Options, Source, check_photos
+
+SAME = ("variant", "crs", "tiles", "results")
+"""Entries of the manifest that two exports into one folder have in common if both are of the same results."""
+DATUM_REMEDY = (
+    "needs heights above the ellipsoid of WGS 84, and the heights of a run are above a vertical datum; say "
+    "which: --vertical EPSG:N (PROJ needs its grid), --geoid FILE (.gtx or .tif), or --height-offset METRES"
+)
+MANIFEST = "export.json"
+ALONG_ROADS = ("crg", "xodr", "lines")
+"""Formats that name the roads on tiles that do not meet."""
+BEGUN = ".flexroad-export"
+"""File with the formats of the folder: written first, so that an interrupted export is known, too."""
+
+
+def export(
+    source: Source,
+    out: Location,
+    formats: Sequence[str],
+    options: Options,
+    executor: Executor,
+    track: Track = untracked,
+    notify: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Write the formats, each into a folder of its name, and the manifest last; return the manifest.
+
+    Parameters
+    ----------
+    track : callable
+        Shows the progress: takes the tiles of a format, its name and their number.
+    notify : callable
+        Receives one line about what the user may not expect.
+
+    Raises
+    ------
+    ConfigError
+        If a format is unknown, needs a datum or centre lines, no tile has the photo that is wanted, a tile's
+        results cannot be read, or the folder is in use.
+    ClusterLost
+        If the workers are gone; the same command goes on.
+    OSError
+        If a file cannot be written.
+    """
+    chosen = check_formats(formats, options)
+    options = replace(options, formats=frozenset(chosen))
+    if options.drape:
+        check_photos(source.tiles)
+    for kind in chosen.values():
+        if kind.check:
+            kind.check(source, options)
+    apart = not has_borders(source.run.config.chains[source.variant]["fit"])
+    others = ", ".join(name for name in chosen if name not in ALONG_ROADS)
+    if apart and others and len(source.tiles) > 1:
+        notify(f"{others}: the tiles of this run do not meet, and heights have steps there; {REMEDY}")
+    with held(out, source.run, chosen, notify):
+        written = _earlier(out, source, options, chosen, notify)
+        for name, kind in chosen.items():
+            written[name] = _written(source, out / name, name, kind, options, executor, track, notify)
+        manifest = _head(source, options) | {"formats": written}
+        write(out / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode())
+    return manifest
+
+
+def _written(
+    source: Source,
+    folder: Location,
+    name: str,
+    kind: Format,
+    options: Options,
+    executor: Executor,
+    track: Track,
+    notify: Callable[[str], None],
+) -> dict[str, Any]:
+    """Write one format; return its entry in the manifest."""
+    remove_unfinished(folder, below=True)
+    before = file_sizes(folder)
+    if isinstance(folder, Path):
+        folder.mkdir(parents=True, exist_ok=True)
+    tiles = track(source.finished(), f"writing {name}", len(source.tiles))
+    with ended(tiles):
+        try:
+            more = kind.write(source, tiles, folder, options, executor) or {}
+        except TaskError as error:
+            raise ConfigError(f"{name}: {error}") from error
+    files = file_sizes(folder)
+    if removed := len(before.keys() - files.keys()):
+        notify(f"removed {count(removed, 'file')} of an earlier export from {folder}")
+    return {
+        "title": kind.title,
+        "version": kind.version,
+        "precision_m": kind.precision_m,
+        **({"mesh_distances": source.mesh_distances} if kind.of_meshes else {}),
+        "files": len(files),
+        "bytes": sum(files.values()),
+        **({"datum": options.datum.text} if kind.needs_datum and options.datum else {}),
+        "notes": [],
+        **more,
+    }
+
+
+def _head(source: Source, options: Options) -> dict[str, Any]:
+    """Return the entries of the manifest that all formats share."""
+    results = sha256("".join(f"{snapshot.nodes['sample']}\n" for snapshot in source.snapshots).encode())
+    return {
+        "flexroad": version("flexroad"),
+        "run": str(source.run.path),
+        "variant": source.variant,
+        "crs": source.crs,
+        "vertical_crs": source.vertical,
+        "datum": options.datum.text if options.datum else None,
+        "tiles": len(source.tiles),
+        "left_out": list(source.left_out),
+        "results": results.hexdigest()[:32],
+    }
+
+
+def _earlier(
+    out: Location, source: Source, options: Options, chosen: Collection[str], notify: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return what the manifest says of other formats in the folder, if they are of the same results."""
+    try:
+        manifest = json.loads(read(out / MANIFEST))
+        others = {name: dict(entry) for name, entry in manifest["formats"].items() if name not in chosen}
+        present = {name: entry for name, entry in others.items() if file_sizes(out / name)}
+        head = _head(source, options)
+        if all(manifest[name] == head[name] for name in SAME):
+            return present
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+    for name in present:
+        notify(f"{out / name} is of an earlier export with other results; write it again, or remove it")
+    return {}
+
+
+def check_formats(names: Sequence[str], options: Options) -> dict[str, Format]:
+    """Return the formats by name.
+
+    Raises
+    ------
+    ConfigError
+        If a format is unknown, or needs heights above the ellipsoid and no datum is given.
+    """
+    if not names:
+        raise ConfigError(f"--format names no format; known are {', '.join(FORMATS)}")
+    unknown = [name for name in names if name not in FORMATS]
+    if unknown:
+        near = get_close_matches(unknown[0].lower(), FORMATS, n=1)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        raise ConfigError(f"--format {unknown[0]} is unknown{meant}; known are {', '.join(FORMATS)}")
+    chosen = {name: FORMATS[name] for name in names}
+    lacking = [name for name, kind in chosen.items() if kind.needs_datum]
+    if lacking and options.datum is None:
+        raise ConfigError(f"{lacking[0]} {DATUM_REMEDY}")
+    return chosen
+
+
+@contextmanager
+def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[str], None]) -> Iterator[None]:
+    """Make the folder and hold its lock; a context manager.
+
+    Parameters
+    ----------
+    formats : collection of str
+        The formats to write, each into a folder of its name.
+    notify : callable
+        Receives one line when the lock of a dead process is taken over.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is the run, its store or inside one of them, has existing files that would be replaced,
+        or another process writes there.
+    OSError
+        If it, or its manifest, cannot be written.
+    """
+    for folder in (run.path, run.store):
+        inside = [str(absolute(place)) for place in (out, *out.parents)]
+        if str(absolute(folder)) in inside:
+            raise ConfigError(f"--output {out} lies in the run ({folder}); choose a folder outside")
+    begun = _begun(out, formats)
+    check_writable(out)
+    if isinstance(out, Path):
+        output_file(out / MANIFEST)
+    with run_lock(out, notify):
+        remove_unfinished(out)
+        names = "".join(f"{name}\n" for name in sorted(begun)).encode()
+        if not exists(out / BEGUN) or read(out / BEGUN) != names:
+            write(out / BEGUN, names)
+        yield
+
+
+def _begun(out: Location, formats: Collection[str]) -> set[str]:
+    """Return the formats of the folder that this or an earlier export has written or begun.
+
+    Raises
+    ------
+    ConfigError
+        If the manifest, or a file in the folder of a format, is not of an earlier export.
+    """
+    own = _formats(out)
+    if own is None and exists(out / MANIFEST):
+        raise _foreign(out / MANIFEST)
+    earlier = own or set()
+    for name in formats:
+        other = None if name in earlier else visible_entry(out / name)
+        if other is not None:
+            raise _foreign(out / name / other)
+    return {*earlier, *formats}
+
+
+def _formats(out: Location) -> set[str] | None:
+    """Return the formats of earlier exports into the folder, None if there was none."""
+    begun = out / BEGUN
+    return set(read(begun).decode(errors="replace").split()) if exists(begun) else None
+
+
+def _foreign(file: Location) -> ConfigError:
+    return ConfigError(
+        f"{file} is not of an earlier `flexroad export` and would be replaced; "
+        "choose another folder with -o, or move that file away"
+    )
+
+
+def remove_unfinished(folder: Location, below: bool = False) -> None:
+    """Remove temporary files that an export which was killed has left in a folder; a bucket has none.
+
+    Parameters
+    ----------
+    below : bool
+        Whether folders inside it are searched, too.
+    """
+    if isinstance(folder, Path):
+        for file in folder.rglob(".*") if below else folder.glob(".*"):
+            if file.suffix == ".tmp" or file.name.startswith(PROBE):
+                file.unlink(missing_ok=True)
+
+
+def file_sizes(folder: Location) -> dict[str, int]:
+    """Return the size of each file of a format (bytes), without those that only an export reads."""
+    return {path: stat.size for path, stat in listing(folder).items() if not path.startswith(".")}

@@ -1,0 +1,237 @@
+"""The formats of `flexroad export`: how each is written from the finished tiles of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from datetime import UTC
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexroad.catalog.grid import Bounds
+from flexroad.catalog.ids import safe_name
+from flexroad.catalog.storage.paths import Location, remove, write
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.graph.borders import has_borders
+from flexroad.pipeline.run.finished import FinishedTile
+from flexroad.tasks.roads.extent import covered
+from flexroad.tasks.spline.levelled import LevelledSurface
+from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tools.export import along_roads, cityjson, landxml, mosaic, obj, opencrg, opendrive, step
+from flexroad.tools.export import lines as road_lines
+from flexroad.tools.export import road_lines as line_file
+from flexroad.tools.export import tileset as tiles3d
+from flexroad.tools.export.georeference import Georeference
+from flexroad.tools.export.network import network
+from flexroad.tools.export.pieces import Encode, Piece, Row, figures, part_name, write_joined, write_pieces
+from flexroad.tools.export.source import Options, Source, TileItem, photographed, texture_of
+
+MATERIALS = "materials.mtl"
+"""Name of the file of materials that all OBJ files share."""
+BEYOND = "a part of the surface is beyond the survey (beyond_survey_m2)"
+OF_LEVEL_0 = (
+    "the surface is that of level 0, which within 20 m of the joints of decks and tubes is not the road's"
+)
+CUT = "surface cut to the rectangle that the survey covers"
+NO_PHOTO = "no orthophoto, in plain colours"
+
+
+def landxml_part(tile: FinishedTile, project: landxml.Project) -> Piece:
+    """Return the part of a LandXML file."""
+    part = landxml.part(tile.mesh, project.joined).encode()
+    return Piece({part_name(tile.id): part}, {"height_error_m": _error_m(tile, 10**-landxml.DECIMALS)})
+
+
+def cityjson_part(tile: FinishedTile, place: Georeference) -> Piece:
+    """Return the lines of a CityJSON file."""
+    lines = cityjson.features(tile.id, tile.mesh, place.origin, place.vertical)
+    return Piece({part_name(tile.id): lines}, {"height_error_m": _error_m(tile, cityjson.SCALE_M)})
+
+
+def obj_piece(tile: FinishedTile, place: Georeference) -> Piece:
+    """Return the mesh as OBJ, and its place as JSON and, for GIS programs, as ``.prj``."""
+    return _obj(tile, place, MATERIALS, None)
+
+
+def draped_obj_piece(item: TileItem, place: Georeference) -> Piece:
+    """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
+    tile, name = item.tile, safe_name(item.id)
+    image = texture_of(tile)
+    materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
+    piece = _obj(tile, place, materials, image.bounds if image else None)
+    if image is None:
+        return Piece({**piece.files, materials: obj.encode_materials()}, piece.row | {"note": NO_PHOTO})
+    return Piece({**piece.files, materials: obj.encode_materials(photo), photo: image.jpeg}, piece.row)
+
+
+def _obj(tile: FinishedTile, place: Georeference, materials: str, photo: Bounds | None) -> Piece:
+    mesh, name = tile.mesh, safe_name(tile.id)
+    files = {
+        f"{name}{obj.NAME}": obj.encode(mesh, materials, place, photo),
+        f"{name}.json": place.sidecar(obj.AXES),
+        f"{name}.prj": place.prj(),
+    }
+    return Piece(files, {"height_error_m": _error_m(tile, 10**-obj.DECIMALS)})
+
+
+def _error_m(tile: FinishedTile, unit_m: float) -> float:
+    """Return the largest vertical distance of a file's vertices from the surface through the mesh's (m).
+
+    A coordinate that is rounded in plan may be in another cell, with another step. Between the two places the
+    surface therefore counts without its steps.
+
+    Parameters
+    ----------
+    unit_m : float
+        Of this unit the coordinates of a file are multiples (m).
+    """
+    points = tile.mesh.vertices + tile.mesh.origin
+    written = np.rint(points / unit_m) * unit_m
+    west, south, east, north = tile.tile.grid.bounds
+    heights = without_steps(tile.surface).height
+    here, there = (
+        heights(np.clip(x, west, east), np.clip(y, south, north)) for x, y, _ in (points.T, written.T)
+    )
+    errors = (written[:, 2] - points[:, 2]) - (there - here)
+    return float(np.nanmax(np.abs(errors), initial=0.0))
+
+
+def step_piece(tile: FinishedTile, place: Georeference) -> Piece:
+    """Return the surface as STEP, cut to what the survey covers of the tile, and its place as JSON."""
+    surface, source, name = tile.surface, tile.tile, safe_name(tile.id)
+    if not isinstance(surface, NurbsSurface):
+        raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
+    bounds, beyond_m2 = covered(tile.road)
+    about = {"bounds": list(bounds), "beyond_survey_m2": beyond_m2, "steps_max_m": _steps_m(tile)}
+    files = {
+        f"{name}{step.NAME}": step.encode(surface, bounds, tile.id, source.datetime, place),
+        f"{name}{step.NAME_SIDECAR}": place.sidecar(step.AXES, **about),
+    }
+    return Piece(files, _smooth_row(tile, bounds, beyond_m2))
+
+
+def _smooth_row(tile: FinishedTile, bounds: Bounds, beyond_m2: float) -> Row:
+    """Return the largest step that a surface leaves out, and a note if it ends with the survey or goes on."""
+    parts = [CUT] if bounds != tile.tile.grid.bounds else []
+    parts += [BEYOND] if beyond_m2 else []
+    parts += [OF_LEVEL_0] if isinstance(tile.surface, LevelledSurface) else []
+    return {"steps_max_m": _steps_m(tile)} | ({"note": "; ".join(parts)} if parts else {})
+
+
+def _steps_m(tile: FinishedTile) -> float:
+    """Return the largest step of a tile's surface within the survey (m)."""
+    surface, road = tile.surface, tile.road
+    if not isinstance(surface, SteppedSurface):
+        return 0.0
+    inside = ~road.outside[road.grid.window(road.core)]
+    return round(float(np.abs(surface.steps[inside]).max(initial=0.0)), 6)
+
+
+Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]
+"""Writes a format of the tiles into a folder; returns what the manifest says of it besides, if anything."""
+
+Check = Callable[[Source, Options], object]
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format of exports."""
+
+    title: str
+    write: Write
+    version: int
+    precision_m: float | None
+    """Largest distance of a point from the run's mesh or surface (m); None if its files or figures say it."""
+    needs_datum: bool = False
+    """Whether heights above the ellipsoid are needed."""
+    check: Check | None = None
+    """Raises an error, before anything is written, if the format cannot be."""
+    of_meshes: bool = False
+    """Whether it has the run's meshes; the manifest then says how far they are from their surfaces."""
+
+
+def write_landxml(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> dict[str, Any]:
+    """Write all meshes as one LandXML file."""
+    name = landxml.NAME_COMPRESSED if options.compress else landxml.NAME
+    latest = max(tile.datetime for tile in source.tiles)
+    joined = has_borders(source.run.config.chains[source.variant]["fit"])
+    project = landxml.Project(source.run.path.name, latest.astimezone(UTC), source.vertical, joined)
+
+    def join(local: Path, parts: Iterator[bytes]) -> None:
+        with local.open("wb") as file:
+            decoded = (landxml.Part.decode(part) for part in parts)
+            landxml.join(file, decoded, project, local.parent, options.compress)
+
+    file = folder / f"{source.run.path.name}{name}"
+    return write_joined(source, tiles, file, landxml.VERSION, landxml_part, project, executor, join)
+
+
+def write_cityjson(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> dict[str, Any]:
+    """Write all meshes as one CityJSONSeq file."""
+    place = source.place
+
+    def join(local: Path, parts: Iterator[bytes]) -> None:
+        with local.open("wb") as file:
+            file.write(cityjson.header(source.crs, place.origin, source.vertical))
+            file.writelines(parts)
+
+    file = folder / f"{source.run.path.name}{cityjson.NAME}"
+    return write_joined(source, tiles, file, cityjson.VERSION, cityjson_part, place, executor, join)
+
+
+def write_obj(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> dict[str, Any]:
+    """Write each mesh as OBJ: all with one file of materials, or each with its own and a photo."""
+    if not options.drape:
+        write(folder / MATERIALS, obj.encode_materials())
+        return _write_each(obj.VERSION, obj_piece, source, tiles, folder, options, executor)
+    remove(folder / MATERIALS)
+    items, encode = map(photographed, tiles), draped_obj_piece
+    return figures(write_pieces(items, folder, obj.VERSION, encode, source.place, executor))
+
+
+def _write_each(
+    version: int,
+    encode: Encode,
+    source: Source,
+    tiles: Iterable[FinishedTile],
+    folder: Location,
+    options: Options,
+    executor: Executor,
+) -> dict[str, Any]:
+    """Write a format that has files of its own for each tile."""
+    return figures(write_pieces(tiles, folder, version, encode, source.place, executor))
+
+
+def _along_roads(title: str, version: int, write: Write) -> Format:
+    return Format(title, write, version, None, check=network)
+
+
+FORMATS = {
+    "3dtiles": Format(
+        "3D Tiles 1.1, for globes", tiles3d.write_tilesets, tiles3d.VERSION, 0.002, True, of_meshes=True
+    ),
+    "landxml": Format(
+        "LandXML 1.2, for civil engineering", write_landxml, landxml.VERSION, 0.0001, of_meshes=True
+    ),
+    "cityjson": Format(
+        "CityJSONSeq 2.0, for city models", write_cityjson, cityjson.VERSION, 0.001, of_meshes=True
+    ),
+    "obj": Format("OBJ, for modelling", write_obj, obj.VERSION, 0.0001, of_meshes=True),
+    "step": Format("STEP AP214, for CAD", partial(_write_each, step.VERSION, step_piece), step.VERSION, 1e-9),
+    "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
+    "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
+    "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),
+    "lines": _along_roads("Road lines as GeoPackage, for GIS", line_file.VERSION, road_lines.write_lines),
+}
+"""By the name on the command line."""

@@ -1,0 +1,174 @@
+"""The roads of an export: routes along centre lines, each with the tiles that it touches."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds, union
+from flexroad.catalog.scan.vectors import opened
+from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.text import count
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks import types
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads import routes as routing
+from flexroad.tasks.roads.centre_lines import CentreLines, read_centre_lines
+from flexroad.tasks.roads.routes import CentreLine, Route
+from flexroad.tasks.segment import vector
+from flexroad.tools.export.local_frame import LocalFrame
+from flexroad.tools.export.source import Options, Source
+
+BEYOND_M = 25.0
+"""Centre lines are cut this far beyond the tiles (m), so that their smoothing at the limit is the same."""
+SIDE_M = 3.0
+"""Width beside a road for which surfaces are needed, beyond that of its lines and grids (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """Routes on the tiles of an export."""
+
+    frame: LocalFrame
+    routes: tuple[Route, ...]
+    """In the frame."""
+    tiles: tuple[NDArray[np.intp], ...]
+    """Per route, indices of the tiles that it touches, in the order of `Source.tiles`."""
+    lengths: tuple[float, ...]
+    """Per route, its length on the tiles (m)."""
+    areas: int
+    """Number of road polygons that were left out."""
+    notes: tuple[str, ...]
+    levels: bool = False
+    """Whether the run has levels, and one of the roads is on a deck or in a tube."""
+
+
+@lru_cache(maxsize=1)
+def network(source: Source, options: Options) -> Network:
+    """Return the roads of an export; the formats of one export share the result.
+
+    Raises
+    ------
+    ConfigError
+        If there are no centre lines, they cannot be read, or none lies on the tiles.
+    """
+    boxes = shapely.box(*np.array([tile.grid.bounds for tile in source.tiles]).T)
+    found = _read(source, options)
+    given = f"--roads {options.roads}" if options.roads else f"the roads of {source.run.path}"
+    if not found.lines and found.areas:
+        raise ConfigError(
+            f"{given}: {count(found.areas, 'area')} and no line; exports along roads need centre lines: "
+            "name a file with --roads"
+        )
+    ground = shapely.union_all(boxes)
+    lines = _clipped(found.lines, ground)
+    if not lines:
+        raise ConfigError(f"{given}: no road lies on the tiles; check the file's CRS and the selected tiles")
+    frame = _frame(source)
+    local = [replace(line, points=np.column_stack(frame.to_local(*line.points.T))) for line in lines]
+    routes = tuple(routing.routes(local))
+    shapes = [shapely.LineString(np.column_stack(frame.to_run(*route.points.T))) for route in routes]
+    touched = tuple(_touched(routes, shapes, boxes))
+    lengths = tuple(map(float, shapely.length(shapely.intersection(shapes, ground))))
+    return Network(
+        frame, routes, touched, lengths, found.areas, found.notes, any(line.level for line in lines)
+    )
+
+
+def _read(source: Source, options: Options) -> CentreLines:
+    """Return the centre lines whose boxes touch the tiles."""
+    stage = source.run.config.chains[source.variant]["segment"]
+    if options.roads is not None:
+        layer = _given(Path(options.roads), options.roads_layer, source.crs)
+        places = {layer: union([tile.grid.bounds for tile in source.tiles])}
+        chosen = rasterise.Options()
+    else:
+        places = _of_catalog(source)
+        chosen = stage if isinstance(stage, rasterise.Options) else rasterise.Options()
+    levels = stage.read_levels if isinstance(stage, vector.Options) else None
+    parts = []
+    for (path, crs, sublayer), bounds in places.items():
+        layer_source = types.Source("roads", (path,), crs, sublayer=sublayer)
+        try:
+            parts.append(read_centre_lines(layer_source, bounds, source.crs, chosen, levels))
+        except TaskError as error:
+            raise ConfigError(str(error)) from error
+    lines = {line.points.tobytes(): line for part in parts for line in part.lines}
+    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
+    return CentreLines(tuple(lines.values()), sum(part.areas for part in parts), notes)
+
+
+Layer = tuple[Location, str | None, str | None]
+"""A vector file, the CRS that it has if it carries none, and its layer."""
+
+
+def _given(path: Path, sublayer: str | None, crs: str) -> Layer:
+    """Return the file that the user names."""
+    if not path.is_file():
+        raise ConfigError(f"--roads {path}: no such file; name a vector file of centre lines")
+    try:
+        file = opened(path, crs, sublayer)
+    except CatalogError as error:
+        raise ConfigError(str(error)) from error
+    if not file.has_crs:
+        raise ConfigError(f"--roads {path} carries no CRS; give it one with ogr2ogr -a_srs")
+    return file.path, None, sublayer
+
+
+def _of_catalog(source: Source) -> dict[Layer, Bounds]:
+    """Return the catalog's files of roads, each with the bounds of the tiles that list it."""
+    tiles: defaultdict[Layer, list[Bounds]] = defaultdict(list)
+    for tile in source.tiles:
+        for layer in tile.all_layers:
+            if layer.name == "roads":
+                for path in tile.paths(layer):
+                    tiles[path, layer.crs, layer.sublayer].append(tile.grid.bounds)
+    if not tiles:
+        raise ConfigError(
+            f"the catalog of {source.run.path} has no roads: name a file of centre lines with --roads"
+        )
+    return {layer: union(bounds) for layer, bounds in tiles.items()}
+
+
+def _clipped(lines: tuple[CentreLine, ...], ground: shapely.Geometry) -> list[CentreLine]:
+    """Return the parts of lines on and near the ground."""
+    near = shapely.buffer(ground, BEYOND_M, join_style="mitre")
+    shapely.prepare([ground, near])
+    kept = []
+    for line in lines:
+        shape = shapely.LineString(line.points)
+        if not shapely.intersects(ground, shape):
+            continue
+        if shapely.contains_properly(near, shape):
+            kept.append(line)
+            continue
+        parts = shapely.get_parts(shapely.line_merge(shapely.intersection(shape, near)))
+        parts = parts[shapely.get_type_id(parts) == 1]
+        kept += [replace(line, points=shapely.get_coordinates(part)) for part in parts]
+    return kept
+
+
+def _frame(source: Source) -> LocalFrame:
+    """Return the frame around the selected tiles, finished or not: it stays as tiles are finished."""
+    left_out = set(source.left_out)
+    selected = [tile for tile in source.run.catalog.usable if tile.id in left_out]
+    west, south, east, north = union([tile.grid.bounds for tile in (*source.tiles, *selected)])
+    return LocalFrame.around(source.crs, (west + east) / 2, (south + north) / 2)
+
+
+def _touched(
+    routes: tuple[Route, ...], shapes: list[shapely.LineString], boxes: NDArray[np.object_]
+) -> Iterator[NDArray[np.intp]]:
+    tree = shapely.STRtree(boxes)
+    for route, line in zip(routes, shapes, strict=True):
+        reach = max(part.width_m for part in route.parts) / 2 + SIDE_M
+        yield np.sort(tree.query(line, predicate="dwithin", distance=reach))

@@ -1,0 +1,219 @@
+"""Roads as OpenDRIVE 1.8: reference lines, profiles and lanes for driving simulators, beside OpenCRG.
+
+Roads are single: each begins and ends without a link, and there are no junctions. A road has its plan as
+paramPoly3, elevation and superelevation, lanes of the known width, and a reference to its OpenCRG file, which
+has the surface itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, BinaryIO
+from xml.etree import ElementTree as ET
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from flexroad.catalog.grid import Bounds
+from flexroad.catalog.text import printable
+from flexroad.tasks.levels.along_route import Structure
+from flexroad.tasks.types import Floats
+from flexroad.tools.export.along_line import Profiles
+from flexroad.tools.export.reference_line import ReferenceLine
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PPoly
+
+VERSION = 3
+NAME = ".xodr"
+MEDIA_TYPE = "application/xml"
+
+# CARLA and esmini read no <offset>: x and y are those of the projection.
+HEADER = """\
+<?xml version="1.0" encoding="UTF-8"?>
+<OpenDRIVE>
+  <header revMajor="1" revMinor="8" name={name} version="1" vendor="FlexRoad" \
+west="{west!r}" south="{south!r}" east="{east!r}" north="{north!r}">
+    <geoReference><![CDATA[{proj}]]></geoReference>
+  </header>
+"""
+FOOTER = "</OpenDRIVE>\n"
+NARROWEST_M, WIDEST_M = 2.0, 6.0
+"""Widths of lanes that roads may have (m): of roads whose number of lanes is not known, it is chosen so."""
+USUAL_M = 4.5
+"""Largest width of the lanes of a road that is divided into more of them (m)."""
+# CARLA's parser raises an error for a lane without a mark.
+NO_MARK = {"sOffset": "0.0", "type": "none", "weight": "standard", "color": "white", "laneChange": "none"}
+SAME_SLOPE = 1e-9
+"""Slopes of the width that differ by less belong to one piece."""
+
+
+@dataclass(frozen=True, eq=False)
+class Road:
+    """One road of a file."""
+
+    id: str
+    line: ReferenceLine
+    profiles: Profiles
+    crg: str | None = None
+    """Name of the OpenCRG file of the same line, relative to the OpenDRIVE file; None if it has none."""
+    structures: tuple[Structure, ...] = ()
+    """Its bridges and tunnels."""
+
+
+def encode(road: Road, left_hand: bool = False) -> bytes:
+    """Return one road as XML, for `write`; with ``left_hand`` traffic keeps left."""
+    element = _road(road, left_hand)
+    ET.indent(element, level=1)
+    text: bytes = ET.tostring(element, "utf-8")
+    return b"  " + text + b"\n"
+
+
+def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, name: str = "") -> None:
+    """Write roads, one after the other, to a file.
+
+    Parameters
+    ----------
+    file : binary file
+    roads : iterable of bytes
+        Roads with different ids, each of `encode`.
+    proj : str
+        The roads' coordinate system as a PROJ string (`tools.export.local_frame.LocalFrame.proj`).
+    bounds : tuple of float
+        West, south, east and north of the roads (m, in that system).
+    name : str
+        Name of the database.
+    """
+    west, south, east, north = map(float, bounds)
+    quoted = quoteattr(printable(name))
+    header = HEADER.format(name=quoted, proj=proj, west=west, south=south, east=east, north=north)
+    file.write(header.encode())
+    for road in roads:
+        file.write(road)
+    file.write(FOOTER.encode())
+
+
+def lane_count(line: ReferenceLine) -> int:
+    """Return the number of lanes: the known one, else two, or one if the road is one-way.
+
+    There are more if these were wider than `WIDEST_M`, and one for both directions if they were narrower than
+    `NARROWEST_M`.
+    """
+    if line.lanes:
+        return line.lanes
+    sides, width = 1 if line.oneway else 2, float(np.median(line.width))
+    if width / sides > WIDEST_M:
+        return sides * math.ceil(width / sides / USUAL_M)
+    return sides if width / sides >= NARROWEST_M else 1
+
+
+def _road(road: Road, left_hand: bool) -> ET.Element:
+    ends, lengths = road.line.pieces
+    element = ET.Element("road", _attributes(name=printable(road.line.name), length=lengths[-1], id=road.id))
+    element.set("junction", "-1")
+    element.set("rule", "LHT" if left_hand else "RHT")
+    plan = ET.SubElement(element, "planView")
+    for piece in zip(ends[:-1], ends[1:], lengths[:-1], lengths[1:], strict=True):
+        plan.append(_geometry(road.line.curve, *map(float, piece)))
+    elevation, lateral = ET.SubElement(element, "elevationProfile"), ET.SubElement(element, "lateralProfile")
+    for parent, tag, spline in (
+        (elevation, "elevation", road.profiles.elevation),
+        (lateral, "superelevation", road.profiles.superelevation),
+    ):
+        for s, (d, c, b, a) in zip(spline.x[:-1], spline.c.T, strict=True):
+            ET.SubElement(parent, tag, _attributes(s=s, a=a, b=b, c=c, d=d))
+    element.append(_lanes(road.line, left_hand))
+    if road.structures:
+        element.append(_objects(road))
+    if road.crg is not None:
+        ET.SubElement(
+            ET.SubElement(element, "surface"), "CRG", crg_reference(road.line, road.crg, lengths[-1])
+        )
+    return element
+
+
+def _objects(road: Road) -> ET.Element:
+    """Return the bridges and tunnels; the schema wants tunnels first, and a material of bridges."""
+    objects = ET.Element("objects")
+    for number, part in sorted(enumerate(road.structures, 1), key=lambda each: each[1].level > 0):
+        kind = ("bridge", "concrete") if part.level > 0 else ("tunnel", "standard")
+        places = _attributes(s=part.start, length=part.end - part.start)
+        ET.SubElement(objects, kind[0], {"id": f"{road.id}_{number}", "type": kind[1], **places})
+    return objects
+
+
+def _geometry(curve: PPoly, start: float, end: float, s: float, s_end: float) -> ET.Element:
+    """Return a piece of the plan: cubics over 0 to 1, in the axes of its own start and heading."""
+    step = end - start
+    derivatives = np.array([curve(start, order) * step**order / math.factorial(order) for order in range(4)])
+    (x, y), ahead = derivatives[0], derivatives[1]
+    heading = math.atan2(ahead[1], ahead[0])
+    along = derivatives @ (math.cos(heading), math.sin(heading))
+    left = derivatives @ (-math.sin(heading), math.cos(heading))
+    geometry = ET.Element("geometry", _attributes(s=s, x=x, y=y, hdg=heading, length=s_end - s))
+    # The curve starts at the origin of these axes, along the first one.
+    u = _attributes(aU=0.0, bU=along[1], cU=along[2], dU=along[3])
+    v = _attributes(aV=0.0, bV=0.0, cV=left[2], dV=left[3])
+    ET.SubElement(geometry, "paramPoly3", {**u, **v, "pRange": "normalized"})
+    return geometry
+
+
+def _lanes(line: ReferenceLine, left_hand: bool) -> ET.Element:
+    """Return the lanes, all of one width, with the carriageway's middle on the line.
+
+    A road of several lanes in two directions has half of them on either side. A one-way road has all lanes on
+    the side on which traffic goes along the line, and so has a road with one lane for both directions.
+    """
+    count = lane_count(line)
+    one_sided = line.oneway or count == 1
+    left = (count if left_hand else 0) if one_sided else count // 2
+    right = count - left
+    lanes = ET.Element("lanes")
+    if left != right:
+        # Lane borders are counted from the line; the offset brings the outer borders to equal distances.
+        shift = (right - left) / count / 2
+        for s, a, b in _linear(line, shift):
+            ET.SubElement(lanes, "laneOffset", _attributes(s=s, a=a, b=b, c=0.0, d=0.0))
+    section = ET.SubElement(lanes, "laneSection", _attributes(s=0.0))
+    both = {"direction": "both"} if count == 1 and not line.oneway else {}
+    sides = {"left": range(left, 0, -1), "center": range(1), "right": range(-1, -right - 1, -1)}
+    for side, numbers in sides.items():
+        group = ET.SubElement(section, side) if numbers else None
+        for number in numbers:
+            kind = {"id": str(number), "type": "driving" if number else "none", "level": "false"}
+            assert group is not None
+            lane = ET.SubElement(group, "lane", {**kind, **(both if number else {})})
+            for s, a, b in _linear(line, 1 / count) if number else ():
+                ET.SubElement(lane, "width", _attributes(sOffset=s, a=a, b=b, c=0.0, d=0.0))
+            ET.SubElement(lane, "roadMark", NO_MARK)
+    return lanes
+
+
+def _linear(line: ReferenceLine, factor: float) -> Iterator[tuple[float, float, float]]:
+    """Return s, value and slope of the linear pieces of a multiple of the width."""
+    value: Floats = factor * line.width
+    slope = np.diff(value) / np.diff(line.s)
+    begins = np.concatenate([[True], np.abs(np.diff(slope)) > SAME_SLOPE])
+    for k in np.flatnonzero(begins):
+        yield float(line.s[k]), float(value[k]), float(slope[k])
+
+
+def crg_reference(line: ReferenceLine, file: str, length: float) -> dict[str, str]:
+    """Return the attributes of a reference to OpenCRG.
+
+    In the mode genuine, readers move the start of the file's line to the road's start and turn it by the
+    road's heading there plus ``hOffset``. The file's line starts along its first chord, the road along its
+    tangent. With their difference as ``hOffset`` the file stays where it is. Its heights are absolute.
+    """
+    turned = float(line.chord_headings[0] - line.heading[0])
+    offset = math.remainder(turned, 2 * math.pi)
+    kind = {"file": file, "orientation": "same", "mode": "genuine", "purpose": "elevation"}
+    places = _attributes(sStart=0.0, sEnd=length, sOffset=0.0, tOffset=0.0, zOffset=0.0, hOffset=offset)
+    return {**kind, **places}
+
+
+def _attributes(**values: float | str) -> dict[str, str]:
+    """Return attributes of XML; numbers with all their digits."""
+    return {key: value if isinstance(value, str) else repr(float(value)) for key, value in values.items()}

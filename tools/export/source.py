@@ -1,0 +1,257 @@
+"""What an export is made of: the finished tiles of a run, with their surfaces and meshes, and its options."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from flexroad.catalog import Bounds, Tile
+from flexroad.catalog.area import Area
+from flexroad.catalog.guard.source_files import source_stat
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.storage.paths import Location
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS, option
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run.finished import (
+    COMPUTED_AGAIN,
+    FileStates,
+    FinishedTile,
+    RunPlace,
+    Snapshot,
+    snapshots,
+)
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import Track, untracked
+from flexroad.pipeline.worker.evaluator import SourceChanged
+from flexroad.pipeline.worker.texture import tile_texture
+from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.metrics.mesh_distance import FIGURES
+from flexroad.tasks.products.glb import Texture
+from flexroad.tools.export.aerial import Aerial
+from flexroad.tools.export.ellipsoidal import Datum
+from flexroad.tools.export.georeference import Georeference
+
+Image = lazy("PIL.Image")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of an export."""
+
+    datum: Datum | None = None
+    """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
+    compress: bool = option(False, OUTPUTS, "Compress LandXML.", name="gzip")
+    """Whether text formats of the complete run are compressed with gzip."""
+    resolution_m: float | None = option(
+        None, OUTPUTS, "Cell size of mosaic; default: that of the run.", "METRES", min=0.01
+    )
+    """Cell size of rasters over the run (m)."""
+    level: int | None = option(
+        None, OUTPUTS, "Level of mosaic: 0 is the ground, also below decks; default: the highest.", "N"
+    )
+    """Level of roads above roads."""
+    drape: bool = option(False, OUTPUTS, "Put the orthophoto on the meshes of 3dtiles and obj.")
+    """Also if the meshes of the run have none."""
+    roads: str | None = option(
+        None,
+        INPUTS,
+        "Centre lines for crg, xodr and lines; default: the roads of the run's catalog.",
+        "FILE",
+    )
+    roads_layer: str | None = option(None, INPUTS, "Layer of --roads, if it has several.", "NAME")
+    left_hand: bool = option(False, INPUTS, "Traffic keeps left, for xodr.")
+    formats: frozenset[str] = frozenset()
+    """Names of the formats that are written together: some refer to files of other formats."""
+
+
+@dataclass(frozen=True, eq=False)
+class TileItem:
+    """A finished tile whose files are made of more than its mesh, such as its photo; sent to a worker."""
+
+    tile: FinishedTile
+    fingerprint: str
+    """Name of its files by what they are made of."""
+
+    @property
+    def id(self) -> str:
+        """Id of the tile."""
+        return self.tile.id
+
+    @property
+    def label(self) -> str:
+        """Its name in messages."""
+        return self.tile.label
+
+
+def layer_state(tile: Tile, name: str) -> str:
+    """Return the files of a tile's layer with their sizes and versions; empty if the tile has none."""
+    layer = tile.layer(name)
+    reaching = layer.reaching(tile.grid.bounds) if layer else None
+    return str([(str(path), source_stat(path)) for path in tile.paths(reaching)]) if reaching else ""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """The finished tiles of a run that an export contains."""
+
+    run: Run
+    variant: str
+    tiles: tuple[Tile, ...]
+    """In the order of the catalog."""
+    left_out: tuple[str, ...]
+    """Ids of selected tiles that are not finished."""
+    snapshots: tuple[Snapshot, ...]
+    """Each tile as it was when the tiles were selected."""
+
+    @property
+    def crs(self) -> str:
+        """The horizontal CRS of all tiles."""
+        return self.tiles[0].grid.crs
+
+    @cached_property
+    def vertical(self) -> str | None:
+        """The vertical CRS of the heights, by the files of the first tile; None if it is not known."""
+        return vertical_crs(self.tiles[0])
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """Whole-metre easting and northing that meshes of the run are relative to."""
+        return self.run.origin
+
+    @property
+    def mesh_distances(self) -> dict[str, float]:
+        """The largest distances of the meshes from their surfaces (m), by column of metrics.parquet."""
+        known = np.fmax.reduce([snapshot.distances for snapshot in self.snapshots])
+        return {
+            name: value for name, value in zip(FIGURES, known.tolist(), strict=True) if np.isfinite(value)
+        }
+
+    @property
+    def place(self) -> Georeference:
+        """What local coordinates of files are relative to: the run's origin, at the height 0."""
+        return Georeference(self.crs, (*self.origin, 0.0), self.vertical)
+
+    def finished(self) -> Iterator[FinishedTile]:
+        """Yield the tiles one by one, as they were when they were selected.
+
+        Only sizes and times of their files are compared, so that each format can have a pass of its own.
+
+        Raises
+        ------
+        ConfigError
+            If a tile is no longer finished, as its sources have changed in the meantime, or has a new result.
+        """
+        files, place = FileStates(self.run), RunPlace.of(self.run)
+        for tile, before in zip(self.tiles, self.snapshots, strict=True):
+            current = before if files(tile) == before.files else self._checked(tile, before)
+            yield FinishedTile(tile, self.variant, current, place)
+
+    def _checked(self, tile: Tile, before: Snapshot) -> Snapshot:
+        """Return the snapshot of a tile of which a file has another size or time than before."""
+        ((_, current),) = snapshots(self.run, [tile], self.variant)
+        if current is None:
+            raise ConfigError(
+                f"{self.run.path}: tile {tile.id} is no longer finished; "
+                f"run `flexroad rerun {self.run.path}`, then export again"
+            )
+        if current.fingerprint != before.fingerprint:
+            raise ConfigError(f"tile {tile.id}: {COMPUTED_AGAIN}")
+        return current
+
+
+def select(
+    location: Location,
+    ids: Sequence[str] = (),
+    bbox: Bounds | None = None,
+    variant: str | None = None,
+    allow: Sequence[str] = (),
+    area: Area | None = None,
+    track: Track = untracked,
+) -> Source:
+    """Return the finished tiles of a run, of all or of the selected tiles.
+
+    The state of each selected tile is checked here, once for all formats.
+
+    Parameters
+    ----------
+    track : callable
+        Shows the progress of that.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is no run, the variant has no meshes in the store, no selected tile is finished, or
+        tiles have different CRSs.
+    CatalogError
+        If an id is not in the run, or no tile touches the box or the area.
+    """
+    run = Run.open(location, allow)
+    variants = run.config.export.variants
+    variant = variant or variants[0]
+    if variant not in variants:
+        raise ConfigError(f"{location} exports no variant {variant!r}; it has {', '.join(variants)}")
+    wanted = run.catalog.select(ids, bbox, area).tiles
+    checked = track(snapshots(run, wanted, variant), "checking tiles", len(wanted))
+    done = {tile.id: snapshot for tile, snapshot in checked if snapshot}
+    tiles = tuple(tile for tile in wanted if tile.id in done)
+    if not tiles:
+        raise ConfigError(f"{location} has no finished tile to export; see `flexroad status {location}`")
+    systems = {tile.grid.crs for tile in tiles}
+    if len(systems) > 1:
+        raise ConfigError(f"{location} has tiles in {len(systems)} CRSs; select tiles of one with --bbox")
+    left_out = tuple(tile.id for tile in wanted if tile.id not in done)
+    return Source(run, variant, tiles, left_out, tuple(done[tile.id] for tile in tiles))
+
+
+def check_photos(tiles: Iterable[Tile]) -> None:
+    """Check that one tile at least has an orthophoto.
+
+    Raises
+    ------
+    ConfigError
+        If none has.
+    """
+    if all(tile.layer("dop") is None for tile in tiles):
+        raise ConfigError(
+            "--drape needs an orthophoto (layer dop), and no exported tile has one; leave out --drape"
+        )
+
+
+def photographed(tile: FinishedTile) -> TileItem:
+    """Return a finished tile whose files have its photo."""
+    return TileItem(tile, f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}")
+
+
+def texture_of(tile: FinishedTile) -> Texture | None:
+    """Return the photo of a tile, None if it has none; also if the products of its run have none.
+
+    Raises
+    ------
+    ConfigError
+        If a file of the photo changes while it is read.
+    TaskError
+        If a file of the photo is missing, broken, or not one of a photo.
+    """
+    pattern = tile.place.pattern
+    with_photo = replace(pattern, export=pattern.export.model_copy(update={"texture": True}))
+    try:
+        return tile_texture(with_photo.graph(tile.tile, tile.place.checksum))[0]
+    except SourceChanged as error:
+        raise ConfigError(f"{error.file} {error}") from error
+
+
+def aerial_of(texture: Texture, pixel_m: float) -> Aerial:
+    """Return a texture as pixels: means of its own, of which at least two fit into ``pixel_m`` (m)."""
+    west, south, east, north = texture.bounds
+    image = Image.open(io.BytesIO(texture.jpeg))
+    dx, dy = (east - west) / image.width, (north - south) / image.height
+    # Large photos would take a gigabyte as numbers.
+    factor = max(1, int(pixel_m / max(dx, dy) / 2))
+    colour = np.asarray(image.reduce(factor), np.float64)
+    rows, columns = colour.shape[:2]
+    bounds = west, north - rows * factor * dy, west + columns * factor * dx, north
+    return Aerial(bounds, colour, np.ones((rows, columns)))

@@ -1,0 +1,242 @@
+"""The surface of a tile as STEP file (ISO 10303-21, AP214) with one B-spline surface, for CAD programs.
+
+The file has the surface itself and no triangles: an open shell of one face, bounded by its four border
+curves, in metres. It is cut to the given bounds by knot insertion, which is exact. With equal weights the
+surface is a polynomial spline of its own degree; else it is rational (`tasks.spline.surface.exact`).
+Coordinates are relative to a whole-metre origin in plan that all tiles of a run share; z is the height.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+
+import numpy as np
+
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.spline.surface import ExactNurbs, NurbsSurface
+from flexroad.tasks.types import Floats
+from flexroad.tools.export.cut import patch
+from flexroad.tools.export.georeference import Georeference
+
+VERSION = 3
+NAME = ".stp"
+NAME_SIDECAR = "_stp.json"
+MEDIA_TYPE = "model/step"
+
+AXES = "x east, y north, relative to origin; z height; metres"
+LONGEST = 250
+"""Longest text of an entry of the head, of which the standard allows 256 characters."""
+
+FILE = """\
+ISO-10303-21;
+HEADER;
+FILE_DESCRIPTION({description},'2;1');
+FILE_NAME({name},'{written:%Y-%m-%dT%H:%M:%S}',(''),(''),'FlexRoad','FlexRoad','');
+FILE_SCHEMA(('AUTOMOTIVE_DESIGN {{ 1 0 10303 214 1 1 1 1 }}'));
+ENDSEC;
+DATA;
+{data}ENDSEC;
+END-ISO-10303-21;
+"""
+
+Knots = tuple[Sequence[int], Sequence[float]]
+"""Multiplicities and values of the different knots."""
+
+
+def encode(surface: NurbsSurface, bounds: Bounds, name: str, written: datetime, place: Georeference) -> bytes:
+    """Return the part of a surface within bounds as STEP file.
+
+    Coordinates have all digits of their float64 numbers. Equal inputs give equal bytes.
+
+    Parameters
+    ----------
+    surface : NurbsSurface
+        The surface of a tile.
+    bounds : tuple of float
+        West, south, east and north of the part, as the tile's core (m). The part ends with the surface's
+        domain where that is smaller.
+    name : str
+        Name of the product, as the tile id.
+    written : datetime
+        Date and time of the file, which the format requires.
+    place : Georeference
+        What coordinates are relative to; its height is 0.
+
+    Raises
+    ------
+    TaskError
+        If the bounds and the surface's domain do not overlap.
+    """
+    nurbs, rational = patch(surface, bounds, place.origin[:2])
+    lines = [f"FlexRoad surface {name}", f"axes {AXES}", *place.lines()]
+    cut = [line[k : k + LONGEST] for line in lines for k in range(0, len(line), LONGEST)]
+    content = FILE.format(
+        description=_list(map(_text, cut)),
+        name=_text(name),
+        written=written,
+        data=_Data(rational).shape(nurbs, name),
+    )
+    return content.encode("ascii")
+
+
+@dataclass
+class _Data:
+    """The entities of a file, numbered in the order in which they are added."""
+
+    rational: bool
+    entities: list[str] = field(default_factory=list)
+
+    def add(self, entity: str) -> str:
+        """Add an entity; return its reference."""
+        self.entities.append(entity)
+        return f"#{len(self.entities)}"
+
+    def shape(self, nurbs: ExactNurbs, name: str) -> str:
+        """Return all entities of a product whose shape is a face on a surface."""
+        add = self.add
+        definition, context = self.product(name), self.units()
+        place = add("CARTESIAN_POINT('',(0.,0.,0.))")
+        up, east = add("DIRECTION('',(0.,0.,1.))"), add("DIRECTION('',(1.,0.,0.))")
+        axes = add(f"AXIS2_PLACEMENT_3D('',{place},{up},{east})")
+        face = self.face(nurbs)
+        shell = add(f"OPEN_SHELL('',({face}))")
+        model = add(f"SHELL_BASED_SURFACE_MODEL({_text(name)},({shell}))")
+        shape = add(f"MANIFOLD_SURFACE_SHAPE_REPRESENTATION({_text(name)},({axes},{model}),{context})")
+        add(f"SHAPE_DEFINITION_REPRESENTATION({definition},{shape})")
+        return "".join(f"#{number}={entity};\n" for number, entity in enumerate(self.entities, 1))
+
+    def product(self, name: str) -> str:
+        """Add a product; return the definition of its shape."""
+        add, label = self.add, _text(name)
+        application = add("APPLICATION_CONTEXT('automotive design')")
+        year = f"'automotive_design',2000,{application}"
+        add(f"APPLICATION_PROTOCOL_DEFINITION('international standard',{year})")
+        context = add(f"PRODUCT_CONTEXT('',{application},'mechanical')")
+        product = add(f"PRODUCT({label},{label},'',({context}))")
+        add(f"PRODUCT_RELATED_PRODUCT_CATEGORY('part',$,({product}))")
+        formation = add(f"PRODUCT_DEFINITION_FORMATION('','',{product})")
+        stage = add(f"PRODUCT_DEFINITION_CONTEXT('part definition',{application},'design')")
+        definition = add(f"PRODUCT_DEFINITION('design','',{formation},{stage})")
+        return add(f"PRODUCT_DEFINITION_SHAPE('','',{definition})")
+
+    def units(self) -> str:
+        """Add metres and radians; return the context of coordinates."""
+        add = self.add
+        metre = add("(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT($,.METRE.))")
+        radian = add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
+        steradian = add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())")
+        accuracy = add(
+            f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-6),{metre},'distance_accuracy_value','')"
+        )
+        return add(
+            f"(GEOMETRIC_REPRESENTATION_CONTEXT(3)GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT(({accuracy}))"
+            f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({metre},{radian},{steradian}))REPRESENTATION_CONTEXT('',''))"
+        )
+
+    def face(self, nurbs: ExactNurbs) -> str:
+        """Add a surface with its four borders; return the face.
+
+        The borders run from west to east and from south to north; the loop is counter-clockwise from above,
+        so that it follows the northern and the western border backwards.
+        """
+        add, (p, q) = self.add, nurbs.degree
+        knots_u, knots_v = _distinct(nurbs.knots_u), _distinct(nurbs.knots_v)
+        weights = nurbs.points[..., 3]
+        points = [[self.point(point) for point in row] for row in nurbs.points]
+        vertices = {
+            (row, col): add(f"VERTEX_POINT('',{points[row][col]})") for row in (0, -1) for col in (0, -1)
+        }
+        south, north = (
+            self.edge(vertices[row, 0], vertices[row, -1], p, knots_u, points[row], weights[row])
+            for row in (0, -1)
+        )
+        west, east = (
+            self.edge(
+                vertices[0, col], vertices[-1, col], q, knots_v, [row[col] for row in points], weights[:, col]
+            )
+            for col in (0, -1)
+        )
+        turns = ((south, ".T."), (east, ".T."), (north, ".F."), (west, ".F."))
+        edges = [add(f"ORIENTED_EDGE('',*,*,{edge},{along})") for edge, along in turns]
+        loop = add(f"EDGE_LOOP('',{_list(edges)})")
+        bound = add(f"FACE_OUTER_BOUND('',{loop},.T.)")
+        surface = self.surface((p, q), knots_u, knots_v, points, weights)
+        return add(f"ADVANCED_FACE('',({bound}),{surface},.T.)")
+
+    def point(self, point: Floats) -> str:
+        """Add a control point."""
+        return self.add(f"CARTESIAN_POINT('',{_reals(point[:3].tolist())})")
+
+    def edge(
+        self, start: str, end: str, degree: int, knots: Knots, points: Sequence[str], weights: Floats
+    ) -> str:
+        """Add a border of the surface."""
+        shape, form = f"{degree},{_list(points)},.UNSPECIFIED.,.F.,.F.", _knots(knots)
+        if self.rational:
+            curve = self.add(
+                f"(BOUNDED_CURVE()B_SPLINE_CURVE({shape})B_SPLINE_CURVE_WITH_KNOTS({form})CURVE()"
+                f"GEOMETRIC_REPRESENTATION_ITEM()RATIONAL_B_SPLINE_CURVE({_reals(weights.tolist())})"
+                "REPRESENTATION_ITEM(''))"
+            )
+        else:
+            curve = self.add(f"B_SPLINE_CURVE_WITH_KNOTS('',{shape},{form})")
+        return self.add(f"EDGE_CURVE('',{start},{end},{curve},.T.)")
+
+    def surface(
+        self,
+        degree: tuple[int, int],
+        knots_u: Knots,
+        knots_v: Knots,
+        points: Sequence[Sequence[str]],
+        weights: Floats,
+    ) -> str:
+        """Add the surface; its first index is along u, that of the arrays along v."""
+        columns = _list(_list(column) for column in zip(*points, strict=True))
+        shape = f"{degree[0]},{degree[1]},{columns},.UNSPECIFIED.,.F.,.F.,.F."
+        form = _knots(knots_u, knots_v)
+        if self.rational:
+            return self.add(
+                f"(BOUNDED_SURFACE()B_SPLINE_SURFACE({shape})B_SPLINE_SURFACE_WITH_KNOTS({form})"
+                f"GEOMETRIC_REPRESENTATION_ITEM()"
+                f"RATIONAL_B_SPLINE_SURFACE({_list(_reals(column) for column in weights.T.tolist())})"
+                "REPRESENTATION_ITEM('')SURFACE())"
+            )
+        return self.add(f"B_SPLINE_SURFACE_WITH_KNOTS('',{shape},{form})")
+
+
+def _distinct(knots: Floats) -> Knots:
+    values, counts = np.unique(knots, return_counts=True)
+    return counts.tolist(), values.tolist()
+
+
+def _knots(*knots: Knots) -> str:
+    """Return the arguments of a spline from its multiplicities on, for one or two parameters."""
+    multiplicities = [_list(map(str, counts)) for counts, _ in knots]
+    return ",".join([*multiplicities, *(_reals(values) for _, values in knots), ".UNSPECIFIED."])
+
+
+def _list(items: Iterable[str]) -> str:
+    return f"({','.join(items)})"
+
+
+def _reals(values: Iterable[float]) -> str:
+    return _list(map(_real, values))
+
+
+def _real(value: float) -> str:
+    """Return a number as the standard wants it: with a point, and a large E."""
+    mantissa, mark, exponent = repr(float(value)).partition("e")
+    return mantissa + ("" if "." in mantissa else ".") + mark.upper() + exponent
+
+
+def _text(text: str) -> str:
+    r"""Return a string of the standard: quotes and backslashes doubled, other characters as ``\X4\``."""
+    return "'" + "".join(map(_character, text)) + "'"
+
+
+def _character(character: str) -> str:
+    if character in "'\\":
+        return 2 * character
+    return character if " " <= character <= "~" else f"\\X4\\{ord(character):08X}\\X0\\"

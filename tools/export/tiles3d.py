@@ -1,0 +1,207 @@
+"""3D Tiles 1.1: tilesets over the GLB files of a run, which stay as they are, and over coarse meshes.
+
+Meshes have coordinates of a map projection, and 3D Tiles those from the Earth's centre. One affine transform
+per tile converts them: it is fitted to points of the tile's box. A rigid one would ignore the scale of the
+projection, 0.04% in the middle of a UTM zone: 79 mm at the corners of a tile of 250 m.
+
+Coarse meshes are too large for that, as the Earth is curved. All their points are converted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.types import Floats
+from flexroad.tools.export.ellipsoidal import Ellipsoidal, geocentric
+
+VERSION = 3
+NAME = ".json"
+MEDIA_TYPE = "application/json"
+ASSET = {"version": "1.1", "generator": "FlexRoad"}
+MARGIN_M = 1.0
+"""Height added below and above a tile's box (m): bounding volumes must contain all vertices."""
+EDGE_M = 0.1
+"""Length added around a region (m): for residuals of transforms, float32, and edges that are no meridians."""
+RADIUS_M = 6_378_137.0
+"""Of the Earth (m), for lengths of angles."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A tile's mesh on the Earth."""
+
+    uri: str
+    """Path of the GLB, relative to the tileset."""
+    transform: tuple[float, ...]
+    """Affine matrix, 4 x 4 by columns, from the run's coordinates (east, north, up from its origin) to those
+    from the Earth's centre (m)."""
+    region: tuple[float, ...]
+    """West, south, east, north (radians), lowest and highest height above the ellipsoid (m)."""
+    residual_m: float
+    """Largest distance of the transform from the exact conversion at the fitted points (m)."""
+
+
+def placed(
+    uri: str,
+    bounds: Bounds,
+    heights: tuple[float, float],
+    origin: tuple[float, float],
+    conversion: Ellipsoidal,
+) -> Placed:
+    """Return where a tile's mesh is on the Earth.
+
+    Parameters
+    ----------
+    uri : str
+        Path of the GLB, relative to the tileset.
+    bounds : tuple of float
+        West, south, east and north of the tile (m).
+    heights : tuple of float
+        Lowest and highest height of the mesh (m).
+    origin : tuple of float
+        Easting and northing of the run's origin (m), which the coordinates of its GLB files are relative to.
+    conversion : Ellipsoidal
+        From the CRS and the heights of the run to WGS 84.
+    """
+    west, south, east, north = bounds
+    low, high = heights[0] - MARGIN_M, heights[1] + MARGIN_M
+    axes = np.meshgrid(np.linspace(west, east, 5), np.linspace(south, north, 5), [low, high])
+    points = np.stack([axis.ravel() for axis in axes], axis=1)
+    longitude, latitude, height = conversion.geographic(*points.T)
+    exact = geocentric(longitude, latitude, height)
+    local = points - (*origin, 0.0)
+    # Centred, so that the squares of large coordinates do not cost digits.
+    middle, centre = local.mean(axis=0), exact.mean(axis=0)
+    linear = np.linalg.lstsq(local - middle, exact - centre, rcond=None)[0].T
+    shift = centre - linear @ middle
+    residual = np.linalg.norm(local @ linear.T + shift - exact, axis=1).max()
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, shift
+    return Placed(uri, _columns(matrix), _region(longitude, latitude, height), float(residual))
+
+
+def sheet_placed(uri: str, points: Floats, conversion: Ellipsoidal) -> tuple[Placed, Floats]:
+    """Return where a mesh is whose points are all converted, and its points in the frame of its tile.
+
+    Parameters
+    ----------
+    uri : str
+        Path of the GLB, relative to the tileset.
+    points : ndarray, (V, 3)
+        Easting, northing and height (m).
+    conversion : Ellipsoidal
+        From the CRS and the heights of the run to WGS 84.
+
+    Returns
+    -------
+    Placed
+        Its transform is from east, north and up at the middle of the points, and has no error.
+    ndarray, (V, 3)
+        The points in that frame (m): small numbers, which float32 holds to 0.2 mm at 4 km.
+    """
+    longitude, latitude, height = conversion.geographic(*points.T)
+    middle = [float(axis.min() + axis.max()) / 2 for axis in (longitude, latitude, height)]
+    matrix = east_north_up(*middle)
+    local = (geocentric(longitude, latitude, height) - matrix[:3, 3]) @ matrix[:3, :3]
+    return Placed(uri, _columns(matrix), _region(longitude, latitude, height), 0.0), local
+
+
+def east_north_up(longitude: float, latitude: float, height: float) -> Floats:
+    """Return the matrix, ``(4, 4)``, from east, north and up at a place to those from the Earth's centre.
+
+    Longitude and latitude are in degrees, the height above the ellipsoid in metres.
+    """
+    lam, phi = np.radians([longitude, latitude])
+    matrix = np.eye(4)
+    matrix[:3, 0] = -np.sin(lam), np.cos(lam), 0.0
+    matrix[:3, 2] = np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)
+    matrix[:3, 1] = np.cross(matrix[:3, 2], matrix[:3, 0])
+    matrix[:3, 3] = geocentric(*(np.array([value]) for value in (longitude, latitude, height)))[0]
+    return matrix
+
+
+def tile(
+    content: Placed,
+    error_m: float,
+    parent: Placed | None = None,
+    children: Sequence[dict[str, Any]] = (),
+    **extras: Any,
+) -> dict[str, Any]:
+    """Return the entry of a tile.
+
+    Parameters
+    ----------
+    content : Placed
+        Its mesh.
+    error_m : float
+        Error of showing it instead of the finest tiles (m).
+    parent : Placed, optional
+        The mesh of the tile of which it is a child: the transform of a tile applies to its children, too.
+    children : sequence of dict
+        The entries of tiles that replace it.
+    extras
+        What else is known of the tile.
+    """
+    matrix = np.reshape(content.transform, (4, 4)).T
+    if parent:
+        outer = np.reshape(parent.transform, (4, 4)).T
+        matrix[:3, 3] -= outer[:3, 3]
+        # The outer frame is rigid.
+        matrix[:3] = outer[:3, :3].T @ matrix[:3]
+    regions = [content.region, *(child["boundingVolume"]["region"] for child in children)]
+    entry = {
+        "boundingVolume": {"region": around(regions)},
+        "geometricError": error_m,
+        "transform": _columns(matrix),
+        "content": {"uri": content.uri},
+    }
+    if children:
+        entry |= {"refine": "REPLACE", "children": list(children)}
+    return entry | ({"extras": extras} if extras else {})
+
+
+def around(regions: Sequence[Sequence[float]]) -> list[float]:
+    """Return the smallest region that contains others, at least one."""
+    edges = np.array(regions)
+    low, high = edges.min(axis=0), edges.max(axis=0)
+    return [float(edge) for edge in (low[0], low[1], high[2], high[3], low[4], high[5])]
+
+
+def tileset(root: dict[str, Any], error_m: float, **extras: Any) -> dict[str, Any]:
+    """Return a tileset of a tile; ``error_m`` is the error of showing nothing instead (m)."""
+    asset = ASSET | ({"extras": extras} if extras else {})
+    return {"asset": asset, "geometricError": error_m, "root": root}
+
+
+def group(children: Sequence[dict[str, Any]], error_m: float) -> dict[str, Any]:
+    """Return a tile without a mesh; ``error_m`` is the error of showing none of its children (m)."""
+    region = around([child["boundingVolume"]["region"] for child in children])
+    return {
+        "boundingVolume": {"region": region},
+        "geometricError": error_m,
+        "refine": "ADD",
+        "children": list(children),
+    }
+
+
+def extent_m(region: Sequence[float]) -> float:
+    """Return the length of the diagonal of a region in plan (m)."""
+    west, south, east, north = region[:4]
+    return RADIUS_M * float(np.hypot((east - west) * np.cos((south + north) / 2), north - south))
+
+
+def _columns(matrix: Floats) -> tuple[float, ...]:
+    return tuple(matrix.T.ravel().tolist())
+
+
+def _region(longitude: Floats, latitude: Floats, height: Floats) -> tuple[float, ...]:
+    """Return the region around places on the Earth, with `EDGE_M` on all sides."""
+    low, high = np.radians([longitude.min(), latitude.min()]), np.radians([longitude.max(), latitude.max()])
+    margin = EDGE_M / RADIUS_M / np.array([np.cos(high[1]), 1.0])
+    heights = float(height.min()) - EDGE_M, float(height.max()) + EDGE_M
+    return (*(low - margin).tolist(), *(high + margin).tolist(), *heights)

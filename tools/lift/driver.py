@@ -1,0 +1,450 @@
+"""Files of other programs with heights of a run: road networks, lines, polygons and points."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from flexroad.catalog import Bounds
+from flexroad.catalog.crs import in_plan, short
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.guard.refused import Refused, head
+from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.storage.outputs import made_folder, output_file
+from flexroad.catalog.storage.paths import write
+from flexroad.catalog.storage.scratch import ScratchFolder
+from flexroad.catalog.text import count, no_formula
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run.finished import passing
+from flexroad.pipeline.run.points import Ground
+from flexroad.pipeline.run.tile_steps import length_text
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.quality.flagged import flag_names
+from flexroad.tasks.types import Floats
+from flexroad.tools.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text
+from flexroad.tools.lift.types import Frame, Heights, Lifted, Options
+from flexroad.tools.results.query import required_crs
+from flexroad.tools.results.query_files import to_crs
+
+if TYPE_CHECKING:
+    import geopandas
+else:
+    geopandas = lazy("geopandas")
+
+XML_FORMATS: dict[str, ModuleType] = {"OpenDRIVE": opendrive, "net": sumo, "osm": osm}
+"""Formats by the name of the outermost element."""
+VECTORS: tuple[ModuleType, ...] = (geopackage, geojson, flatgeobuf, shapefile)
+"""Formats of features; each has its ``SUFFIXES``, and ``begins`` tells it by the first bytes of a file."""
+KINDS = (
+    "OpenDRIVE (.xodr), a network of SUMO (.net.xml), OSM (.osm), a GeoPackage, GeoJSON, FlatGeobuf or "
+    "Shapefile"
+)
+PACKED = {
+    b"BZh": "is compressed with bzip2; unpack it: bunzip2 --keep {file}",
+    b"OSMHeader": "is OSM's PBF; convert it: osmium cat {file} -o streets.osm",
+}
+"""What to do with files that are not read, by their first bytes."""
+DISTANCES = {"elevation_m": "", "superelevation_m": " with superelevation"}
+"""Distances from the surface in the summary, and what they are with."""
+NEAR_M = 5.0
+"""Distance up to which consecutive points are of one line (m); lines have a height every metre or less."""
+PLACES = ".gpkg"
+"""Places above limits are in a file beside the report, of the same name with this suffix."""
+
+
+@dataclass(frozen=True)
+class LiftedFile:
+    """What became of a file."""
+
+    rows: tuple[Lifted, ...]
+    files: tuple[Path, ...]
+    """The files written."""
+    earlier: int
+    """Number of tiles whose heights are of earlier sources or options."""
+    noun: str
+    """What a row is."""
+    options: Options
+    tile_step_m: float = 0.0
+    """Largest step between tiles of the run below it."""
+
+    @property
+    def summary(self) -> str:
+        """One line: what has heights, and what has not."""
+        parts = [f"{count(len(self.rows), self.noun)}, {_length(self.rows, 'length_m')}"]
+        if any(row.without_ground_m > 0 for row in self.rows):
+            kept = "go on level" if self.options.flat_ends else "keep their heights"
+            parts.append(f"{_length(self.rows, 'without_ground_m')} beyond the tiles {kept}")
+        if any(row.unknown_deck_m > 0 for row in self.rows):
+            parts.append(f"{_length(self.rows, 'unknown_deck_m')} on decks or in tunnels of unknown height")
+        figures = [
+            f"{length_text(max(values))}{words}"
+            for name, words in DISTANCES.items()
+            if (values := [value for row in self.rows if np.isfinite(value := getattr(row, name))])
+        ]
+        if figures:
+            parts.append(f"at most {', '.join(figures)} from the surface")
+        return "; ".join(parts)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines for the user: what has no heights of the run, and why."""
+        without = [row for row in self.rows if row.without_ground_m > 0 or row.points_without_ground]
+        unknown = [row for row in self.rows if row.unknown_deck_m > 0]
+        notes = []
+        if without:
+            length = sum(row.without_ground_m for row in without)
+            points = sum(row.points_without_ground for row in without)
+            parts = [f"{length:.1f} m"] if length else []
+            parts += [count(points, "point")] if points else []
+            kept = "go on level there" if self.options.flat_ends else "keep their heights"
+            notes.append(
+                f"{' and '.join(parts)} of {count(len(without), self.noun)} lie beyond the finished tiles "
+                f"and {kept} ({_first(without)})"
+            )
+        if flagged := {row.id: ", ".join(flag_names(row.flags)) for row in self.rows if row.flags}:
+            notes.append(passing(flagged, self.noun))
+        for note, rows in self._by_note.items():
+            notes.append(f"{count(len(rows), self.noun)}: {note} ({_first(rows)})")
+        if unknown:
+            length = sum(row.unknown_deck_m for row in unknown)
+            notes.append(
+                f"{length:.1f} m of {count(len(unknown), self.noun)} are on a deck of unknown height "
+                f"({_first(unknown)}); a run with segment.levels=true has its level"
+            )
+        if self.options.crossfall_limit is not None and not any(
+            np.isfinite(row.crossfall) for row in self.rows
+        ):
+            notes.append(
+                "--crossfall-limit: crossfalls are not known for this format; only grades are listed"
+            )
+        return tuple(notes)
+
+    @property
+    def _by_note(self) -> dict[str, list[Lifted]]:
+        """The rows by what is noted of them."""
+        found = dict[str, list[Lifted]]()
+        for row in self.rows:
+            if row.note:
+                found.setdefault(row.note, []).append(row)
+        return found
+
+
+def _first(rows: Sequence[Lifted]) -> str:
+    return f"{rows[0].id}{' and others' if len(rows) > 1 else ''}"
+
+
+def _length(rows: Sequence[Lifted], name: str) -> str:
+    """Return the sum of lengths of rows, as a text."""
+    metres = float(np.nansum([getattr(row, name) for row in rows]))
+    return f"{metres:.0f} m" if metres < 100 else f"{metres / 1000:.1f} km"
+
+
+def lift(
+    ground: Ground,
+    source: Path,
+    out: Path,
+    options: Options,
+    crs: str | None = None,
+    offset: tuple[float, float] | None = None,
+    report: Path | None = None,
+) -> LiftedFile:
+    """Write a file with the heights of a run.
+
+    Parameters
+    ----------
+    ground : Ground
+        The run.
+    source, out : Path
+        The file, and where its copy is written: both are complete files of the same format.
+    options : Options
+    crs, offset
+        CRS of the file, and what is added to its coordinates (m), if the file does not say them.
+    report : Path, optional
+        A CSV with a row per road or feature; places above limits are in a GeoPackage beside it.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is of an unknown format, has no CRS, or does not lie on the run's tiles.
+    OSError
+        If an output cannot be written.
+    """
+    _require_outputs(source, out, report)
+    with _explained(source):
+        module = _format(source)
+        _require_suffix(module, source, out)
+        named = module.frame(source)
+        place = replace(named, crs=crs or named.crs)
+        if offset is not None:
+            place = Frame(place.crs, *offset)
+        if place.crs is None:
+            raise TaskError("carries no CRS; give it with --crs, such as --crs EPSG:25832")
+        in_run = _InRun(
+            ground, _plan(place.crs), place, required_crs(ground), module.STEPS, crs is not None, _Seen()
+        )
+        with made_folder(out.absolute().parent), ScratchFolder(out.absolute().parent) as scratch:
+            with _named(out, Path(scratch)):
+                rows = tuple(module.lift(source, Path(scratch, out.name), in_run, options))
+            in_run.require_heights()
+            files = _move(Path(scratch), out)
+            _remove_parts(out, files)
+    if report is not None:
+        files += _write_report(rows, report, in_run)
+    seen = in_run.seen
+    return LiftedFile(rows, files, len(seen.earlier), module.NOUN, options, seen.tile_step_m)
+
+
+@dataclass(eq=False)
+class _Seen:
+    """What has been looked up in a run for a file."""
+
+    known: int = 0
+    """Number of points with a height."""
+    bounds: Floats = field(default_factory=lambda: np.array([np.inf, np.inf, -np.inf, -np.inf]))
+    """Of all points, in the CRS of the run."""
+    earlier: set[str] = field(default_factory=set)
+    tile_step_m: float = 0.0
+    """Largest step between tiles on its lines."""
+
+
+@dataclass(frozen=True, eq=False)
+class _InRun:
+    """The surface of a run at coordinates of a file (`RunSurface`)."""
+
+    ground: Ground
+    crs: str
+    place: Frame
+    run_crs: str
+    steps: bool
+    given: bool
+    """Whether the user gave the CRS."""
+    seen: _Seen
+
+    def in_crs(self, crs: str | None, layer: str) -> _InRun:
+        """Return the surface for a layer with its own CRS; a CRS that the user gave goes first."""
+        if self.given:
+            return self
+        if crs is None:
+            raise TaskError(
+                f"has the layer {layer} without a CRS; give it with --crs, such as --crs EPSG:25832"
+            )
+        return replace(self, crs=_plan(crs))
+
+    @cached_property
+    def bounds(self) -> Bounds:
+        """West, south, east and north of the tiles of the run (m, in its CRS)."""
+        tiles = np.array([tile.grid.bounds for tile in self.ground.run.catalog.usable])
+        west, south = tiles[:, :2].min(axis=0).tolist()
+        east, north = tiles[:, 2:].max(axis=0).tolist()
+        return west, south, east, north
+
+    def to_run(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Return easting and northing (m) in the CRS of the run."""
+        place, x, y = self.place, np.asarray(x), np.asarray(y)
+        ahead, left = math.cos(place.turn), math.sin(place.turn)
+        with np.errstate(invalid="ignore"):
+            east, north = x * ahead - y * left + place.x, x * left + y * ahead + place.y
+        return to_crs(east, north, self.crs, self.run_crs)
+
+    def __call__(self, x: Floats, y: Floats) -> Heights:
+        """Return heights of all levels at coordinates of the file; NaN without a surface."""
+        return self.at(*self.to_run(x, y))
+
+    def at(self, easting: Floats, northing: Floats) -> Heights:
+        """Return heights of all levels at points in the CRS of the run."""
+        found, earlier = self.ground.heights(easting, northing, self.steps)
+        found = replace(found, z=found.z - self.place.z)
+        seen = self.seen
+        seen.earlier.update(earlier)
+        step = self.ground.largest_tile_step(easting, northing, NEAR_M)
+        seen.tile_step_m = max(seen.tile_step_m, step)
+        seen.known += int(np.isfinite(found.z).any(axis=0).sum())
+        inside = np.isfinite(easting) & np.isfinite(northing)
+        if inside.any():
+            part = np.array([[values.min(), values.max()] for values in (easting[inside], northing[inside])])
+            seen.bounds[:2] = np.minimum(seen.bounds[:2], part[:, 0])
+            seen.bounds[2:] = np.maximum(seen.bounds[2:], part[:, 1])
+        return found
+
+    def errors(self, easting: Floats, northing: Floats, numbers: NDArray[np.int8]) -> Floats:
+        """Return the estimated errors (m) at points on levels, in the CRS of the run."""
+        return self.ground.errors(easting, northing, numbers)
+
+    def require_heights(self) -> None:
+        """Raise an error if no point has had a height."""
+        if self.seen.known:
+            return
+        if not np.isfinite(self.seen.bounds).all():
+            raise TaskError("has no road or feature with coordinates")
+        raise TaskError(
+            f"does not lie on the finished tiles: it lies in {_box(self.seen.bounds)}, they in "
+            f"{_box(self.bounds)} ({short(self.run_crs)}); correct its CRS with --crs and --offset"
+        )
+
+
+def _box(bounds: Sequence[float] | Floats) -> str:
+    west, south, east, north = bounds
+    return f"W {west:.0f} S {south:.0f} E {east:.0f} N {north:.0f}"
+
+
+def _format(source: Path) -> ModuleType:
+    """Return the module of a file's format, told by its first bytes."""
+    first = head(source).removeprefix(b"\xef\xbb\xbf").lstrip()
+    if first[:1] == b"<" or first[:2] == b"\x1f\x8b":
+        name = xml_text.root_name(source)
+        if name in XML_FORMATS:
+            return XML_FORMATS[name]
+        if name == "osmChange":
+            raise TaskError("is a list of changes (osmChange); give the complete file (.osm)")
+        raise TaskError(f"has the root element {name or 'none'}; give {KINDS}")
+    for module in VECTORS:
+        if module.begins(head(source)):
+            return module
+    for begin, said in PACKED.items():
+        if begin in head(source)[:64]:
+            raise TaskError(f"{said.format(file=shlex.quote(str(source)))}")
+    raise TaskError(
+        f"is of no known format; give {KINDS}; convert others, such as DXF, with ogr2ogr NEW.gpkg FILE"
+    )
+
+
+def _require_suffix(module: ModuleType, source: Path, out: Path) -> None:
+    """Raise an error if a copy of features is to be of another format, or is open in another program."""
+    if module not in VECTORS:
+        return
+    if out.suffix.lower() not in module.SUFFIXES:
+        own = module.SUFFIXES[0]
+        raise ConfigError(
+            f"-o {out}: is of another format than {source}; write {out.stem}{own}, then "
+            f"ogr2ogr {shlex.quote(out.name)} {shlex.quote(out.stem + own)}"
+        )
+    for end in SQLITE_PARTS if module is geopackage else ():
+        part = out.with_name(out.name + end)
+        if part.exists():
+            raise ConfigError(
+                f"-o {out}: is open in another program, as {part.name} is there; close it there"
+            )
+
+
+def _plan(crs: str) -> str:
+    try:
+        return in_plan(crs)
+    except CatalogError as error:
+        raise TaskError(f"has a CRS that PROJ does not read: {error}; give another one with --crs") from error
+
+
+def _require_outputs(source: Path, out: Path, report: Path | None) -> None:
+    """Raise an error if an output would replace the input, or another output."""
+    files = [
+        (out, "-o"),
+        *([(report, "--report"), (report.with_suffix(PLACES), "--report")] if report else []),
+    ]
+    taken = {source.resolve(): str(source)}
+    for path, option in files:
+        if path.resolve() in taken:
+            raise ConfigError(f"{option} {path}: is also {taken[path.resolve()]}; give another name")
+        taken[path.resolve()] = f"{option} {path}"
+        output_file(path)
+
+
+@contextmanager
+def _named(out: Path, scratch: Path) -> Iterator[None]:
+    """Name the output in errors of writing it in a scratch folder; that of a full disk names no file."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and scratch not in Path(error.filename).parents:
+            raise
+        raise OSError(error.errno, error.strerror or str(error), str(out)) from error
+
+
+@contextmanager
+def _explained(source: Path) -> Iterator[None]:
+    """Name the file in errors of reading it."""
+    try:
+        yield
+    except (TaskError, Refused) as error:
+        raise ConfigError(f"{source} {error}") from error
+
+
+def _move(scratch: Path, out: Path) -> tuple[Path, ...]:
+    """Move the files that a format has written into their places; the one that was asked for is the last."""
+    made = sorted(path for path in scratch.iterdir() if path.is_file() and not path.name.startswith("."))
+    made.sort(key=lambda path: path.name == out.name)
+    files = list[Path]()
+    for path in made:
+        target = out.parent / path.name
+        path.replace(output_file(target))
+        files.append(target)
+    return tuple(files)
+
+
+def _remove_parts(out: Path, files: Sequence[Path]) -> None:
+    """Remove the parts of a Shapefile that has been replaced, of which the new one has none: old indices."""
+    if out.suffix.lower() == shapefile.SUFFIXES[0]:
+        for end in SHAPEFILE_PARTS:
+            part = out.with_suffix(end)
+            if part not in files and part.is_file():
+                part.unlink()
+
+
+def _write_report(rows: Sequence[Lifted], report: Path, in_run: _InRun) -> tuple[Path, ...]:
+    """Write the table, and the places above limits if there are any; return the files."""
+    text = io.StringIO(newline="")
+    table = csv.DictWriter(text, list(_row(Lifted(""))), lineterminator="\n")
+    table.writeheader()
+    table.writerows({name: no_formula(value) for name, value in _row(row).items()} for row in rows)
+    write(report, text.getvalue().encode())
+    steep = [(row.id, place) for row in rows for place in row.steep]
+    if not steep:
+        return (report,)
+    east, north = in_run.to_run(
+        np.array([place.x for _, place in steep]), np.array([place.y for _, place in steep])
+    )
+    found, _ = in_run.ground.heights(east, north)
+    columns = {
+        "id": [name for name, _ in steep],
+        "kind": [place.kind for _, place in steep],
+        "percent": [round(100 * place.value, 3) for _, place in steep],
+    }
+    height = np.nan_to_num(found.ground)
+    frame = geopandas.GeoDataFrame(columns, geometry=shapely.points(east, north, height), crs=in_run.run_crs)
+    places = report.with_suffix(PLACES)
+    with ScratchFolder() as folder:
+        frame.to_file(Path(folder, "places.gpkg"), layer="places", driver="GPKG", engine="pyogrio")
+        write(places, Path(folder, "places.gpkg").read_bytes())
+    return report, places
+
+
+def _row(row: Lifted) -> dict[str, str | int | float]:
+    """Return a row of the report; lengths in m, heights in mm, slopes in percent, empty where not known."""
+    figures = {
+        "length_m": (row.length_m, 1, 3),
+        "without_ground_m": (row.without_ground_m, 1, 3),
+        "unknown_deck_m": (row.unknown_deck_m, 1, 3),
+        "before_max_mm": (row.before_m, 1000, 1),
+        "elevation_max_mm": (row.elevation_m, 1000, 1),
+        "superelevation_max_mm": (row.superelevation_m, 1000, 1),
+        "grade_max_percent": (row.grade, 100, 3),
+        "crossfall_max_percent": (row.crossfall, 100, 3),
+        "error_estimate_mm": (row.error_m, 1000, 1),
+    }
+    values: dict[str, str | int | float] = {"id": row.id, "levels": " ".join(map(str, row.levels))}
+    values["points_without_ground"] = row.points_without_ground
+    for name, (value, factor, digits) in figures.items():
+        values[name] = round(value * factor, digits) if np.isfinite(value) else ""
+    return {**values, "flags": ", ".join(flag_names(row.flags)), "note": row.note}

@@ -1,0 +1,184 @@
+"""FlatGeobuf: features are copied by GDAL, as a stream of tables in which the geometries get heights."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flexroad.catalog.guard.open_vector import ERRORS, layer_info, vector_name
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.text import reason
+from flexroad.tasks.errors import TaskError
+from flexroad.tools.lift.features import (
+    BATCH_BYTES,
+    BATCH_FEATURES,
+    COLUMNS,
+    Feature,
+    level_columns,
+    lifted,
+    percent_columns,
+    wanted_levels,
+    with_zero,
+)
+from flexroad.tools.lift.shapes import of_wkb, to_wkb
+from flexroad.tools.lift.types import Frame, Lifted, Options, RunSurface
+
+pyogrio = lazy("pyogrio")
+if TYPE_CHECKING:
+    import pyarrow as pa
+else:
+    pa = lazy("pyarrow")
+
+NOUN = "feature"
+"""What a row of the report is."""
+STEPS = True
+"""Whether heights have the steps beside roads."""
+SUFFIXES = (".fgb",)
+KINDS = (
+    "Point",
+    "LineString",
+    "Polygon",
+    "MultiPoint",
+    "MultiLineString",
+    "MultiPolygon",
+    "GeometryCollection",
+)
+"""Types of layers that GDAL writes with z; those of layers with several types it does not."""
+
+
+def begins(data: bytes) -> bool:
+    """Return whether a file begins like a FlatGeobuf."""
+    return data.startswith(b"fgb\x03")
+
+
+def _info(source: Path) -> dict[str, Any]:
+    try:
+        name = vector_name(source)
+        return layer_info(name, str(pyogrio.list_layers(name)[0, 0]))
+    except ERRORS as error:
+        raise TaskError(f"cannot be read: {reason(error)}") from error
+
+
+def frame(source: Path) -> Frame:
+    """Return the CRS in the header."""
+    return Frame(_info(source)["crs"])
+
+
+def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
+    """Copy a file with heights; yield the rows of the report.
+
+    Raises
+    ------
+    TaskError
+        If the file is damaged or has geometries other than points, lines and polygons; continues a sentence
+        that begins with its name.
+    """
+    info, rows, failures = _info(source), list[Lifted](), list[Exception]()
+    kind = info["geometry_type"]
+    if kind not in KINDS and kind.removesuffix(" Z") not in KINDS:
+        raise TaskError(
+            f"has geometries of the type {kind}, which GDAL does not write with heights; convert it with "
+            "ogr2ogr NEW.gpkg FILE"
+        )
+    size = source.stat().st_size // max(info["features"], 1)
+    batch = max(1, min(BATCH_FEATURES, BATCH_BYTES // max(size, 1)))
+    try:
+        name = vector_name(source)
+        with (
+            _general_reader(),
+            warnings.catch_warnings(),
+            pyogrio.raw.open_arrow(name, use_pyarrow=True, batch_size=batch, return_fids=False) as opened,
+        ):
+            warnings.filterwarnings("ignore", "'crs' was not provided")
+            geometry, reader = opened[0]["geometry_name"] or "wkb_geometry", opened[1]
+            schema = _schema(reader.schema, options)
+            tables = _lifted_tables(reader, schema, geometry, run, options, rows, failures)
+            metadata = info["layer_metadata"] or {}
+            pyogrio.raw.write_arrow(
+                pa.RecordBatchReader.from_batches(schema, tables),
+                out,
+                layer=info["layer_name"],
+                driver="FlatGeobuf",
+                geometry_name=geometry,
+                geometry_type=kind.removesuffix(" Z") + " Z",
+                crs=info["crs"],
+                # Without an index the features keep their order; with one they are in that of the index.
+                SPATIAL_INDEX="YES" if info["capabilities"]["fast_spatial_filter"] else "NO",
+                **{key: metadata[key] for key in ("TITLE", "DESCRIPTION") if key in metadata},
+            )
+    except ERRORS as error:
+        if failures:
+            # Through the stream of tables, only its text would come.
+            raise failures[0] from error
+        raise TaskError(f"cannot be copied: {reason(error)}") from error
+    if len(rows) < info["features"]:
+        raise TaskError(f"is cut off: it has {len(rows)} of {info['features']} features; copy it again")
+    yield from rows
+
+
+@contextmanager
+def _general_reader() -> Iterator[None]:
+    """Have GDAL read tables as of all formats: its reader for this one fails at features without geometry."""
+    option = "OGR_FLATGEOBUF_STREAM_BASE_IMPL"
+    before = pyogrio.get_gdal_config_option(option)
+    pyogrio.set_gdal_config_options({option: True})
+    try:
+        yield
+    finally:
+        pyogrio.set_gdal_config_options({option: before})
+
+
+def _schema(given: pa.Schema, options: Options) -> pa.Schema:
+    """Return the columns of the copy."""
+    for name in COLUMNS if options.columns else ():
+        new, at = pa.field(name, pa.float64()), given.get_field_index(name)
+        given = given.append(new) if at < 0 else given.set(at, new)
+    return given
+
+
+def _lifted_tables(
+    reader: Any,
+    schema: pa.Schema,
+    geometry: str,
+    run: RunSurface,
+    options: Options,
+    rows: list[Lifted],
+    failures: list[Exception],
+) -> Iterator[pa.RecordBatch]:
+    """Yield the batches of a file with heights; add their rows, and the error with which it ends."""
+    try:
+        for batch in reader:
+            columns = {name: batch.column(name) for name in batch.schema.names}
+            wkb, own = list[bytes | None](), list[Lifted]()
+            for shape, row in lifted(_features(columns, geometry, len(rows)), run, options):
+                shape, row = with_zero(shape, row)
+                wkb.append(None if shape is None else to_wkb(shape))
+                own.append(row)
+            rows += own
+            columns[geometry] = pa.array(wkb, schema.field(geometry).type)
+            if options.columns:
+                values = zip(*map(percent_columns, own), strict=True)
+                columns |= {
+                    name: pa.array(part, pa.float64()) for name, part in zip(COLUMNS, values, strict=True)
+                }
+            yield pa.RecordBatch.from_arrays([columns[name] for name in schema.names], schema=schema)
+    except Exception as error:
+        failures.append(error)
+        raise
+
+
+def _features(columns: dict[str, Any], geometry: str, first: int) -> list[Feature]:
+    levels = {name: columns[name].to_pylist() for name in level_columns(columns) if name != geometry}
+    shapes = columns[geometry].to_pylist()
+    features = []
+    for number, (data, level) in enumerate(
+        zip(shapes, wanted_levels(levels, len(shapes)), strict=True), first
+    ):
+        try:
+            features.append(Feature(str(number), None if data is None else of_wkb(data), level))
+        except TaskError as error:
+            raise TaskError(f"(feature {number}) {error}") from error
+    return features

@@ -1,0 +1,367 @@
+"""OpenDRIVE 1.4 to 1.8 (``.xodr``): elevation and superelevation of each road from the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.quality.flagged import passed
+from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.lift import lanes, levels, opendrive_text, plan_view, road_levels, road_profiles, xml_text
+from flexroad.tools.lift.batches import with_heights
+from flexroad.tools.lift.levels import ANY, Numbers
+from flexroad.tools.lift.lines import steepest
+from flexroad.tools.lift.plan_view import numbers
+from flexroad.tools.lift.profile import AHEAD_M, value_at
+from flexroad.tools.lift.road_profiles import NONE, CrossSections
+from flexroad.tools.lift.types import Frame, Heights, HeightsAt, Lifted, Options, Steep
+from flexroad.tools.lift.xml_text import Part
+
+NOUN = "road"
+"""What a row of the report is."""
+STEPS = False
+"""Whether heights have the steps beside roads: OpenDRIVE has kerbs in its lanes."""
+ALONG_M, LEAST_ALONG = 1.0, 4
+"""Distance of the cross-sections of a road (m), and their least number, less one."""
+ACROSS_M = 1.0
+"""Distance of the points of a cross-section (m)."""
+LEAST_ACROSS, MOST_ACROSS = 4, 80
+"""Number of the points of a cross-section, less one."""
+MOST_FINER, MOST_FINE = 8, 4000
+"""Cross-sections for each of the usual ones, at most, where a road bends, and of a road that has more."""
+LONGEST_M = 50_000.0
+"""Longest road (m)."""
+Structure = tuple[Literal["bridge", "tunnel"], float, float]
+"""Kind, start and end of a bridge or tunnel, by distances along its road (m)."""
+ALL_LEVEL = 'all lanes have level="true", as netconvert writes it: they stay flat across; write "false"'
+
+
+@dataclass(frozen=True, eq=False)
+class Road:
+    """A road with the places of its cross-sections."""
+
+    part: Part
+    id: str
+    s: Floats
+    """``(n,)``: distances of the cross-sections, m."""
+    t: Floats
+    """``(m,)``: their points, m from the reference line."""
+    x: Floats
+    """``(n,)``: the reference line."""
+    y: Floats
+    heading: Floats
+    extent: lanes.Extent
+    elevation: Floats
+    """The profile that it had, ``(k, 5)``."""
+    superelevation: Floats
+    structures: tuple[Structure, ...]
+
+    @property
+    def inside(self) -> Bools:
+        """The points of cross-sections on the lanes, ``(n, m)``, or next to them."""
+        half = (self.t[1] - self.t[0]) / 2
+        right, left = self.extent.right[:, None], self.extent.left[:, None]
+        return np.asarray((self.t >= right - half) & (self.t <= left + half))
+
+    @property
+    def column(self) -> NDArray[np.intp]:
+        """The point in the middle of the lanes of each cross-section, ``(n,)``."""
+        middle = (self.extent.right + self.extent.left) / 2
+        return np.asarray(np.abs(self.t - middle[:, None]).argmin(axis=1))
+
+    def middle(self) -> tuple[Floats, Floats]:
+        """Return x and y in the middle of the lanes, ``(n,)`` each."""
+        away = self.t[self.column]
+        return self.x - away * np.sin(self.heading), self.y + away * np.cos(self.heading)
+
+    def places(self) -> tuple[Floats, Floats]:
+        """Return x and y of the points: cross-sections, the line, before and after its points."""
+        ahead, left = np.cos(self.heading), np.sin(self.heading)
+        x = [(self.x[:, None] - self.t * left[:, None]).ravel()]
+        y = [(self.y[:, None] + self.t * ahead[:, None]).ravel()]
+        for away in (0.0, -AHEAD_M, AHEAD_M):
+            x.append(self.x + away * ahead)
+            y.append(self.y + away * left)
+        return np.concatenate(x), np.concatenate(y)
+
+
+@dataclass(frozen=True)
+class Left:
+    """A road that stays as it is, and why."""
+
+    part: Part
+    id: str
+    note: str
+
+
+def frame(source: Path) -> Frame:
+    """Return where the coordinates of a file are: its ``geoReference`` and ``offset``.
+
+    Raises
+    ------
+    TaskError
+        If the file cannot be read; continues a sentence that begins with its name.
+    """
+    with xml_text.opened(source) as file:
+        for part in xml_text.parts(file, {"header", "road"}):
+            if isinstance(part, bytes):
+                continue
+            if part.element.tag == "road":
+                break
+            text = " ".join((part.element.findtext("geoReference") or "").split())
+            offset = part.element.find("offset")
+            try:
+                moved = [0.0] * 4 if offset is None else numbers(offset, *"xyz", "hdg", missing=0.0)
+            except TaskError as error:
+                raise TaskError(f"{error}; correct its header") from error
+            return Frame(text or None, moved[0], moved[1], z=moved[2], turn=moved[3])
+    return Frame(None)
+
+
+def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Iterator[Lifted]:
+    """Copy a file with heights; yield the rows of the report.
+
+    Raises
+    ------
+    TaskError
+        If the file cannot be read; continues a sentence that begins with its name.
+    """
+    of_links = LinkedLevels(source, heights)
+    with xml_text.opened(source) as file, xml_text.written(out) as copy:
+        parts = map(_read, xml_text.parts(file, {"road"}))
+        for part, found in with_heights(parts, _places, heights):
+            if isinstance(part, bytes):
+                copy.write(part)
+            elif isinstance(part, Left) or found is None:
+                assert isinstance(part, Left)
+                copy.write(part.part.text)
+                yield Lifted(part.id, note=part.note)
+            else:
+                text, row = _lifted(part, found, options, of_links)
+                copy.write(text)
+                yield row
+
+
+def _places(part: bytes | Left | Road) -> tuple[Floats, Floats] | None:
+    return part.places() if isinstance(part, Road) else None
+
+
+def _read(part: bytes | Part) -> bytes | Left | Road:
+    """Return a road, or why it stays as it is."""
+    if isinstance(part, bytes):
+        return part
+    name = part.element.get("id", "")
+    if part.path != ("OpenDRIVE",):
+        return part.text
+    try:
+        with np.errstate(all="ignore"):
+            return _road(part, name)
+    except TaskError as error:
+        return Left(part, name, f"{error}; it stays as it was")
+
+
+def _road(part: Part, name: str) -> Road:
+    element = part.element
+    (length,) = numbers(element, "length")
+    if not 0 < length <= LONGEST_M:
+        raise TaskError(f"has a length of {length:g} m")
+    plan = plan_view.read(element)
+    count = max(int(np.ceil(length / ALONG_M)), LEAST_ALONG)
+    s = np.linspace(0.0, length, count + 1)
+    extent = lanes.extent(element, s)
+    reach = max(float(np.abs(extent.right).max()), float(np.abs(extent.left).max()))
+    # In narrow bends the outer lanes are long; kinks between geometries are not bends.
+    kept = np.diff(np.searchsorted(plan.start[:, 0], s, side="right")) == 0
+    turned = float(np.abs(np.diff(plan.at(s)[2]))[kept].max(initial=0.0)) * reach
+    if np.isfinite(turned) and turned > ALONG_M:
+        finer = int(min(np.ceil(turned / ALONG_M), MOST_FINER, max(1, MOST_FINE // count)))
+        s = np.linspace(0.0, length, count * finer + 1)
+        extent = lanes.extent(element, s)
+    x, y, heading = plan.at(s)
+    if not np.isfinite([x, y, heading]).all():
+        raise TaskError("has a planView with places that are no numbers")
+    right, left = float(extent.right.min()), float(extent.left.max())
+    if left - right < ACROSS_M / 2:
+        right, left = right - ACROSS_M / 2, left + ACROSS_M / 2
+    across = int(np.clip(np.ceil((left - right) / ACROSS_M), LEAST_ACROSS, MOST_ACROSS))
+    return Road(
+        part=part,
+        id=name,
+        s=s,
+        t=np.linspace(right, left, across + 1),
+        x=x,
+        y=y,
+        heading=heading,
+        extent=extent,
+        elevation=_old(element, "elevationProfile/elevation"),
+        superelevation=_old(element, "lateralProfile/superelevation"),
+        structures=tuple(_structures(element)),
+    )
+
+
+def _structures(road: ET.Element) -> Iterator[Structure]:
+    kinds: tuple[Literal["bridge", "tunnel"], ...] = ("bridge", "tunnel")
+    for kind in kinds:
+        for each in road.iterfind(f"objects/{kind}"):
+            start, length = numbers(each, "s", "length")
+            yield kind, start, start + length
+
+
+def _old(road: ET.Element, path: str) -> Floats:
+    """Return the pieces of a profile that a road has; readers take 0 before the first one."""
+    pieces = lanes.records(road.findall(path))
+    if not len(pieces):
+        return NONE
+    pieces = pieces[np.argsort(pieces[:, 0], kind="stable")]
+    return pieces if pieces[0, 0] <= 0 else np.vstack([NONE, pieces])
+
+
+def _lifted(road: Road, heights: Heights, options: Options, of_links: LinkedLevels) -> tuple[bytes, Lifted]:
+    """Return the text of a road with heights, and its row."""
+    sections, used, unknown_m, rows = _sections(road, heights, of_links)
+    beyond: road_profiles.Beyond = "flat" if options.flat_ends else "keep"
+    tolerance = options.tolerance_m
+    elevation = road_profiles.elevation(sections, road.elevation, beyond, tolerance)
+    across = road_profiles.superelevation(sections, road.superelevation, beyond, tolerance)
+    if elevation is None or across is None:
+        length = float(road.s[-1])
+        return road.part.text, Lifted(road.id, length, length, (), unknown_m)
+    lateral = None if options.lateral == "none" else opendrive_text.records("superelevation", across)
+    text = opendrive_text.with_profiles(road.part, opendrive_text.records("elevation", elevation), lateral)
+    row = _row(road, sections, used, unknown_m, elevation, across, options)
+    on_lanes = np.flatnonzero(road.inside)
+    numbers = np.array(heights.numbers, np.int8)[np.repeat(rows, len(road.t))[on_lanes]]
+    return text, replace(row, flags=passed(heights[on_lanes].flags_on(numbers)))
+
+
+def _sections(
+    road: Road, heights: Heights, of_links: LinkedLevels
+) -> tuple[CrossSections, Numbers, float, NDArray[np.intp]]:
+    """Return the cross-sections, their levels, the length of unknown ones (m), their rows of `Heights.z`."""
+    n, m = len(road.s), len(road.t)
+    line = heights[np.arange(n) * m + road.column]
+    wanted, joined, unknown_m = _wanted(road, line)
+    if (wanted == ANY).all() and road_levels.several(line):
+        wanted[:] = of_links.get(road.id, ANY)
+    _, chosen = levels.along(line, wanted)
+    rows = np.searchsorted(np.array(heights.numbers), chosen)
+    of_point = np.concatenate([np.repeat(rows, m), *[rows] * 3])
+    z = heights.z[of_point, np.arange(len(of_point))]
+    on, before, after = z[n * m :].reshape(3, n)
+    grid = z[: n * m].reshape(n, m)
+    sections = road_profiles.cross_sections(road.s, road.t, grid, (on, before, after), road.inside, joined)
+    return sections, chosen[np.isfinite(sections.line)], unknown_m, rows
+
+
+def _wanted(road: Road, line: Heights) -> tuple[Numbers, Bools, float]:
+    """Return the wanted levels, where a tunnel has none, and the length of structures without one (m)."""
+    wanted, joined, unknown_m = np.full(len(road.s), ANY), np.zeros(len(road.s), np.bool_), 0.0
+    for kind, start, end in road.structures:
+        here = (road.s >= start) & (road.s <= end)
+        side = 1 if kind == "bridge" else -1
+        own = [
+            number
+            for number, z in zip(line.numbers, line.z, strict=True)
+            if number * side > 0 and np.isfinite(z[here]).any()
+        ]
+        if len(own) == 1:
+            wanted[here] = own[0]
+        elif not own:
+            wanted[here] = 0
+            joined |= here & (kind == "tunnel")
+            unknown_m += max(0.0, min(end, float(road.s[-1])) - max(start, 0.0))
+    return wanted, joined, unknown_m
+
+
+class LinkedLevels:
+    """The levels of roads that have several from end to end, by the roads linked with them.
+
+    The file is read for them when the first such road comes.
+    """
+
+    def __init__(self, source: Path, heights: HeightsAt) -> None:
+        self._source, self._heights = source, heights
+
+    def get(self, name: str, otherwise: np.int8) -> int:
+        """Return the level of a road; `otherwise` if its links do not say it."""
+        return self._levels.get(name, int(otherwise))
+
+    @cached_property
+    def _levels(self) -> dict[str, int]:
+        roads = dict[str, road_levels.Ends]()
+        with xml_text.opened(self._source) as file:
+            parts = map(_read, xml_text.parts(file, {"road"}))
+            lines = (part for part in parts if isinstance(part, Road))
+            for road, line in with_heights(lines, Road.middle, self._heights):
+                assert line is not None
+                roads[road.id] = _ends(road, line)
+        return road_levels.decided(roads)
+
+
+def _ends(road: Road, line: Heights) -> road_levels.Ends:
+    wanted, _, _ = _wanted(road, line)
+    z, numbers = levels.along(line, wanted)
+    known = {int(numbers[0]): (float(z[0]), float(z[-1]))}
+    if (wanted == ANY).all() and (numbers_of := road_levels.several(line)):
+        rows = {number: line.z[line.numbers.index(number)] for number in numbers_of}
+        known = {number: (float(row[0]), float(row[-1])) for number, row in rows.items()}
+    return road_levels.Ends(known, road_levels.links(road.part.element))
+
+
+def _row(
+    road: Road,
+    sections: CrossSections,
+    used: Numbers,
+    unknown_m: float,
+    elevation: Floats,
+    across: Floats,
+    options: Options,
+) -> Lifted:
+    s, t = road.s, road.t
+    known = np.isfinite(sections.line)
+    seen = sections.inside & known[:, None] & np.isfinite(sections.z)
+    # Lanes that are level have the height of the middle.
+    t_read = np.broadcast_to(road.extent.middle[:, None] if road.extent.level else t, seen.shape)
+
+    def missed(profile: Floats, lateral: Floats) -> float:
+        z = value_at(profile, s)[:, None] + t_read * np.tan(value_at(lateral, s))[:, None]
+        return float(np.abs(z - sections.z)[seen].max(initial=0.0))
+
+    lateral = road.superelevation if options.lateral == "none" else across
+    crossfall = np.where(known, np.tan(value_at(across, s)), 0.0)
+    grade = np.where(known, sections.grade, 0.0)
+    gone = ~(known[:-1] & known[1:]) & ~(sections.joined[:-1] | sections.joined[1:])
+    return Lifted(
+        id=road.id,
+        length_m=float(s[-1]),
+        without_ground_m=float(np.diff(s)[gone].sum()),
+        levels=tuple(sorted({int(number) for number in used})),
+        unknown_deck_m=unknown_m,
+        before_m=missed(road.elevation, road.superelevation),
+        elevation_m=missed(elevation, NONE),
+        superelevation_m=np.nan if lateral is NONE else missed(elevation, lateral),
+        grade=float(np.abs(grade).max()),
+        crossfall=float(np.abs(crossfall).max()),
+        steep=(
+            *_steep(road, "grade", grade, options.grade_limit),
+            *_steep(road, "crossfall", crossfall, options.crossfall_limit),
+        ),
+        note=ALL_LEVEL if road.extent.level and options.lateral != "none" else "",
+    )
+
+
+def _steep(
+    road: Road, kind: Literal["grade", "crossfall"], values: Floats, limit: float | None
+) -> Iterator[Steep]:
+    """Yield the steepest place of each stretch that is steeper than a limit."""
+    slopes = np.abs(values)
+    for at in steepest(slopes, limit):
+        yield Steep(kind, float(slopes[at]), float(road.x[at]), float(road.y[at]))

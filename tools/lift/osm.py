@@ -1,0 +1,349 @@
+"""OpenStreetMap's XML (``.osm``), also as Lanelet2 uses it: a tag ``ele`` at each node with a surface."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.text import shown
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.quality.flagged import passed
+from flexroad.tasks.types import Floats
+from flexroad.tools.lift import xml_text
+from flexroad.tools.lift.batches import POINTS, with_heights
+from flexroad.tools.lift.levels import Numbers, along, level_of, tagged_level
+from flexroad.tools.lift.lines import Line, largest
+from flexroad.tools.lift.meetings import Meetings
+from flexroad.tools.lift.types import Frame, Heights, HeightsAt, Lifted, Options
+from flexroad.tools.lift.xml_text import Part
+
+NOUN = "way"
+"""What a row of the report is."""
+STEPS = False
+"""Whether heights have the steps beside roads."""
+STEP_M = 1.0
+"""Largest distance of points at which the heights of a way are taken (m)."""
+DEGREES, LOCAL = ("lon", "lat"), ("local_x", "local_y")
+"""Where coordinates are: attributes of nodes, or tags of Lanelet2."""
+
+Indices = NDArray[np.intp]
+
+
+def frame(source: Path) -> Frame:
+    """Return where the coordinates of a file are: longitude and latitude, or local ones of Lanelet2."""
+    return Frame("EPSG:4326" if _names(source) == DEGREES else None)
+
+
+def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Iterator[Lifted]:
+    """Copy a file with heights; yield the rows of the report.
+
+    Raises
+    ------
+    TaskError
+        If the file cannot be read; continues a sentence that begins with its name.
+    """
+    network = _Network.read(source, _names(source))
+    network.find_heights(heights)
+    copy = _Added(network, options)
+    streets = [way for way in network.ways if way.row]
+    rows = [copy.row(way, line, found) for way, line, found in network.lines(heights, streets)]
+    if options.flat_ends:
+        network.go_on_level()
+    with xml_text.opened(source) as file, xml_text.written(out) as target:
+        for text in copy.texts(xml_text.parts(file, {"node", "way"})):
+            target.write(text)
+    yield from rows
+
+
+def _names(source: Path) -> tuple[str, str]:
+    """Return where a file has its coordinates."""
+    local = False
+    with xml_text.opened(source) as file:
+        for part in xml_text.parts(file, {"node"}):
+            if isinstance(part, Part):
+                if np.isfinite(_place(part.element, DEGREES)).all():
+                    return DEGREES
+                local = local or bool(np.isfinite(_place(part.element, LOCAL)).all())
+    return LOCAL if local else DEGREES
+
+
+def _place(node: ET.Element, names: tuple[str, str]) -> tuple[float, float]:
+    """Return the coordinates of a node, NaN if it has none or is deleted."""
+    if node.get("visible") == "false" or node.get("action") == "delete":
+        return np.nan, np.nan
+    values = node.attrib if names == DEGREES else _tags(node)
+    return _number(values.get(names[0])), _number(values.get(names[1]))
+
+
+def _number(text: str | None) -> float:
+    """Return a number, NaN if a text is none."""
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return np.nan
+
+
+def _tags(element: ET.Element) -> dict[str, str]:
+    return {tag.get("k", ""): tag.get("v", "") for tag in element.iter("tag")}
+
+
+def _id(text: str | None) -> int:
+    try:
+        number = int(text or "")
+    except ValueError:
+        number = 2**63
+    if abs(number) >= 2**63:
+        raise TaskError(f"has the id {shown(text)}, which is no whole number; correct it")
+    return number
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    id: str
+    nodes: Indices
+    """Indices of its nodes; -1 if the file does not have one."""
+    level: int
+    """Its level by its tags."""
+    row: bool
+    """Whether the report has a row of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Network:
+    """Nodes in the order of the file, and the ways that have levels or a row of the report."""
+
+    ids: NDArray[np.int64]
+    x: Floats
+    y: Floats
+    before: Floats
+    """Heights that nodes had (m); NaN without."""
+    ways: list[_Way]
+    by_tags: bool
+    """Whether ways without a level in their tags are on the ground, as roads of OpenStreetMap are."""
+    geographic: bool
+    """Whether x and y are degrees; else they are metres."""
+    z: Floats
+    """New heights of the nodes (m); NaN where they keep those that they had."""
+    meetings: Meetings = field(default_factory=Meetings)
+
+    @classmethod
+    def read(cls, source: Path, names: tuple[str, str]) -> _Network:
+        ids, values = array("q"), array("d")
+        ways = list[tuple[str, NDArray[np.int64], int, bool]]()
+        with xml_text.opened(source) as file:
+            for part in xml_text.parts(file, {"node", "way"}):
+                if isinstance(part, bytes):
+                    continue
+                element = part.element
+                if element.tag == "node":
+                    ids.append(_id(element.get("id")))
+                    ele = next((tag.get("v") for tag in element.iter("tag") if tag.get("k") == "ele"), None)
+                    values.extend((*_place(element, names), _number(ele)))
+                else:
+                    tags = _tags(element)
+                    refs = np.array([_id(node.get("ref")) for node in element.iter("nd")], np.int64)
+                    ways.append((element.get("id", ""), refs, tagged_level(tags), "highway" in tags))
+        own, table = np.array(ids, np.int64), np.array(values).reshape(-1, 3)
+        x, y, before = (np.where(np.isfinite(column), column, np.nan) for column in table.T)
+        streets = any(row for *_, row in ways)
+        order = np.argsort(own, kind="stable")
+        found = [
+            _Way(name, _find(own, order, refs), level, row or not streets)
+            for name, refs, level, row in ways
+            if len(own) and len(refs) > 1 and (row or level or not streets)
+        ]
+        return cls(own, x, y, before, found, streets, names == DEGREES, np.full(len(own), np.nan))
+
+    def find_heights(self, heights: HeightsAt) -> None:
+        """Give each node its height: that of the ground, or of the level of a way that has it."""
+        for start in range(0, len(self.ids), POINTS):
+            part = slice(start, start + POINTS)
+            self.z[part] = heights(self.x[part], self.y[part]).ground
+        keeps, meets = np.zeros((2, len(self.ids)), np.bool_)
+        some = [way for way in self.ways if way.level or not self.by_tags]
+        if not self.by_tags:
+            for way, line, found in self.lines(heights, some):
+                self.meetings.note(line, self._ends(way), found, way.level or None, None)
+            self.meetings.decide()
+        for way, line, found in self.lines(heights, some):
+            z, numbers, known = self.along(way, found)
+            raised = (numbers != 0) & np.isfinite(z)
+            raised = raised[line.own] & (way.nodes >= 0)
+            self.z[way.nodes[raised]] = z[line.own][raised]
+            if way.level < 0 and not known:
+                keeps[way.nodes[way.nodes >= 0]] = True
+        for way in self.ways:
+            if way.level >= 0:
+                meets[way.nodes[way.nodes >= 0]] = True
+        # A tunnel whose level is not known meets other roads on the ground.
+        self.z[keeps & ~meets] = np.nan
+
+    def lines(self, heights: HeightsAt, ways: list[_Way]) -> Iterator[tuple[_Way, Line, Heights]]:
+        """Yield each way with the points along it and their heights on all levels."""
+        pairs = ((way, self._line(way)) for way in ways)
+        for (way, line), found in with_heights(pairs, lambda each: (each[1].x, each[1].y), heights):
+            assert found is not None
+            yield way, line, found
+
+    def _line(self, way: _Way) -> Line:
+        missing = way.nodes < 0
+        x, y = (np.where(missing, np.nan, values[way.nodes]) for values in (self.x, self.y))
+        return Line.of(x, y, self._metres(y), STEP_M)
+
+    def _metres(self, y: Floats) -> tuple[float, float]:
+        """Return the lengths of a unit of x and y (m), at places whose y is known."""
+        if not self.geographic or not np.isfinite(y).any():
+            return 1.0, 1.0
+        middle = np.radians(np.nanmean(y))
+        # Series for the ellipsoid of WGS 84.
+        east = 111412.84 * np.cos(middle) - 93.5 * np.cos(3 * middle)
+        return float(east), float(111132.95 - 559.82 * np.cos(2 * middle) + 1.175 * np.cos(4 * middle))
+
+    def _ends(self, way: _Way) -> tuple[tuple[str], tuple[str]]:
+        return (str(way.nodes[0]),), (str(way.nodes[-1]),)
+
+    def along(self, way: _Way, heights: Heights) -> tuple[Floats, Numbers, bool]:
+        """Return heights along a way, the numbers of their levels, and whether its level is known."""
+        own = level_of(heights, way.level) if way.level else None
+        if own is None and not self.by_tags:
+            first, last = (self.meetings.ends.get(end) for end in self._ends(way))
+            wanted = self.meetings.wanted(heights, first, last)
+        else:
+            wanted = np.full(heights.z.shape[1], own or 0, np.int8)
+        return *along(heights, wanted), own is not None or not way.level
+
+    def go_on_level(self) -> None:
+        """Give nodes beyond the surface the heights of the nearest ones along their ways."""
+        rest = self.ways
+        while rest:
+            left = list[_Way]()
+            for way in rest:
+                nodes = way.nodes[way.nodes >= 0]
+                known = np.isfinite(self.z[nodes])
+                if known.any() and not known.all():
+                    line = self._line(replace(way, nodes=nodes))
+                    at = line.s[line.own]
+                    self.z[nodes[~known]] = np.interp(at[~known], at[known], self.z[nodes[known]])
+                left += [] if known.any() else [way]
+            if len(left) == len(rest):
+                break
+            rest = left
+
+
+def _find(ids: NDArray[np.int64], order: Indices, refs: NDArray[np.int64]) -> Indices:
+    """Return the indices of nodes by their ids, -1 for those that are missing."""
+    place = np.minimum(np.searchsorted(ids, refs, sorter=order), len(ids) - 1)
+    index = order[place]
+    return np.where(ids[index] == refs, index, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Added:
+    """What a copy of the file has more than the file."""
+
+    network: _Network
+    options: Options
+    segments: dict[tuple[int, int], list[tuple[float, float, float]]] = field(default_factory=dict)
+    """New nodes (x, y, height) between two others, by their ids, the lower one first."""
+
+    def row(self, way: _Way, line: Line, heights: Heights) -> Lifted:
+        """Return the row of a way; note the nodes that it needs."""
+        network = self.network
+        z, numbers, known = network.along(way, heights)
+        surface = np.isfinite(z)
+        if way.level < 0 and not known:
+            z = np.full(len(z), np.nan)
+        add = self.options.add_vertices is True
+        index = line.needed(z, self.options.tolerance_m, add)
+        self._note(way, line, index, z)
+        grade, steep = line.grades(z, self.options.grade_limit)
+        without = line.length_where(~surface)
+        before = np.where(way.nodes < 0, np.nan, network.before[way.nodes])
+        return Lifted(
+            way.id,
+            length_m=float(line.s[-1]),
+            without_ground_m=without,
+            levels=tuple(np.unique(numbers[np.isfinite(z)]).tolist()),
+            unknown_deck_m=0.0 if known else float(line.s[-1]) - without,
+            before_m=largest(np.abs(before - z[line.own])),
+            elevation_m=largest(np.abs(np.interp(line.s, line.s[index], z[index]) - z)),
+            grade=grade,
+            steep=steep,
+            flags=passed(heights.flags_on(numbers)),
+        )
+
+    def _note(self, way: _Way, line: Line, index: Indices, z: Floats) -> None:
+        """Note the new nodes between each two nodes of a way, if another way has not noted them."""
+        ends = np.flatnonzero(line.own)
+        for i, (a, b) in enumerate(zip(way.nodes[:-1].tolist(), way.nodes[1:].tolist(), strict=True)):
+            new = index[(index > ends[i]) & (index < ends[i + 1])]
+            if len(new) and a >= 0 and b >= 0:
+                first, last = int(self.network.ids[a]), int(self.network.ids[b])
+                new = new if first < last else new[::-1]
+                places = list(zip(*(values[new].tolist() for values in (line.x, line.y, z)), strict=True))
+                self.segments.setdefault((min(first, last), max(first, last)), places)
+
+    def texts(self, parts: Iterator[bytes | Part]) -> Iterator[bytes]:
+        """Yield the text of the copy."""
+        number, named, ids = 0, False, self._new_ids()
+        for part in parts:
+            if isinstance(part, bytes):
+                yield part
+            elif part.element.tag == "node":
+                yield _with_ele(part, float(self.network.z[number]))
+                number += 1
+            else:
+                if ids and not named:
+                    # New nodes stand before the first way, as readers expect nodes first.
+                    yield from self._new_nodes(ids)
+                    named = True
+                yield self._with_nodes(part, ids)
+
+    def _new_ids(self) -> dict[tuple[int, int], list[int]]:
+        """Return the ids of new nodes: below zero and below all others, as of nodes without one in OSM."""
+        next_id = min(int(self.network.ids.min(initial=0)), 0) - 1
+        ids = dict[tuple[int, int], list[int]]()
+        for segment, places in self.segments.items():
+            ids[segment] = [next_id - i for i in range(len(places))]
+            next_id -= len(places)
+        return ids
+
+    def _new_nodes(self, ids: dict[tuple[int, int], list[int]]) -> Iterator[bytes]:
+        local = not self.network.geographic
+        for segment, numbers in ids.items():
+            for name, (x, y, z) in zip(numbers, self.segments[segment], strict=True):
+                tags = [("ele", f"{z:.3f}")]
+                place = f'lat="{y:.9f}" lon="{x:.9f}"'
+                if local:
+                    place, tags = 'lat="" lon=""', [("local_x", f"{x:.4f}"), ("local_y", f"{y:.4f}"), *tags]
+                inside = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags)
+                yield f'<node id="{name}" {place}>{inside}</node>\n'.encode()
+
+    def _with_nodes(self, part: Part, ids: dict[tuple[int, int], list[int]]) -> bytes:
+        """Return a way with the new nodes between its nodes."""
+        nodes = part.element.findall("nd") if ids else []
+        edits = []
+        for a, b in pairwise(nodes):
+            first, last = _id(a.get("ref")), _id(b.get("ref"))
+            new = ids.get((min(first, last), max(first, last)), [])
+            if new:
+                end = part.spans[a][1]
+                text = "".join(f'<nd ref="{name}"/>' for name in (new if first < last else new[::-1]))
+                edits.append((end, end, text.encode()))
+        return part.replaced(edits)
+
+
+def _with_ele(part: Part, z: float) -> bytes:
+    if not np.isfinite(z):
+        return part.text
+    for tag in part.element.iter("tag"):
+        if tag.get("k") == "ele":
+            return part.replaced([part.with_attributes(tag, {"v": f"{z:.3f}"})])
+    return part.replaced([part.with_child(f'<tag k="ele" v="{z:.3f}"/>')])

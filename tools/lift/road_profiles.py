@@ -1,0 +1,160 @@
+"""Profiles of a road of OpenDRIVE from heights beside its reference line: elevation and superelevation.
+
+The elevation is the surface at the reference line. At both ends of a road it has the height and the grade of
+the surface there, so that roads that meet in plan meet in height. The superelevation is the slope of the
+straight line through it that fits the cross-section best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Literal
+
+import numpy as np
+
+from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.lift.profile import AHEAD_M, cubic_pieces
+
+NONE = np.zeros((1, 5))
+"""A profile without records: it is 0."""
+STEEPEST = 0.5
+"""Largest slope across a road (m/m): where the surface is steeper, a step or the end of a deck is beneath."""
+LEAST_ACROSS_M = 0.25
+"""Points nearer to the reference line do not say how the cross-section falls (m)."""
+BREAK_M = 1e-3
+"""Distance behind the ground at which a profile goes on as it was (m)."""
+
+Beyond = Literal["keep", "flat"]
+
+
+@dataclass(frozen=True, eq=False)
+class CrossSections:
+    """Heights of the surface at n distances along a road."""
+
+    s: Floats
+    """``(n,)``, m, ascending."""
+    t: Floats
+    """``(m,)``: distances from the reference line, ascending, positive to the left (m)."""
+    z: Floats
+    """``(n, m)``, m; NaN where the surface is not."""
+    inside: Bools
+    """``(n, m)``: the points on the lanes."""
+    line: Floats
+    """``(n,)``: heights on the reference line; NaN without a surface."""
+    grade: Floats
+    """``(n,)``: slope of the surface along the reference line."""
+    joined: Bools
+    """``(n,)``: places without ground between which a profile goes on smoothly, as in a tunnel."""
+
+
+def cross_sections(
+    s: Floats, t: Floats, z: Floats, beside: tuple[Floats, Floats, Floats], inside: Bools, joined: Bools
+) -> CrossSections:
+    """Return cross-sections.
+
+    Parameters
+    ----------
+    s, t, z, inside, joined
+        As of `CrossSections`.
+    beside : tuple of ndarray, (n,)
+        Heights on the reference line, and `AHEAD_M` before and after it.
+    """
+    on, before, after = beside
+    used = np.where(inside, z, np.nan)
+    known = np.isfinite(used)
+    # Where the line is beside a deck, the cross-section goes on to it.
+    lost = ~np.isfinite(on) & (known.sum(axis=1) > 1)
+    line = on.copy()
+    for row in np.flatnonzero(lost):
+        slope, at_line = np.polyfit(t[known[row]], used[row, known[row]], 1)
+        line[row] = at_line if abs(slope) < STEEPEST else np.nan
+    line[joined] = np.nan
+    # A single place with ground is no part of a profile.
+    has = np.isfinite(line)
+    beside_one = np.convolve(has, [1, 0, 1], "same") > 0
+    line[~beside_one] = np.nan
+    grade = (after - before) / (2 * AHEAD_M)
+    for one_sided in ((after - on) / AHEAD_M, (on - before) / AHEAD_M):
+        grade = np.where(np.isfinite(grade), grade, one_sided)
+    missing = np.isfinite(line) & ~np.isfinite(grade)
+    if missing.any():
+        grade[missing] = np.nan_to_num(np.gradient(line, s))[missing]
+    return CrossSections(s, t, z, inside, line, grade, joined)
+
+
+def elevation(sections: CrossSections, old: Floats, beyond: Beyond, tolerance: float) -> Floats | None:
+    """Return the pieces of the elevation, ``(k, 5)``; None if the road has no ground."""
+    return _profile(sections, sections.line, sections.grade, old, beyond, tolerance)
+
+
+def superelevation(sections: CrossSections, old: Floats, beyond: Beyond, tolerance: float) -> Floats | None:
+    """Return the pieces of the superelevation, ``(k, 5)``, radians; None if the road has no ground."""
+    away = np.where(sections.inside & np.isfinite(sections.z), sections.t, 0.0)
+    weight = (away**2).sum(axis=1)
+    rise = np.where(away != 0, sections.z - sections.line[:, None], 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = (away * rise).sum(axis=1) / weight
+    known = np.isfinite(sections.line)
+    good = known & np.isfinite(slope) & (np.abs(slope) < STEEPEST)
+    good &= np.abs(away).max(axis=1, initial=0.0) >= LEAST_ACROSS_M
+    s = sections.s
+    angle = np.full(len(s), np.nan)
+    if good.any():
+        angle[known] = np.interp(s[known], s[good], np.arctan(slope[good]))
+    elif known.any():
+        angle[known] = 0.0
+    reach = float(np.abs(sections.t).max(initial=1.0))
+    return _profile(sections, angle, _slopes(s, angle), old, beyond, tolerance / max(reach, 1.0))
+
+
+def _profile(
+    sections: CrossSections, values: Floats, slopes: Floats, old: Floats, beyond: Beyond, tolerance: float
+) -> Floats | None:
+    """Return pieces along the whole road: of the surface where it is, else by what `beyond` says."""
+    s, known = sections.s, np.isfinite(values)
+    both = known[:-1] & known[1:]
+    if not both.any():
+        return None
+    parts, start = list[Floats](), 0
+    for has, group in groupby(both.tolist()):
+        end = start + len(list(group))
+        if has:
+            here = slice(start, end + 1)
+            parts.append(cubic_pieces(s[here], values[here], slopes[here], tolerance))
+        else:
+            outer = start == 0 or end == len(both)
+            bridged = not outer and (beyond == "flat" or bool(sections.joined[start + 1 : end].all()))
+            if bridged:
+                ends = [start, end]
+                parts.append(cubic_pieces(s[ends], values[ends], slopes[ends], np.inf))
+            elif beyond == "flat":
+                level = values[end if start == 0 else start]
+                parts.append(np.array([[s[start], level, 0.0, 0.0, 0.0]]))
+            else:
+                # The last place with ground still has its height.
+                first = float(s[start]) + (BREAK_M if start else 0.0)
+                parts.append(_part(old, first, float(s[end])))
+        start = end
+    return np.vstack(parts)
+
+
+def _part(pieces: Floats, start: float, end: float) -> Floats:
+    """Return the pieces from one distance to another; the first one begins there."""
+    inner = pieces[(pieces[:, 0] > start) & (pieces[:, 0] < end)]
+    first = pieces[max(int(np.searchsorted(pieces[:, 0], start, side="right")) - 1, 0)]
+    s, a, b, c, d = first
+    x = start - s
+    moved = [start, a + x * (b + x * (c + x * d)), b + x * (2 * c + 3 * d * x), c + 3 * d * x, d]
+    return np.vstack([moved, inner])
+
+
+def _slopes(s: Floats, values: Floats) -> Floats:
+    """Return the derivative of values along each stretch without NaN."""
+    slopes, start = np.zeros(len(s)), 0
+    for known, group in groupby(np.isfinite(values).tolist()):
+        end = start + len(list(group))
+        if known and end - start > 1:
+            slopes[start:end] = np.gradient(values[start:end], s[start:end])
+        start = end
+    return slopes

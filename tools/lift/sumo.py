@@ -1,0 +1,337 @@
+"""Networks of SUMO (``.net.xml``): heights in the shapes of edges, lanes and junctions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.text import shown
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.quality.flagged import passed
+from flexroad.tasks.types import Floats
+from flexroad.tools.lift import xml_text
+from flexroad.tools.lift.batches import with_heights
+from flexroad.tools.lift.levels import ANY, Numbers, along, level_of, tagged_level
+from flexroad.tools.lift.lines import STEP_M, Line, largest
+from flexroad.tools.lift.meetings import Meetings
+from flexroad.tools.lift.types import Frame, Heights, HeightsAt, Lifted, Options
+from flexroad.tools.lift.xml_text import Part
+
+NOUN = "edge"
+"""What a row of the report is."""
+STEPS = False
+"""Whether heights have the steps beside roads."""
+NO_PROJECTION = ("", "!", "-", ".")
+"""Values of ``projParameter`` of networks without a CRS."""
+DIGITS = 3
+"""Decimal places of heights, and at least of the vertices that are added."""
+
+
+def frame(source: Path) -> Frame:
+    """Return where the coordinates of a network are, by its element ``location``."""
+    with xml_text.opened(source) as file:
+        for part in xml_text.parts(file, {"location"}):
+            if isinstance(part, Part):
+                x, y, z = _offset(part.element)
+                crs = (part.element.get("projParameter") or "").strip()
+                return Frame(None if crs in NO_PROJECTION else crs, -x, -y, -z)
+    return Frame(None)
+
+
+def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Iterator[Lifted]:
+    """Copy a network with heights; yield a row of the report for each edge.
+
+    A second copy follows if the first one has met roads above roads or the limit of the surface: what a line
+    has there depends on those that it meets.
+
+    Raises
+    ------
+    TaskError
+        If the file cannot be read; continues a sentence that begins with its name.
+    """
+    network = _Network.read(source)
+    copy = _Copy(network, Meetings(), heights, options)
+    rows = list(copy.written(source, out))
+    if copy.meetings.lines or (options.flat_ends and copy.meetings.open):
+        copy.meetings.decide()
+        rows = list(replace(copy, decided=True).written(source, out))
+    yield from rows
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """The vertices of a line, of an area or of a junction's place."""
+
+    element: ET.Element
+    name: str
+    """Attribute of the element: ``shape``, ``outlineShape``; ``z`` for the place of a junction."""
+    vertices: tuple[str, ...]
+    """As the file has them: ``x,y`` or ``x,y,z``."""
+    before: Floats
+    """Heights that the vertices had; NaN without."""
+    line: Line
+    area: bool = False
+    """Whether it is an outline, which gets no vertices."""
+
+    @classmethod
+    def of(cls, element: ET.Element, name: str, text: str, area: bool = False) -> _Shape | None:
+        """Return a shape; None if it has no vertices."""
+        vertices = tuple(text.split())
+        if not vertices:
+            return None
+        try:
+            values = [[float(number) for number in vertex.split(",")] for vertex in vertices]
+        except ValueError:
+            values = [[]]
+        if not text.isascii() or {len(vertex) for vertex in values} - {2, 3}:
+            named = f"{element.tag} {shown(element.get('id'))}"
+            raise TaskError(f"has coordinates that are no numbers ({named}: {shown(text)}); correct them")
+        table = np.array([[*vertex, np.nan][:3] for vertex in values])
+        table[~np.isfinite(table)] = np.nan
+        line = Line.of(table[:, 0], table[:, 1], step=np.inf if area else STEP_M)
+        return cls(element, name, vertices, table[:, 2], line, area)
+
+    @property
+    def ends(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The coordinates of its ends in plan, as the file has them."""
+        first, last = (tuple(self.vertices[i].split(",")[:2]) for i in (0, -1))
+        return first, last
+
+    def text(self, index: NDArray[np.intp], z: Floats) -> str:
+        """Return some of its points with heights; those without keep what they had."""
+        number = np.cumsum(self.line.own) - 1
+        decimals = [len(each.partition(".")[2]) for each in self.vertices[0].split(",")[:2]]
+        digits = max(DIGITS, *decimals)
+        parts = list[str]()
+        for i in index.tolist():
+            if self.line.own[i]:
+                text = self.vertices[number[i]]
+            else:
+                text = f"{self.line.x[i]:.{digits}f},{self.line.y[i]:.{digits}f}"
+            if np.isfinite(z[i]):
+                text = f"{','.join(text.split(',')[:2])},{z[i]:.{DIGITS}f}"
+            parts.append(text)
+        return " ".join(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """An edge or a junction."""
+
+    part: Part
+    shapes: tuple[_Shape, ...]
+
+    @property
+    def points(self) -> tuple[Floats, Floats]:
+        lines = [shape.line for shape in self.shapes]
+        x, y = ([getattr(line, name) for line in lines] or [np.zeros(0)] for name in "xy")
+        return np.concatenate(x), np.concatenate(y)
+
+
+@dataclass(frozen=True, eq=False)
+class _Network:
+    """What is read of a network before it is copied."""
+
+    places: dict[str, str]
+    """``x,y`` of each junction, as the file has it."""
+
+    @classmethod
+    def read(cls, source: Path) -> _Network:
+        places = dict[str, str]()
+        with xml_text.opened(source) as file:
+            for part in xml_text.parts(file, {"junction"}):
+                if isinstance(part, Part) and part.element.get("type") != "internal":
+                    x, y = (part.element.get(name, "") for name in "xy")
+                    places[part.element.get("id", "")] = f"{x},{y}"
+        return cls(places)
+
+    def piece(self, part: bytes | Part) -> bytes | _Piece:
+        """Return an edge or junction with its shapes, all other text as it is."""
+        if isinstance(part, bytes):
+            return part
+        if part.path != ("net",):
+            return part.text
+        shapes = self._of_edge(part.element) if part.element.tag == "edge" else _of_junction(part.element)
+        return _Piece(part, tuple(shape for shape in shapes if shape is not None))
+
+    def _of_edge(self, edge: ET.Element) -> Iterator[_Shape | None]:
+        area = edge.get("function") == "walkingarea"
+        for lane in edge.findall("lane"):
+            yield _Shape.of(lane, "shape", lane.get("shape", ""), area)
+            yield _Shape.of(lane, "outlineShape", lane.get("outlineShape", ""), True)
+        ends = [self.places.get(edge.get(name, "")) for name in ("from", "to")]
+        # An edge without a shape is straight, from junction to junction.
+        yield _Shape.of(
+            edge, "shape", edge.get("shape") or ("" if None in ends else " ".join(map(str, ends)))
+        )
+
+
+def _of_junction(junction: ET.Element) -> Iterator[_Shape | None]:
+    place = ",".join(junction.get(name, "") for name in ("x", "y", "z") if name in junction.attrib)
+    yield _Shape.of(junction, "z", place, True)
+    yield _Shape.of(junction, "shape", junction.get("shape", ""), True)
+
+
+def _offset(location: ET.Element) -> tuple[float, float, float]:
+    """Return what has been added to coordinates: x, y and height (m)."""
+    text = location.get("netOffset") or "0,0"
+    try:
+        x, y, z = (*map(float, text.split(",")), 0.0)[:3]
+    except ValueError:
+        x = y = z = np.nan
+    if not np.isfinite([x, y, z]).all():
+        raise TaskError(f"has the netOffset {shown(text)}, not two or three numbers; correct it")
+    return x, y, z
+
+
+@dataclass(frozen=True, eq=False)
+class _Copy:
+    """A copy of a network with heights."""
+
+    network: _Network
+    meetings: Meetings
+    heights: HeightsAt
+    options: Options
+    decided: bool = False
+    """Whether it is known what lines share where they meet; else this is noted."""
+
+    def written(self, source: Path, out: Path) -> Iterator[Lifted]:
+        """Write the copy; yield the rows of the report."""
+        with xml_text.opened(source) as file, xml_text.written(out) as copy:
+            pieces = map(self.network.piece, xml_text.parts(file, {"edge", "junction"}))
+            found = with_heights(
+                pieces, lambda each: None if isinstance(each, bytes) else each.points, self.heights
+            )
+            for piece, heights in found:
+                if isinstance(piece, bytes) or heights is None:
+                    assert isinstance(piece, bytes)
+                    copy.write(piece)
+                    continue
+                text, row = self._lifted(piece, heights)
+                copy.write(text)
+                if row is not None:
+                    yield row
+
+    def _lifted(self, piece: _Piece, heights: Heights) -> tuple[bytes, Lifted | None]:
+        """Return an edge or junction with heights, and the row of an edge."""
+        element = piece.part.element
+        level = tagged_level({each.get("key", ""): each.get("value", "") for each in element.iter("param")})
+        own = level_of(heights, level) if level else None
+        edits, lanes, start = dict[ET.Element, dict[str, str]](), list[Lifted](), 0
+        for shape in piece.shapes:
+            end = start + len(shape.line.s)
+            here = heights[start:end]
+            z, numbers = self._heights(element, shape, here, own)
+            without = shape.line.length_where(~np.isfinite(z))
+            if level < 0 and own is None:
+                # A tunnel whose level is not known meets other roads at its ends alone.
+                z[1:-1] = np.nan
+            start, taken = end, z
+            if self.options.flat_ends and self.decided:
+                z = self.meetings.going_on(shape.line, None if shape.area else shape.ends, z)
+            elif self.options.flat_ends and not shape.area:
+                self.meetings.note_open(shape.ends, z)
+            index = shape.line.needed(z, self.options.tolerance_m, self.options.add_vertices is not False)
+            self._edit(shape, index, z, edits)
+            if shape.element.tag == "lane" and not shape.area:
+                row = self._row(shape, taken, index, numbers)
+                flags = passed(here.flags_on(numbers))
+                lanes.append(replace(row, without_ground_m=without, flags=flags))
+        edited = [piece.part.with_attributes(each, values) for each, values in edits.items()]
+        text = piece.part.replaced(edited)
+        if not lanes or element.get("function"):
+            return text, None
+        return text, _joined(element.get("id", ""), lanes, unknown=bool(level) and own is None)
+
+    def _heights(
+        self, element: ET.Element, shape: _Shape, heights: Heights, own: int | None
+    ) -> tuple[Floats, Numbers]:
+        """Return the heights of the points of a shape, and the numbers of their levels."""
+        size, ends = len(shape.line.s), shape.ends
+        junctions = (element.get("from", ""), element.get("to", "")) if "from" in element.attrib else None
+        if shape.area:
+            name = element.get("id", "")
+            # Edges within a junction are named ":JUNCTION_NUMBER".
+            junction = name[1:].rpartition("_")[0] if name.startswith(":") else name
+            wanted = np.full(size, self.meetings.level(junction), np.int8)
+            z, numbers = along(heights, wanted)
+            _complete(shape.line, z, numbers, wanted)
+        elif self.decided:
+            known = self.meetings.ends
+            first, last = known.get(ends[0]), known.get(ends[1])
+            if shape.element is element and junctions:
+                first, last = map(self.meetings.level, junctions)
+            wanted = self.meetings.wanted(heights, first, last)
+            if own is not None:
+                wanted[1:-1] = own
+            z, numbers = along(heights, wanted)
+        else:
+            if shape.element is not element:
+                self.meetings.note(shape.line, ends, heights, own, junctions)
+            z, numbers = along(heights, np.full(size, ANY if own is None else own, np.int8))
+        return z, numbers
+
+    def _edit(
+        self, shape: _Shape, index: NDArray[np.intp], z: Floats, edits: dict[ET.Element, dict[str, str]]
+    ) -> None:
+        """Add the new values of attributes of a shape's element."""
+        values = edits.setdefault(shape.element, {})
+        if not np.isfinite(z[index]).any():
+            return
+        if shape.name == "z":
+            values["z"] = f"{z[0]:.{DIGITS}f}"
+        elif shape.name in shape.element.attrib or len(index) > len(shape.vertices):
+            values[shape.name] = shape.text(index, z)
+
+    def _row(self, shape: _Shape, z: Floats, index: NDArray[np.intp], numbers: Numbers) -> Lifted:
+        """Return the figures of a lane with heights of the surface, NaN without."""
+        line = shape.line
+        grade, steep = line.grades(z, self.options.grade_limit)
+        return Lifted(
+            "",
+            length_m=float(line.s[-1]),
+            levels=tuple(np.unique(numbers[np.isfinite(z)]).tolist()),
+            before_m=largest(np.abs(shape.before - z[line.own])),
+            elevation_m=largest(np.abs(np.interp(line.s, line.s[index], z[index]) - z)),
+            grade=grade,
+            steep=steep,
+        )
+
+
+def _complete(line: Line, z: Floats, numbers: Numbers, wanted: Numbers) -> None:
+    """Give the corners of an area that lie beside its deck the height of the nearest one on it."""
+    beside = np.isfinite(z) & (numbers != wanted)
+    on = np.flatnonzero(np.isfinite(z) & ~beside)
+    for i in np.flatnonzero(beside) if len(on) else ():
+        z[i] = z[on[np.argmin(np.hypot(line.x[on] - line.x[i], line.y[on] - line.y[i]))]]
+
+
+def _joined(name: str, lanes: list[Lifted], unknown: bool) -> Lifted:
+    """Return the row of an edge: of each figure, the largest one of its lanes."""
+    length, without, before, off, grade = (
+        largest(np.array(values))
+        for values in zip(
+            *(
+                (each.length_m, each.without_ground_m, each.before_m, each.elevation_m, each.grade)
+                for each in lanes
+            ),
+            strict=True,
+        )
+    )
+    return Lifted(
+        name,
+        length_m=length,
+        without_ground_m=without,
+        levels=tuple(sorted({number for lane in lanes for number in lane.levels})),
+        unknown_deck_m=length - without if unknown else 0.0,
+        before_m=before,
+        elevation_m=off,
+        grade=grade,
+        steep=tuple(place for lane in lanes for place in lane.steep),
+        flags=passed(np.array([lane.flags for lane in lanes], np.uint16)),
+    )

@@ -1,0 +1,255 @@
+"""Rasters from points in buckets on disk, made block by block and in parallel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from flexroad.catalog import Grid
+from flexroad.catalog.text import count
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.tasks import memory
+from flexroad.tasks.types import Orthophoto
+from flexroad.tools.prepare.output import disk_errors
+from flexroad.tools.prepare.point_buckets import BlockIndex, PointBuckets
+from flexroad.tools.prepare.point_reading import BucketedPoints
+from flexroad.tools.prepare.points.to_rasters import (
+    Options,
+    cells_reach_m,
+    of_cells,
+    of_points,
+    points_reach_m,
+)
+from flexroad.tools.prepare.raster_writer import GROUND, RasterWriter
+from flexroad.tools.prepare.types import CellHeights, TopLayer
+
+POINT_BYTES, CELL_BYTES, PIXEL_BYTES = 200, 200, 20
+"""Memory that a block takes per point, cell and pixel of the orthophoto (bytes); measured."""
+LAYERS = 8
+"""Arrays in the file of a block: those of `CellHeights`, in the order of its fields."""
+
+
+@dataclass(frozen=True)
+class _PointsJob:
+    """The input of a worker call that reads the points of a block."""
+
+    buckets: PointBuckets
+    """Those that overlap the block and its rim."""
+    grid: Grid
+    """Cells of the block."""
+    options: Options
+    pixels: Grid | None
+    """Pixels of the orthophoto; None if there is none."""
+    target: Path
+    """Output file, ``.npz``: the heights of the cells and the orthophoto."""
+
+
+@dataclass(frozen=True)
+class _CellsJob:
+    """The input of a worker call that makes the rasters of a block from the heights of cells."""
+
+    grid: Grid
+    """Cells of the block."""
+    options: Options
+    sources: tuple[tuple[Grid, Path], ...]
+    """Outputs of `_PointsJob` on the block and on the rim around it."""
+    target: Path
+    """Output file with the rasters, ``.npz``."""
+
+
+def write_blocks(
+    writer: RasterWriter,
+    bucketed: BucketedPoints,
+    options: Options,
+    executor: Executor,
+    log: Callable[[str], None],
+) -> None:
+    """Make the rasters of all blocks and write them; a progress bar is shown on stderr.
+
+    The points of each block are read first; rasters then take the cells around a block, too, but no points.
+
+    Parameters
+    ----------
+    writer : RasterWriter
+        Writer of the output rasters. Its grid is aligned to the block edges to whole cells.
+    bucketed : BucketedPoints
+        The points on disk; they are removed.
+    options : Options
+        How points become rasters.
+    executor : Executor
+        Runs two worker calls per block, on workers that are held.
+    log : Callable[[str], None]
+        Called with a line of progress: the number of blocks.
+
+    Raises
+    ------
+    ConfigError
+        If the disk is full, or a worker dies.
+    TaskError
+        If a block would not fit in memory.
+    """
+    first = list(_points_jobs(writer, bucketed, options))
+    second = list(_cells_jobs(writer, bucketed, options, first))
+    _check_memory(first, second)
+    log(f"{count(len(second), 'block')} of {bucketed.buckets.edge:g} m")
+    read = executor.map(_read_points, first, _fail)
+    for points_job in track(read, "reading points", len(first), console=Console(stderr=True)):
+        _write_photo(writer, points_job)
+    bucketed.buckets.remove()
+    made = executor.map(_make_rasters, second, _fail)
+    for cells_job in track(made, "making rasters", len(second), console=Console(stderr=True)):
+        _write_block(writer, cells_job)
+
+
+def _points_jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Options) -> Iterator[_PointsJob]:
+    """Yield the blocks near points."""
+    buckets, whole = bucketed.buckets, writer.grid
+    # Points sampled from a mesh have no colours: the orthophoto is drawn from its texture.
+    dop_cell = writer.photo_grid.cell if writer.photo_grid and any(bucketed.has_colours) else None
+    # A point on the eastern or southern border of the area is in a cell outside, whose height counts, too.
+    wider = whole.buffered(whole.cell)
+    for index in buckets.overlapping(wider):
+        grid, inner = (_block_grid(part, buckets.edge, index) for part in (wider, whole))
+        reach = points_reach_m(options, whole.cell)
+        if grid and (near := buckets.around(grid, reach)).parts:
+            pixels = Grid.covering(inner.crs, inner.bounds, dop_cell) if inner and dop_cell else None
+            yield _PointsJob(near, grid, options, pixels, writer.scratch / f"{index[0]}_{index[1]}.npz")
+
+
+def _cells_jobs(
+    writer: RasterWriter, bucketed: BucketedPoints, options: Options, of_points: Sequence[_PointsJob]
+) -> Iterator[_CellsJob]:
+    """Yield the blocks whose rasters can depend on points."""
+    buckets, cell = bucketed.buckets, writer.grid.cell
+    reach, heights = cells_reach_m(options, cell), {job.target.stem: job for job in of_points}
+    for index in buckets.overlapping(writer.grid):
+        grid = _block_grid(writer.grid, buckets.edge, index)
+        if not grid:
+            continue
+        around = [heights.get(f"{col}_{row}") for col, row in buckets.overlapping(grid, reach)]
+        sources = tuple((job.grid, job.target) for job in around if job)
+        if sources:
+            target = writer.scratch / f"{index[0]}_{index[1]}.rasters.npz"
+            yield _CellsJob(grid, options, sources, target)
+
+
+def _check_memory(of_points: Sequence[_PointsJob], of_cells: Sequence[_CellsJob]) -> None:
+    """Check that each block with its rim fits in memory.
+
+    Raises
+    ------
+    TaskError
+        If a block has too many points or cells.
+    """
+    counts: dict[BlockIndex, int] = {}
+    for job in of_points:
+        reach = points_reach_m(job.options, job.grid.cell)
+        rim, points = job.grid.buffered(reach), 0.0
+        for index in job.buckets.overlapping(job.grid, reach):
+            if index not in counts:
+                counts[index] = job.buckets.count(index)
+            # The points of a block may lie anywhere in it; of its neighbours only the rim is kept.
+            is_whole = job.buckets.share(index, job.grid.bounds) > 0
+            points += counts[index] * (1 if is_whole else job.buckets.share(index, rim.bounds))
+        pixels = job.pixels.width * job.pixels.height if job.pixels else 0
+        _check_block(job.grid, points, float(rim.width * rim.height), pixels)
+    for block in of_cells:
+        rim = block.grid.buffered(cells_reach_m(block.options, block.grid.cell))
+        _check_block(block.grid, 0.0, float(rim.width * rim.height), 0)
+
+
+def _check_block(grid: Grid, points: float, cells: float, pixels: int) -> None:
+    memory.check(
+        POINT_BYTES * points + CELL_BYTES * cells + PIXEL_BYTES * pixels,
+        f"block {grid.west:.0f}_{grid.south:.0f}, {points:,.0f} points and {cells:,.0f} cells,",
+        "thin the points, or use larger cells (--cell, --dop-cell)",
+    )
+
+
+def _block_grid(whole: Grid, edge: float, index: BlockIndex) -> Grid | None:
+    """Return the cells of a block that are part of the complete grid, or None if there are none."""
+    left, right = (round((index[0] * edge + d - whole.west) / whole.cell) for d in (0, edge))
+    top, bottom = (round((whole.north - index[1] * edge - d) / whole.cell) for d in (edge, 0))
+    left, right = max(left, 0), min(right, whole.width)
+    top, bottom = max(top, 0), min(bottom, whole.height)
+    if left >= right or top >= bottom:
+        return None
+    west, north = whole.west + left * whole.cell, whole.north - top * whole.cell
+    return Grid(whole.crs, west, north, whole.cell, right - left, bottom - top)
+
+
+def _read_points(job: _PointsJob) -> _PointsJob:
+    reach = points_reach_m(job.options, job.grid.cell)
+    points = job.buckets.read(job.grid, reach, with_colours=job.pixels is not None)
+    heights, photo = of_points(points, job.grid, job.options, job.pixels)
+    top = heights.top
+    layers = [heights.highest, top.height, top.count, top.spread, *heights.ground, heights.bridges]
+    arrays: dict[str, NDArray[Any]] = {"heights": np.stack(layers)}
+    if photo:
+        arrays |= {"colour": photo.colour, "known": photo.known}
+    _save(job.target, arrays)
+    return job
+
+
+def _make_rasters(job: _CellsJob) -> _CellsJob:
+    rim = job.grid.buffered(cells_reach_m(job.options, job.grid.cell))
+    rasters = of_cells(_heights(job.sources, rim), rim, job.grid, job.options)
+    top = rasters.top
+    layers = {"dsm": rasters.dsm, "dtm": rasters.dtm}
+    layers["road_height"] = np.stack([top.height, top.count, top.spread])
+    if rasters.bridges is not None:
+        layers["bridges"] = rasters.bridges
+    arrays: dict[str, NDArray[Any]] = {name: heights.astype(np.float32) for name, heights in layers.items()}
+    arrays[GROUND] = rasters.ground
+    _save(job.target, arrays)
+    return job
+
+
+def _heights(sources: Sequence[tuple[Grid, Path]], rim: Grid) -> CellHeights:
+    """Return the heights of the cells of several blocks on one grid; cells of no block have no points."""
+    layers = np.full((LAYERS, *rim.shape), np.nan)
+    # The number of points of the top layer.
+    layers[2] = 0
+    for grid, path in sources:
+        with np.load(path) as file:
+            heights = file["heights"]
+        east, north = grid.west - rim.west, grid.north - rim.north
+        left, top = round(east / rim.cell), round(-north / rim.cell)
+        columns = slice(max(left, 0), min(left + grid.width, rim.width))
+        rows = slice(max(top, 0), min(top + grid.height, rim.height))
+        part = heights[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+        layers[:, rows, columns] = part
+        layers[4, rows, columns] += east
+        layers[5, rows, columns] += north
+    return CellHeights(layers[0], TopLayer(*layers[1:4]), layers[4:7], layers[7])
+
+
+def _save(target: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    with disk_errors(target.parent.parent):
+        np.savez(target, allow_pickle=False, **arrays)
+
+
+def _fail(job: _PointsJob | _CellsJob, reason: str) -> NoReturn:
+    raise ConfigError(f"block {job.grid.west:.0f}_{job.grid.south:.0f}: {reason}; use fewer workers")
+
+
+def _write_photo(writer: RasterWriter, job: _PointsJob) -> None:
+    if job.pixels:
+        with np.load(job.target) as file:
+            writer.write_photo(Orthophoto(job.pixels, file["colour"], file["known"]))
+
+
+def _write_block(writer: RasterWriter, job: _CellsJob) -> None:
+    with np.load(job.target) as rasters:
+        for layer in ("dsm", "dtm", "road_height", "bridges", GROUND):
+            if layer in rasters:
+                writer.write(layer, job.grid, rasters[layer])
+    job.target.unlink()

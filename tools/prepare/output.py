@@ -1,0 +1,114 @@
+"""The output folder of a ``prepare`` command: its files, which replace no existing files, and its errors."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from flexroad.catalog import LAYERS
+from flexroad.catalog.guard.open_raster import ERRORS, open_raster
+from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.storage.scratch import ScratchFolder
+from flexroad.catalog.text import write_reason
+from flexroad.pipeline.errors import ConfigError
+
+CATALOG = "catalog.parquet"
+NAMES = (CATALOG, *(f"{layer}.tif" for layer in LAYERS))
+"""The files that a command writes, or removes if it does not write them."""
+LAYER_TAG = "LAYER"
+"""TIFF tag with the layer of a raster: shows that this program has written it."""
+FULL = (errno.ENOSPC, errno.EDQUOT)
+FULL_BYTES = 2**24
+"""A disk with less free space counts as full if an error has no number, as those of GDAL."""
+
+
+def check_replaced(out: Path) -> None:
+    """Check that all files that will be replaced in an output folder are of an earlier ``prepare``.
+
+    A raster is, if it has the tag of its layer. The catalog is, if it lies beside such a DSM: it is removed
+    before the rasters are, and written after them.
+
+    Raises
+    ------
+    ConfigError
+        If a file is of another program, or is no regular file, or the folder is a file.
+    """
+    if not out.is_dir():
+        if out.exists():
+            raise ConfigError(f"{out} is a file; choose a folder with -o")
+        return
+    for name in NAMES:
+        with disk_errors(out / name):
+            present = output_file(out / name).exists()
+        if present and not _is_own(out / ("dsm.tif" if name == CATALOG else name)):
+            raise ConfigError(
+                f"{out / name} is not of an earlier `flexroad prepare` and would be replaced; "
+                "choose another folder with -o, or move that file away"
+            )
+
+
+def _is_own(raster: Path) -> bool:
+    try:
+        with open_raster(raster) as source:
+            return bool(source.tags().get(LAYER_TAG) == raster.stem)
+    except ERRORS:
+        return False
+
+
+@contextlib.contextmanager
+def disk_errors(where: Path) -> Iterator[None]:
+    """Context manager that turns an `OSError` of the disk into a `ConfigError` of one line.
+
+    Raises
+    ------
+    ConfigError
+        If the disk is full or the file or folder cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise write_error(where, error) from error
+
+
+@contextlib.contextmanager
+def scratch_folder(out: Path) -> Iterator[Path]:
+    """Context manager that makes a hidden temporary folder inside ``out`` and removes it at the end.
+
+    ``out`` is created if it does not exist, and removed again if nothing was written to it.
+
+    Raises
+    ------
+    ConfigError
+        If the folder cannot be written.
+    """
+    new = not out.exists()
+    try:
+        with contextlib.ExitStack() as stack:
+            with disk_errors(out):
+                out.mkdir(parents=True, exist_ok=True)
+                folder = Path(stack.enter_context(ScratchFolder(out)))
+            yield folder
+    finally:
+        if new:
+            # Fails, as intended, if the folder has published rasters.
+            with contextlib.suppress(OSError):
+                out.rmdir()
+
+
+def write_error(where: Path, error: Exception) -> ConfigError:
+    """Return the error of a file or folder that cannot be written: one line with reason and remedy."""
+    remedy = "correct that or choose another folder with -o"
+    if _is_full(where, getattr(error, "errno", None)):
+        remedy = "free disk space and repeat"
+    return ConfigError(f"cannot write to {where}: {write_reason(error)}; {remedy}")
+
+
+def _is_full(where: Path, number: int | None) -> bool:
+    """Return whether an error means a full disk; ``number`` is its errno, None if it has none."""
+    if number is not None:
+        return number in FULL
+    existing = next(folder for folder in (where.absolute(), *where.absolute().parents) if folder.exists())
+    return shutil.disk_usage(existing).free < FULL_BYTES

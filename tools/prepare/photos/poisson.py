@@ -1,0 +1,99 @@
+"""Poisson surface reconstruction (Kazhdan & Hoppe, 2013) of oriented points, by pycolmap.
+
+The reconstructed surface is closed; parts far from all points are invented, and are removed.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from flexroad.catalog.lazy import lazy
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Floats
+from flexroad.tools.prepare.mesh.sample import TexturedMesh
+from flexroad.tools.prepare.photos.mvs_cpu import Cloud
+from flexroad.tools.prepare.photos.sfm import colmap
+
+spatial = lazy("scipy.spatial")
+trimesh = lazy("trimesh")
+
+CELLS = 2.0
+"""Width of the octree's finest cells, in distances between points; smaller cells would fit the noise."""
+FAR = 5.0
+"""Vertices farther than this from all points, in distances between points, are removed."""
+DEEPEST = 13
+"""Largest depth of the octree, to limit the memory."""
+RECORD = np.dtype(
+    [(axis, "<f4") for axis in ("x", "y", "z", "nx", "ny", "nz")]
+    + [(band, "u1") for band in ("red", "green", "blue")]
+)
+HEADER = """ply
+format binary_little_endian 1.0
+element vertex {}
+{}
+end_header
+"""
+
+
+def poisson(
+    cloud: Cloud, spacing_m: float, crs: str, origin: Floats, work: Path, threads: int | None = None
+) -> TexturedMesh:
+    """Return the surface of a cloud as a mesh with vertex colours.
+
+    Parameters
+    ----------
+    cloud : Cloud
+        Points about ``spacing_m`` apart, with normals.
+    spacing_m : float
+        Distance between neighbouring points (m).
+    crs, origin : str, Floats
+        CRS, and the position of the cloud's origin in it: easting, northing, height, ``(3,)``, m.
+    work : Path
+        Folder for two temporary PLY files.
+    threads : int, optional
+        Number of threads; by default one per core.
+
+    Raises
+    ------
+    TaskError
+        If pycolmap is missing, or there are too few points for a surface.
+    """
+    pycolmap = colmap()
+    write_ply(work / "cloud.ply", cloud)
+    span = float(np.ptp(cloud.points, axis=0).max()) if len(cloud) else 0.0
+    depth = math.ceil(math.log2(max(1.1 * span / (CELLS * spacing_m), 2)))
+    options = pycolmap.PoissonMeshingOptions(
+        depth=min(depth, DEEPEST), trim=0.0, color=True, num_threads=threads or -1
+    )
+    pycolmap.poisson_meshing(work / "cloud.ply", work / "mesh.ply", options)
+    mesh = trimesh.load(work / "mesh.ply", process=False)
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    distance, _ = spatial.cKDTree(cloud.points).query(vertices, distance_upper_bound=FAR * spacing_m)
+    faces = faces[np.isfinite(distance)[faces].all(axis=1)]
+    if not len(faces):
+        raise TaskError(f"{len(cloud)} points give no surface; use photographs that overlap more")
+    return TexturedMesh(
+        crs=crs,
+        vertices=vertices + origin,
+        faces=faces.astype(np.int32),
+        texture=np.full(len(faces), -1, np.int32),
+        colours=np.asarray(mesh.visual.vertex_colors)[faces, :3],
+    )
+
+
+def write_ply(path: Path, cloud: Cloud) -> None:
+    """Write points, normals and colours as binary PLY."""
+    records = np.empty(len(cloud), RECORD)
+    for names, values in (
+        ("xyz", cloud.points),
+        (("nx", "ny", "nz"), cloud.normals),
+        (("red", "green", "blue"), cloud.colours),
+    ):
+        for name, column in zip(names, values.T, strict=True):
+            records[name] = column
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    lines = "\n".join(f"property {kinds[RECORD[name].str]} {name}" for name in RECORD.names or ())
+    path.write_bytes(HEADER.format(len(cloud), lines).encode() + records.tobytes())

@@ -1,0 +1,265 @@
+"""Points of many files, decoded by jobs and sorted into buckets on disk; each point is decoded once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from itertools import groupby
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog import Bounds, CatalogError
+from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
+from flexroad.catalog.scan.point_clouds import CHUNK, Chunk, Cloud, chunks, survey_dates
+from flexroad.catalog.to_metres import MetricTransform
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.tasks.compiled import compiled
+from flexroad.tasks.types import Floats
+from flexroad.tools.prepare.limits import check_extent
+from flexroad.tools.prepare.output import disk_errors
+from flexroad.tools.prepare.point_buckets import (
+    BYTE,
+    PER_METRE,
+    RECORD,
+    WORDS,
+    BlockIndex,
+    BlockPart,
+    Integers,
+    PointBuckets,
+    Words,
+    append,
+)
+
+Dates = tuple[datetime, datetime]
+"""When the first and the last point were measured."""
+SHIFT = 8
+"""Number of bits by which colours of 16 bits are moved to the right."""
+
+
+@dataclass(frozen=True, eq=False)
+class BucketedPoints:
+    """The points in the buckets, and statistics of the input files."""
+
+    buckets: PointBuckets
+    bounds: Bounds
+    """Bounds of all points: west, south, east, north (m)."""
+    kinds: tuple[Integers, ...]
+    """Number of points of each class, ``(256,)``, per file; without noise."""
+    has_colours: tuple[bool, ...]
+    """Whether the points have colours, per file."""
+    out_of_range: int
+    """Number of points left out because their height is outside `LOWEST_M`..`HIGHEST_M`."""
+    dates: Dates | None = None
+    """When the first and the last point were measured, or None if that is not known of every file."""
+
+    @property
+    def occupied(self) -> frozenset[BlockIndex]:
+        """The blocks with points."""
+        return frozenset(self.buckets.parts)
+
+    @property
+    def points(self) -> int:
+        """Number of points in all buckets."""
+        return int(sum(kinds.sum() for kinds in self.kinds))
+
+
+@dataclass(frozen=True)
+class _Job:
+    """The input of a worker call that reads a part of a file."""
+
+    cloud: Cloud
+    file: int
+    """Number of the file."""
+    points: range
+    frame: MetricTransform
+    edge: float
+    """Edge of a block (m)."""
+    target: Path
+    """File of the points."""
+    shift: int | None = None
+    """By how many bits colours are moved to the right; None: `_Part.shift`."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What a job has read."""
+
+    job: _Job
+    block_parts: list[BlockPart]
+    outermost: Integers
+    """Easting and northing of the western-, southern-, eastern- and northernmost point, ``(2, 4)``, in stored
+    units; ``(2, 0)`` without points."""
+    kinds: Integers
+    """Number of points of each class, ``(256,)``."""
+    out_of_range: int
+    dates: Dates | None
+    shift: int | None
+    """`SHIFT` if the first chunk with colours other than black has 16 bits, 0 if 8, None if all are black."""
+
+
+def bucket_points(
+    clouds: Sequence[Cloud],
+    frame: MetricTransform,
+    folder: Path,
+    edge: float,
+    executor: Executor,
+    log: Callable[[str], None],
+) -> BucketedPoints:
+    """Move the points of all files to metres and sort them into buckets, except noise and withheld points.
+
+    Parameters
+    ----------
+    clouds : Sequence[Cloud]
+        The input files.
+    frame : MetricTransform
+        Transforms their coordinates to metres.
+    folder : Path
+        Folder for the files of points; they take 16 bytes per point.
+    edge : float
+        Edge of a block (m).
+    executor : Executor
+        Runs a worker call per million points.
+    log : Callable[[str], None]
+        Called with one line of progress per file.
+
+    Raises
+    ------
+    CatalogError
+        If a file cannot be read, points are too far apart or have no position in metres, or no point is left.
+    ConfigError
+        If the disk is full, or a worker dies.
+    """
+    parts: list[_Part] = []
+    bounds: Bounds | None = None
+    for part in executor.map(_read, _jobs(clouds, frame, folder, edge, log), _fail):
+        parts.append(part)
+        if part.block_parts:
+            plan = part.outermost / PER_METRE
+            check_extent(str(part.job.cloud.path), plan, bounds)
+            bounds = _joined(plan, bounds)
+    if bounds is None:
+        raise CatalogError(f"{clouds[0].path} has only noise points; leave it out")
+    parts.sort(key=lambda part: (part.job.file, part.job.points.start))
+    of_files = [list(of_file) for _, of_file in groupby(parts, lambda part: part.job.file)]
+    for _ in executor.map(_read, [job for of_file in of_files for job in _otherwise_shifted(of_file)], _fail):
+        pass
+    dates = [_span(part.dates for part in of_file) for of_file in of_files]
+    return BucketedPoints(
+        PointBuckets.of(edge, (own for part in parts for own in part.block_parts)),
+        bounds,
+        tuple(np.sum([part.kinds for part in of_file], axis=0) for of_file in of_files),
+        tuple(any(part.shift is not None for part in of_file) for of_file in of_files),
+        sum(part.out_of_range for part in parts),
+        None if None in dates else _span(dates),
+    )
+
+
+def _jobs(
+    clouds: Sequence[Cloud],
+    frame: MetricTransform,
+    folder: Path,
+    edge: float,
+    log: Callable[[str], None],
+) -> Iterator[_Job]:
+    for number, cloud in enumerate(clouds):
+        log(f"reading {cloud.path} ({number + 1} of {len(clouds)}, {cloud.points:,} points)")
+        for points in cloud.parts(CHUNK):
+            yield _Job(cloud, number, points, frame, edge, folder / f"{number}_{points.start}.points")
+
+
+def _otherwise_shifted(of_file: Sequence[_Part]) -> list[_Job]:
+    """Return the jobs to be repeated: whether colours have 8 or 16 bits is decided by the first of a file."""
+    shift = next((part.shift for part in of_file if part.shift is not None), None)
+    return [replace(part.job, shift=shift) for part in of_file if part.shift not in (None, shift)]
+
+
+def _joined(plan: Floats, bounds: Bounds | None) -> Bounds:
+    """Return the bounds of points, ``(2, n)``, and of those before."""
+    west, south, east, north = map(float, (*plan.min(axis=1), *plan.max(axis=1)))
+    if bounds is None:
+        return west, south, east, north
+    return min(west, bounds[0]), min(south, bounds[1]), max(east, bounds[2]), max(north, bounds[3])
+
+
+def _span(dates: Iterable[Dates | None]) -> Dates | None:
+    """Return the first and the last of the dates that are known, None if none is."""
+    known = [pair for pair in dates if pair]
+    return (min(first for first, _ in known), max(last for _, last in known)) if known else None
+
+
+def _read(job: _Job) -> _Part:
+    path, shift = job.cloud.path, job.shift
+    block_parts, outermost = list[BlockPart](), np.zeros((2, 0), np.int64)
+    kinds, out_of_range, dates = np.zeros(256, np.int64), 0, list[Dates | None]()
+    with disk_errors(job.target.parent.parent):
+        # A worker that died may have written a part of it.
+        job.target.unlink(missing_ok=True)
+    for chunk in chunks(path, CHUNK, points=job.points):
+        if shift is None and chunk.colour is not None and chunk.colour.any():
+            shift = SHIFT if chunk.colour.max() > BYTE else 0
+        try:
+            plan, records = _records(chunk, job.frame, shift or 0)
+        except CatalogError as error:
+            raise CatalogError(f"{path}: {error}") from error
+        dates.append(None if chunk.gps is None else survey_dates(chunk.gps))
+        out_of_range += len(chunk.z) - len(records)
+        if not len(records):
+            continue
+        check_extent(str(path), plan / PER_METRE, None)
+        outermost = _outermost(np.concatenate([outermost, plan], axis=1))
+        kinds += np.bincount(records["kind"], minlength=256)
+        with disk_errors(job.target.parent.parent):
+            block_parts += append(job.target, job.edge, plan[0], plan[1], records)
+    return _Part(job, block_parts, outermost, kinds, out_of_range, _span(dates), shift)
+
+
+def _outermost(plan: Integers) -> Integers:
+    """Return the outermost points of some, ``(2, 4)``; see `_Part`."""
+    return plan[:, [plan[0].argmin(), plan[1].argmin(), plan[0].argmax(), plan[1].argmax()]]
+
+
+def _fail(job: _Job, reason: str) -> NoReturn:
+    raise ConfigError(f"{job.cloud.path}: {reason}; use fewer workers")
+
+
+def _records(chunk: Chunk, frame: MetricTransform, shift: int) -> tuple[Integers, NDArray[np.void]]:
+    """Return eastings and northings in stored units, ``(2, n)``, and records with all other fields set."""
+    metres = frame.metres(chunk.x, chunk.y, chunk.z)
+    colour = np.zeros((1, 3), np.uint16) if chunk.colour is None else chunk.colour
+    plan, words = _in_units(*metres, chunk.kind, colour, shift)
+    return plan, words.view(RECORD).reshape(-1)
+
+
+@compiled()
+def _in_units(
+    easting: Floats,
+    northing: Floats,
+    height: Floats,
+    kind: NDArray[np.uint8],
+    colour: NDArray[np.uint16],
+    shift: int,
+) -> tuple[Integers, Words]:
+    """Return plan coordinates, ``(2, n)``, and records of the points whose height is in range."""
+    count = 0
+    for i in range(height.size):
+        count += LOWEST_M <= height[i] <= HIGHEST_M
+    plan, words = np.empty((2, count), np.int64), np.zeros((count, WORDS), np.int32)
+    k = 0
+    for i in range(height.size):
+        if LOWEST_M <= height[i] <= HIGHEST_M:
+            plan[0, k] = np.rint(easting[i] * PER_METRE)
+            plan[1, k] = np.rint(northing[i] * PER_METRE)
+            words[k, 2] = np.rint(height[i] * PER_METRE)
+            word = np.uint32(kind[i])
+            if colour.shape[0] == height.size:
+                for band in range(3):
+                    shade = np.uint32(min(colour[i, band] >> shift, BYTE))
+                    word |= shade << np.uint32(8 * (band + 1))
+            words[k, 3] = np.int32(word)
+            k += 1
+    return plan, words

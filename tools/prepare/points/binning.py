@@ -1,0 +1,159 @@
+"""The cell of each point, and what the points of a cell give: means, the highest point and the top layer.
+
+The highest of n points with noise is above the surface, the more so the more points a cell has. The mean of
+the points close below it, the top layer, is not, and still belongs to the uppermost surface: a deck, not the
+ground under it. A single point far above all around it is a spike.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.compiled import compiled
+from flexroad.tasks.types import Floats
+from flexroad.tools.prepare.types import TopLayer
+
+Cells = NDArray[np.int64]
+"""Row-major index of the cell of each point, ``(n,)``; -1 outside the grid."""
+
+NUDGE = 1e-6
+"""Part of a cell that is more than the rounding error of its edge's coordinates."""
+AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
+"""The 8 neighbours of a cell."""
+
+
+def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
+    """Return the cell of each point, ``(n,)``, row-major; -1 outside the grid.
+
+    A point on the border of two cells belongs to the eastern or southern one. Rounding does not change that,
+    so all grids of the same lattice give the same result.
+    """
+    cells: Cells = _bins(
+        np.asarray(easting), np.asarray(northing), grid.west, grid.north, grid.cell, grid.height, grid.width
+    )
+    return cells
+
+
+@compiled()
+def _bins(
+    easting: Floats, northing: Floats, west: float, north: float, cell: float, rows: int, cols: int
+) -> Cells:
+    cells = np.full(easting.size, -1, np.int64)
+    for i in range(easting.size):
+        col = math.floor((easting[i] - west) / cell + NUDGE)
+        row = math.floor((north - northing[i]) / cell + NUDGE)
+        if 0 <= row < rows and 0 <= col < cols:
+            cells[i] = row * cols + col
+    return cells
+
+
+def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats, ...]:
+    """Return the mean of each array of values per cell, each ``(H, W)``; NaN in cells without points.
+
+    Values are summed in the order of the points: another order changes only the last digits.
+
+    Parameters
+    ----------
+    cells : Cells
+        The cells of the points, ``(n,)``; points outside the grid are left out.
+    shape : tuple of int
+        Rows and columns.
+    *values : Floats
+        One value per point, ``(n,)``.
+    """
+    size = shape[0] * shape[1]
+    with np.errstate(invalid="ignore"):
+        return tuple(np.divide(*_totals(cells, value, size)).reshape(shape) for value in values)
+
+
+@compiled()
+def _totals(cells: Cells, value: Floats, size: int) -> tuple[Floats, Floats]:
+    """Return the sum of the values and their number, per cell."""
+    total, count = np.zeros(size), np.zeros(size)
+    for i in range(cells.size):
+        if cells[i] >= 0:
+            total[cells[i]] += value[i]
+            count[cells[i]] += 1.0
+    return total, count
+
+
+def highest(cells: Cells, height: Floats, shape: tuple[int, int]) -> Floats:
+    """Return the height of the highest point per cell, ``(H, W)``; NaN in cells without points."""
+    top, _, _ = _two_highest(cells, height, shape[0] * shape[1])
+    return np.where(np.isneginf(top), np.nan, top).reshape(shape)
+
+
+def spikes(cells: Cells, height: Floats, shape: tuple[int, int], despike_m: float) -> NDArray[np.int64]:
+    """Return the indices of single points far above all points around them, ``(k,)``.
+
+    The highest point of a cell is a spike if it is more than ``despike_m`` above the second highest point of
+    its cell and above the highest points of all 8 neighbours. A pole or a crown with two points is not a
+    spike, nor is a point without any points around it. A cell has at most one spike.
+    """
+    top, second, index = _two_highest(cells, height, shape[0] * shape[1])
+    around = ndimage.maximum_filter(top.reshape(shape), footprint=AROUND, mode="constant", cval=-np.inf)
+    rest = np.maximum(second, around.ravel())
+    single: NDArray[np.int64] = index[np.isfinite(rest) & (top > rest + despike_m)]
+    return single
+
+
+@compiled()
+def _two_highest(cells: Cells, height: Floats, size: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Return the two greatest heights per cell (-inf if there is none) and the index of the greatest."""
+    top, second = np.full(size, -np.inf), np.full(size, -np.inf)
+    index = np.full(size, -1, np.int64)
+    for i in range(cells.size):
+        c = cells[i]
+        if c < 0:
+            continue
+        if height[i] > top[c]:
+            second[c], top[c], index[c] = top[c], height[i], i
+        elif height[i] > second[c]:
+            second[c] = height[i]
+    return top, second, index
+
+
+def top_layer(
+    cells: Cells, height: Floats, highest: Floats, depth_m: float, shape: tuple[int, int]
+) -> TopLayer:
+    """Return mean, number and spread of the points of each cell's top layer.
+
+    Parameters
+    ----------
+    cells : Cells
+        The cells of the points, ``(n,)``.
+    height : Floats
+        The points, ``(n,)``, m.
+    highest : Floats
+        Highest point per cell, ``(H, W)``, m; NaN where there is none.
+    depth_m : float
+        Points up to this much below the highest one belong to the top layer (m).
+    shape : tuple of int
+        Rows and columns.
+    """
+    count, below, squared = _sums(cells, height, highest.ravel(), depth_m)
+    with np.errstate(invalid="ignore"):
+        mean, square = below / count, squared / count
+    spread = np.sqrt(np.maximum(square - mean**2, 0.0))
+    return TopLayer(highest + mean.reshape(shape), count.reshape(shape), spread.reshape(shape))
+
+
+@compiled()
+def _sums(cells: Cells, height: Floats, highest: Floats, depth_m: float) -> tuple[Floats, Floats, Floats]:
+    """Return number, sum and sum of squares of the heights relative to the highest, per cell."""
+    count, below, squared = np.zeros_like(highest), np.zeros_like(highest), np.zeros_like(highest)
+    for i in range(cells.size):
+        c = cells[i]
+        if c < 0:
+            continue
+        z = height[i] - highest[c]
+        if z >= -depth_m:
+            count[c] += 1.0
+            below[c] += z
+            squared[c] += z * z
+    return count, below, squared

@@ -1,0 +1,110 @@
+"""Morphological ground filter: points above what an opening of the surface leaves are not ground.
+
+An opening with a disk removes all that is narrower than the disk, as houses and trees, but keeps ground on
+one side of a wall or quay, which the slope filter rejects. Disks of all sizes are compared, each with the
+height that sloping ground loses by it, as by Zhang et al. (2003), "A progressive morphological filter for
+removing nonground measurements from airborne LIDAR data", IEEE TGRS 41(4), and Pingel et al. (2013), "An
+improved simple morphological filter for the terrain classification of airborne LIDAR data", ISPRS JPRS 77.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flexroad.catalog.lazy import lazy
+from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.prepare.points import low_outliers
+
+cv2 = lazy("cv2")
+
+
+class Options(low_outliers.Options):
+    """Size of objects, slope and roughness of the ground, and the detection of low outliers."""
+
+    radius_m: float = Field(
+        18.0, gt=0, le=100, description="radius of the largest disk (m): half the widest roof"
+    )
+    slope: float = Field(
+        0.1, ge=0, le=5, description="slope up to which ridges and all points of a cell are kept: 0.1 is 10 %"
+    )
+    tolerance_m: float = Field(
+        0.1, ge=0, le=2, description="tolerated height above the lowest point of a cell on level ground (m)"
+    )
+    cell_m: float = Field(1.0, gt=0, le=10, description="cell size of the surface that is opened (m)")
+
+    @property
+    def reach_m(self) -> float:
+        """Distance up to which points decide whether one is ground (m)."""
+        return 2 * self.radius_m + math.sqrt(2) * self.cell_m + self.low_reach_m
+
+
+def ground(easting: Floats, northing: Floats, height: Floats, options: Options) -> Bools:
+    """Return which points are ground.
+
+    The surface has the height of the lowest point in each cell. A point is ground if it is at most ``slope *
+    (r + cell_m) + tolerance_m`` above the opening of the surface by the disk of radius r, for all radii from
+    0 to ``radius_m`` in steps of a cell. Cells without points have no effect. Low outliers are not ground,
+    and do not count.
+
+    Parameters
+    ----------
+    easting, northing, height : ndarray, (n,)
+        In metres. Points with NaN or infinite coordinates are not ground.
+
+    Returns
+    -------
+    ndarray of bool, (n,)
+        Independent of the order of the points, and of those farther away than ``reach_m``.
+
+    Raises
+    ------
+    TaskError
+        If the arrays differ in length.
+    """
+    points = low_outliers.without_low_outliers(easting, northing, height, options.radius_m, options)
+    out = np.zeros(height.shape, bool)
+    if points.order.size == 0:
+        return out
+    kept, cell = points.order, options.cell_m
+    # Cells lie on multiples of their size, so that they do not depend on the extent of the points.
+    rows, cols = (np.floor(along[kept] / cell).astype(np.int64) for along in (northing, easting))
+    rows, cols = rows - rows.min(), cols - cols.min()
+    surface = np.full((rows.max() + 1, cols.max() + 1), np.inf)
+    np.minimum.at(surface, (rows, cols), height[kept])
+    highest = _highest_ground(surface, round(options.radius_m / cell), options.slope * cell)
+    limit = highest[rows, cols] + options.slope * cell + options.tolerance_m
+    out[kept[height[kept] <= limit]] = True
+    return out
+
+
+def _highest_ground(surface: Floats, radius: int, fall: float) -> Floats:
+    """Return the lowest sum of an opening and of the fall over its radius, for all radii, ``(H, W)``, m.
+
+    Parameters
+    ----------
+    surface : (H, W) array
+        Heights (m); inf without points.
+    radius : int
+        Largest radius, in cells.
+    fall : float
+        Fall of the ground over one cell (m).
+    """
+    result = surface.copy()
+    for size in range(1, radius + 1):
+        disk = _disk(size)
+        lowest = cv2.erode(surface, disk)
+        # Where no point is within the disk, the lowest one is inf, or OpenCV's value beyond the border.
+        there = lowest < np.finfo(np.float64).max
+        opened = cv2.dilate(np.where(there, lowest, -np.inf), disk)
+        np.minimum(result, opened + fall * size, out=result)
+    return result
+
+
+def _disk(radius: int) -> NDArray[np.uint8]:
+    """Return the cells whose centres lie within a radius, ``(2 r + 1, 2 r + 1)``, uint8."""
+    down, across = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    return np.asarray(down**2 + across**2 <= radius**2, np.uint8)

@@ -1,0 +1,234 @@
+"""Rasters from a point cloud: DSM and its top layer, DTM, bridge decks and orthophoto of a block of ground.
+
+Values depend only on the points within `reach_m` of the block, not on the division into blocks or on the
+order of the points; heights agree to 1e-8 m, the rounding error of sums and large coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import options as base
+from flexroad.tasks.types import Bools, Floats, Orthophoto
+from flexroad.tools.prepare.points import ground_filter as slope_filter
+from flexroad.tools.prepare.points import morphological as morphological_filter
+from flexroad.tools.prepare.points import tin
+from flexroad.tools.prepare.points.binning import bins, highest, means, spikes, top_layer
+from flexroad.tools.prepare.points.orthophoto import photo
+from flexroad.tools.prepare.types import CellHeights, Points, Rasters, TopLayer
+
+BRIDGE_CLASSES = {"asprs": (17,), "ahn": (26,)}
+"""Classes of bridge decks by the scheme of a point cloud: ASPRS LAS 1.4, also in Switzerland, Sweden and
+North Rhine-Westphalia; the Dutch AHN, whose class of structures (kunstwerken) also has locks and weirs."""
+
+
+class Options(base.Options):
+    """How points become rasters."""
+
+    despike_m: float | None = Field(
+        None,
+        gt=0,
+        description="drop single points that are this much above all others around (m); null keeps all",
+    )
+    fill_m: float = Field(5.0, ge=0, le=100, description="DSM voids up to this width are filled (m)")
+    top_layer_m: float = Field(
+        0.25,
+        gt=0,
+        le=10,
+        description="points up to this much below a cell's highest one make the height of roads (m)",
+    )
+    ground: Literal["classes", "filter", "morphological"] = Field(
+        "classes",
+        description="classes: ground points have a ground class; filter: the slope filter identifies them; "
+        "morphological: the morphological filter does",
+    )
+    ground_classes: tuple[int, ...] = Field((2,), description="classes of ground points")
+    bridge_classes: tuple[int, ...] = Field(
+        BRIDGE_CLASSES["asprs"], description="classes of bridge decks; never ground"
+    )
+    dtm: Literal["tin", "mean"] = Field(
+        "tin",
+        description="tin: linear between the cells' ground centroids; mean: mean ground height per cell",
+    )
+    void_m: float = Field(50.0, ge=0, le=500, description="DTM voids up to this width are filled (m)")
+    dop_fill_m: float = Field(
+        2.0, ge=0, le=20, description="pixels without colour take the nearest within this distance (m)"
+    )
+    filter: slope_filter.Options = Field(
+        slope_filter.Options(), description="the slope filter, used with ground: filter"
+    )
+    morphological: morphological_filter.Options = Field(
+        morphological_filter.Options(),
+        description="the morphological filter, used with ground: morphological",
+    )
+
+
+def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Rasters:
+    """Make the rasters of a block of ground.
+
+    Parameters
+    ----------
+    points : Points
+        In the grid's CRS (m), including a rim of `reach_m` around the grid; others have no effect.
+    dop_cell : float, optional
+        Pixel of the orthophoto (m); None makes no orthophoto.
+
+    Returns
+    -------
+    Rasters
+        NaN without points, and the DTM without ground points; no orthophoto if the points have no colours.
+    """
+    rim = grid.buffered(cells_reach_m(options, grid.cell))
+    pixels = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
+    heights, image = of_points(points, rim, options, pixels)
+    return replace(of_cells(heights, rim, grid, options), photo=image)
+
+
+def of_points(
+    points: Points, grid: Grid, options: Options, pixels: Grid | None
+) -> tuple[CellHeights, Orthophoto | None]:
+    """Return what the points of each cell give, and the orthophoto.
+
+    Parameters
+    ----------
+    points : Points
+        In the grid's CRS (m), including a rim of `points_reach_m` around the grid; others have no effect.
+    pixels : Grid, optional
+        Pixels of the orthophoto; None makes no orthophoto.
+
+    Returns
+    -------
+    CellHeights, Orthophoto or None
+        No orthophoto if the points have no colours.
+    """
+    if options.despike_m is not None:
+        points = _without_spikes(points, grid.buffered(points_reach_m(options, grid.cell)), options.despike_m)
+    cells = bins(points.easting, points.northing, grid)
+    highest_points = highest(cells, points.height, grid.shape)
+    top = top_layer(cells, points.height, highest_points, options.top_layer_m, grid.shape)
+    decks = _has_class(points, options.bridge_classes)
+    (bridges,) = means(np.where(decks, cells, -1), grid.shape, points.height)
+    ground = _is_ground(points, cells >= 0, options) & ~decks
+    of_ground = means(
+        np.where(ground, cells, -1),
+        grid.shape,
+        points.easting - grid.west,
+        points.northing - grid.north,
+        points.height,
+    )
+    image = photo(points, pixels, options.dop_fill_m) if pixels and points.colour is not None else None
+    return CellHeights(highest_points, top, np.stack(of_ground), bridges), image
+
+
+def of_cells(heights: CellHeights, rim: Grid, grid: Grid, options: Options) -> Rasters:
+    """Return the rasters of a block of ground, without orthophoto.
+
+    Parameters
+    ----------
+    heights : CellHeights
+        On the cells of ``rim``: the grid and `cells_reach_m` around it.
+    """
+    inner = rim.window(grid)
+    top = heights.top
+    dsm, road_height = tin.fill_voids(np.stack([heights.highest, top.height]), rim, options.fill_m)
+    bridges = heights.bridges[inner]
+    return Rasters(
+        grid,
+        dsm=dsm[inner],
+        dtm=_dtm(heights.ground, rim, grid, options)[inner],
+        top=TopLayer(road_height[inner], top.count[inner], top.spread[inner]),
+        ground=np.isfinite(heights.ground[2][inner]),
+        bridges=bridges if np.isfinite(bridges).any() else None,
+    )
+
+
+def reach_m(options: Options, cell: float) -> float:
+    """Return the largest distance from a grid of such cells at which points can change a value in it (m)."""
+    return points_reach_m(options, cell) + cells_reach_m(options, cell)
+
+
+def points_reach_m(options: Options, cell: float) -> float:
+    """Return the largest distance at which points can change what `of_points` returns (m)."""
+    farthest = options.dop_fill_m
+    if options.ground == "filter":
+        farthest = max(farthest, options.filter.reach_m)
+    if options.ground == "morphological":
+        farthest = max(farthest, options.morphological.reach_m)
+    # Whether a point is a spike depends on its own and the neighbouring cells.
+    return farthest if options.despike_m is None else farthest + 2 * cell
+
+
+def cells_reach_m(options: Options, cell: float) -> float:
+    """Return the largest distance at which cells can change what `of_cells` returns (m)."""
+    reach = tin.tin_reach_m if options.dtm == "tin" else tin.voids_reach_m
+    return max(reach(options.void_m, cell), tin.voids_reach_m(options.fill_m, cell))
+
+
+def tags(options: Options) -> dict[str, str]:
+    """Return the processing of each layer, for the TIFF tags of the rasters."""
+    spikes = (
+        ""
+        if options.despike_m is None
+        else f"; single points {options.despike_m:g} m above all around dropped"
+    )
+    if options.ground == "classes":
+        ground = f"points of {_classes(options.ground_classes)}"
+    elif options.ground == "morphological":
+        of = options.morphological
+        ground = (
+            f"morphologically filtered points (Zhang et al. 2003: radius {of.radius_m:g} m, "
+            f"slope {of.slope:g}, tolerance {of.tolerance_m:.2f} m)"
+        )
+    else:
+        ground = (
+            f"slope-filtered points (Vosselman 2000: radius {options.filter.radius_m:g} m, "
+            f"slope {options.filter.slope:g}, tolerance {options.filter.tolerance_m:.2f} m)"
+        )
+    kind = "TIN of the cells' centroids" if options.dtm == "tin" else "mean per cell"
+    return {
+        "DSM": f"highest point per cell{spikes}; voids up to {options.fill_m:g} m filled linearly",
+        "DTM": f"{kind} of {ground}; voids up to {options.void_m:g} m bridged linearly",
+        "ROAD_HEIGHT": f"mean, number and standard deviation of the points within {options.top_layer_m:g} m "
+        f"of the cell's highest{spikes}; voids up to {options.fill_m:g} m filled linearly, with the number 0",
+        "BRIDGES": f"mean per cell of points of {_classes(options.bridge_classes)}",
+        "DOP": f"colour of the highest point; voids take the nearest within {options.dop_fill_m:g} m",
+    }
+
+
+def _classes(classes: tuple[int, ...]) -> str:
+    return f"class{'es' if len(classes) > 1 else ''} {', '.join(map(str, classes))}"
+
+
+def _without_spikes(points: Points, grid: Grid, despike_m: float) -> Points:
+    cells = bins(points.easting, points.northing, grid)
+    kept = np.ones(len(points), bool)
+    kept[spikes(cells, points.height, grid.shape, despike_m)] = False
+    return points[kept]
+
+
+def _is_ground(points: Points, asked: Bools, options: Options) -> Bools:
+    """Return which of the points that are asked for are ground, ``(n,)``."""
+    if options.ground == "classes":
+        return _has_class(points, options.ground_classes)
+    if options.ground == "morphological":
+        of = options.morphological
+        return morphological_filter.ground(points.easting, points.northing, points.height, of)
+    return slope_filter.ground(points.easting, points.northing, points.height, options.filter, asked)
+
+
+def _has_class(points: Points, classes: tuple[int, ...]) -> Bools:
+    """Return which points have one of some classes, ``(n,)``."""
+    chosen = np.isin(np.arange(256), classes)
+    return chosen[points.kind]
+
+
+def _dtm(ground: Floats, rim: Grid, grid: Grid, options: Options) -> Floats:
+    """Return the bare ground, ``(H, W)``, m, on the cells of ``rim``; only those of ``grid`` are complete."""
+    if options.dtm == "mean":
+        return tin.fill_voids(ground[2], rim, options.void_m)
+    return tin.triangulated(ground, rim, options.void_m, rim.window(grid))

@@ -1,0 +1,353 @@
+"""Writer of the rasters of one area: block by block, then published together as COGs with a catalog.
+
+Until they are published, all files are in a hidden folder inside the output folder: a failure leaves no
+files behind, and new rasters replace old ones by renaming. The catalog is written last.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import compress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NoReturn, Self
+
+import numpy as np
+import rasterio
+import rasterio.shutil
+from numpy.typing import NDArray
+from rasterio.errors import CRSError, RasterioError
+from rasterio.windows import Window
+
+from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
+from flexroad.catalog.crs import compound
+from flexroad.catalog.crs_checks import require_scale
+from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.scan.cover import height_share
+from flexroad.catalog.scan.rasters import opened, zoned
+from flexroad.catalog.scan.vectors import VectorFile, with_roads
+from flexroad.catalog.skipped import lines
+from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.text import some
+from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
+from flexroad.catalog.tiling import cut
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor, SerialExecutor
+from flexroad.tasks.types import Orthophoto
+from flexroad.tools.prepare.output import CATALOG, LAYER_TAG, NAMES, disk_errors, scratch_folder, write_error
+
+SERIAL = SerialExecutor()
+PHOTO = "dop"
+GROUND = "ground"
+"""Cells with ground points: an intermediate layer, not published."""
+BLOCK = 256
+"""Side of the internal tiles of the temporary GeoTIFFs (cells)."""
+HEIGHT_PROFILE = {"dtype": "float32", "nodata": np.nan, "count": 1}
+ROAD_HEIGHT_PROFILE = {**HEIGHT_PROFILE, "count": len(ROAD_HEIGHT_BANDS)}
+MASK_PROFILE = {"dtype": "uint8", "nodata": None, "count": 1}
+PHOTO_PROFILE = {"dtype": "uint8", "nodata": None, "count": 3, "photometric": "RGB", "interleave": "pixel"}
+
+
+@dataclass(frozen=True)
+class PreparedDataset:
+    """The result of a ``prepare`` command: rasters and their catalog."""
+
+    catalog: Path
+    """The catalog file, ``.parquet``."""
+    tiles: int
+    """Number of tiles in the catalog."""
+    notes: tuple[str, ...] = ()
+    """What was left out or assumed, one line each."""
+
+    def with_notes(self, *notes: str) -> PreparedDataset:
+        """Return a copy with more notes in front."""
+        return replace(self, notes=(*notes, *self.notes))
+
+
+class RasterWriter:
+    """Writer of the rasters of one area; a context manager that removes its temporary files.
+
+    Parameters
+    ----------
+    out : Path
+        Output folder; created if it does not exist.
+    grid : Grid
+        All cells of the area.
+    dop_cell : float, optional
+        Pixel of the orthophoto (m), None if there is no orthophoto.
+    tags : Mapping[str, str]
+        TIFF tags of every file: its source and its processing.
+    vertical : str, optional
+        Vertical CRS of the heights, in metres, if it is known.
+
+    Raises
+    ------
+    ConfigError
+        If the folder cannot be written.
+    CatalogError
+        If a metre of the CRS is none on the ground.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        grid: Grid,
+        dop_cell: float | None,
+        tags: Mapping[str, str],
+        vertical: str | None = None,
+    ) -> None:
+        require_scale("the rasters", grid.crs, grid.bounds, "give a CRS in metres with --to-crs {zone}")
+        self.out = out
+        self.grid = grid
+        self.photo_grid = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
+        self.tags = dict(tags)
+        self._crs_of_heights = compound(grid.crs, vertical) if vertical else grid.crs
+        self._open: dict[str, Any] = {}
+        self._roads: list[VectorFile] = []
+        self._notes: list[str] = []
+        self.scratch = out
+        """Folder for temporary files, also of the caller; made and removed with the context."""
+        self._stack = contextlib.ExitStack()
+        for name in NAMES:
+            # Refused at the start and not after the rasters are computed.
+            with disk_errors(out / name):
+                output_file(out / name)
+
+    def __enter__(self) -> Self:
+        self.scratch = self._stack.enter_context(scratch_folder(self.out))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for raster in self._open.values():
+            with contextlib.suppress(RasterioError, OSError):
+                raster.close()
+        self._stack.close()
+
+    def write(self, layer: str, part: Grid, values: NDArray[Any]) -> None:
+        """Write a window of a layer: heights (m, NaN where there is none) or a mask, ``(H, W)``.
+
+        Of ``road_height`` it has all bands, ``(3, H, W)``.
+
+        Raises
+        ------
+        ConfigError
+            If the disk is full.
+        CatalogError
+            If ``part`` is not a window of the writer's grid.
+        """
+        heights = layer in HEIGHTS
+        with self._writing(layer):
+            raster = self._raster(layer, self.grid, _profile(layer))
+            cells = values.astype(np.float32 if heights else np.uint8)
+            bands = cells if cells.ndim > 2 else cells[None]
+            raster.write(bands, window=_window(self.grid, part))
+
+    def write_photo(self, photo: Orthophoto) -> None:
+        """Write a window of the orthophoto; pixels without a colour are masked.
+
+        Raises
+        ------
+        ConfigError
+            If the disk is full, or the writer was created without an orthophoto.
+        CatalogError
+            If the orthophoto's grid is not a window of the writer's pixels.
+        """
+        if self.photo_grid is None:
+            raise ConfigError(f"no orthophoto was requested in {self.out}")
+        with self._writing(PHOTO), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+            raster = self._raster(PHOTO, self.photo_grid, PHOTO_PROFILE)
+            window = _window(self.photo_grid, photo.grid)
+            raster.write(photo.colour, window=window)
+            raster.write_mask(photo.known, window=window)
+
+    def attach_roads(self, file: VectorFile, *notes: str) -> None:
+        """Add a vector file to the catalog as the roads of the tiles it overlaps; the file is not copied."""
+        self._roads.append(file)
+        self._notes += notes
+
+    def read(self, layer: str, part: Grid) -> NDArray[Any]:
+        """Return a window of a layer as written up to now, ``(H, W)``: float64 heights or a bool mask."""
+        values: NDArray[Any] = self._open[layer].read(1, window=_window(self.grid, part))
+        return values.astype(np.float64) if layer in HEIGHTS else values.astype(bool)
+
+    def publish(
+        self,
+        tile_size_m: float = 250,
+        date: datetime | None = None,
+        dataset: str = "",
+        min_cover: float = MIN_COVER,
+        assumed: datetime | None = None,
+        executor: Executor = SERIAL,
+    ) -> PreparedDataset:
+        """Convert the rasters to COGs and write the catalog; existing outputs in the folder are replaced.
+
+        Parameters
+        ----------
+        tile_size_m : float
+            Side of a tile (m). An area no larger than this is a single tile; a larger one is divided at
+            multiples of it.
+        date : datetime, optional
+            Acquisition date; None: ``assumed`` is used, with a note.
+        dataset : str
+            Name of the data in reports.
+        min_cover : float
+            Tiles with heights in less than this share (0 to 1) of their cells are left out.
+        assumed : datetime, optional
+            When the source was written, with a time zone; None: now.
+        executor : Executor
+            Converts each layer by a worker call.
+
+        Raises
+        ------
+        ConfigError
+            If the disk is full, a worker dies, or no tile has enough heights.
+        CatalogError
+            If the roads overlap no tile.
+        """
+        names = [layer for layer in LAYERS if layer in self._open]
+        for layer in names:
+            with self._writing(layer):
+                self._open[layer].close()
+        jobs = [_CogJob(self.scratch / f"{layer}.tmp.tif", layer, self.out) for layer in names]
+        # The largest layers first, so that no worker has one of them at the end.
+        jobs.sort(key=lambda job: -job.source.stat().st_size)
+        for job in executor.map(_to_cog, jobs, _fail):
+            job.source.unlink()
+        survey = zoned(date or assumed or datetime.now(UTC))
+        tiles, notes = self._tiles(names, tile_size_m, survey, dataset, min_cover)
+        tiles = tuple(replace(tile, datetime_assumed=date is None) for tile in tiles)
+        tiles, far = with_roads(tiles, self._roads, None)
+        self._replace(names)
+        Catalog(tiles).write(self.out / CATALOG)
+        undated = (
+            f"the date of the survey is not known: {survey:%Y-%m-%d}, when its files were written, is used "
+            "instead (--date sets it)"
+        )
+        notes = (*self._notes, *notes, *lines(far), *([undated] if date is None else []))
+        return PreparedDataset(self.out / CATALOG, len(tiles), notes)
+
+    def _replace(self, names: list[str]) -> None:
+        # A catalog must only exist beside complete rasters: removed first, written last.
+        for name in NAMES:
+            output_file(self.out / name).unlink(missing_ok=True)
+        for layer in names:
+            (self.scratch / f"{layer}.tif").replace(output_file(self.out / f"{layer}.tif"))
+
+    def _tiles(
+        self, names: list[str], size_m: float, date: datetime, dataset: str, min_cover: float
+    ) -> tuple[tuple[Tile, ...], tuple[str, ...]]:
+        """Return the tiles with enough heights, and notes on the others."""
+        if max(self.grid.width, self.grid.height) * self.grid.cell <= size_m:
+            tiles: tuple[Tile, ...] = (self._one_tile(names, date, dataset),)
+            notes: tuple[str, ...] = ()
+        else:
+            root = self.scratch.resolve()
+            layers = {name: opened(root, name, [root / f"{name}.tif"], None)[0] for name in names}
+            indexed = cut(root, layers, tile_size_m=size_m, date=date, dataset=dataset, min_cover=0)
+            tiles = tuple(replace(tile, root=str(self.out.resolve())) for tile in indexed.tiles)
+            notes = indexed.notes
+        shares = (height_share(tile.grid, [self.scratch / "dsm.tif"]) or 0.0 for tile in tiles)
+        enough = [share >= max(min_cover, 1e-9) for share in shares]
+        kept = tuple(compress(tiles, enough))
+        sparse = [tile.id for tile, is_kept in zip(tiles, enough, strict=True) if not is_kept]
+        if not kept:
+            raise ConfigError(
+                f"no tile of {self.out} would have heights in {min_cover:.0%} of its cells; "
+                "use larger cells (--cell), smaller tiles (--tile-size) or a lower --min-cover"
+            )
+        left_out = f"left out {some(sparse)}: heights in less than {min_cover:.0%} of the cells"
+        return kept, (*notes, left_out) if sparse else notes
+
+    def _one_tile(self, names: list[str], date: datetime, dataset: str) -> Tile:
+        return Tile(
+            id=f"{self.grid.west:.0f}_{self.grid.south:.0f}",
+            grid=self.grid,
+            layers=tuple(Layer(name, (f"{name}.tif",), extents=(self.grid.bounds,)) for name in names),
+            root=str(self.out.resolve()),
+            datetime=date,
+            dataset=dataset,
+        )
+
+    def _raster(self, layer: str, grid: Grid, profile: Mapping[str, Any]) -> Any:
+        if layer not in self._open:
+            raster = rasterio.open(
+                self.scratch / f"{layer}.tmp.tif",
+                "w+",
+                driver="GTiff",
+                crs=self._crs_of_heights if layer in HEIGHTS else grid.crs,
+                transform=grid.transform,
+                width=grid.width,
+                height=grid.height,
+                tiled=True,
+                blockxsize=BLOCK,
+                blockysize=BLOCK,
+                BIGTIFF="IF_SAFER",
+                **profile,
+            )
+            raster.update_tags(**self.tags, **{LAYER_TAG: layer})
+            if layer == "road_height":
+                raster.descriptions, raster.units = zip(*ROAD_HEIGHT_BANDS, strict=True)
+            self._open[layer] = raster
+        return self._open[layer]
+
+    def _writing(self, layer: str) -> contextlib.AbstractContextManager[None]:
+        return _raster_errors(self.out / f"{layer}.tif")
+
+
+@contextlib.contextmanager
+def _raster_errors(where: Path) -> Iterator[None]:
+    """Context manager that turns errors of writing a raster into a `ConfigError` of one line."""
+    try:
+        yield
+    except CRSError as error:
+        raise ConfigError(f"cannot write {where}: {error}; choose another CRS with --to-crs") from error
+    except (OSError, RasterioError) as error:
+        raise write_error(where, error) from error
+
+
+def _profile(layer: str) -> Mapping[str, Any]:
+    if layer == "road_height":
+        return ROAD_HEIGHT_PROFILE
+    return HEIGHT_PROFILE if layer in HEIGHTS else MASK_PROFILE
+
+
+@dataclass(frozen=True)
+class _CogJob:
+    """The input of a worker call that converts a layer."""
+
+    source: Path
+    layer: str
+    out: Path
+    """Output folder, for messages."""
+
+
+def _to_cog(job: _CogJob) -> _CogJob:
+    smooth = job.layer in HEIGHTS or job.layer == PHOTO
+    with _raster_errors(job.out / f"{job.layer}.tif"):
+        rasterio.shutil.copy(
+            job.source,
+            job.source.parent / f"{job.layer}.tif",
+            driver="COG",
+            compress="deflate",
+            # The default, 6, takes 1.4 times as long; the files are 2% smaller.
+            level=1,
+            predictor="floating_point" if job.layer in HEIGHTS else "standard",
+            overview_resampling="average" if smooth else "mode",
+            statistics="yes",
+            bigtiff="if_safer",
+        )
+    return job
+
+
+def _fail(job: _CogJob, reason: str) -> NoReturn:
+    raise ConfigError(f"{job.out / job.layer}.tif: {reason}; use fewer workers")
+
+
+def _window(whole: Grid, part: Grid) -> Window:
+    rows, cols = whole.window(part)
+    return Window.from_slices(rows, cols)

@@ -1,0 +1,213 @@
+"""The page: outcome, map, figures and the tiles to look at, put together from their parts."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import pandas as pd
+from markupsafe import Markup
+
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.text import count, printable
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import Track, untracked
+from flexroad.tasks.quality.assess import FLAGS, Options
+from flexroad.tools.report.browser.figures import Comparison, compare, histograms
+from flexroad.tools.report.browser.outcome import Reason, cards, described, headline, reasons, statements
+from flexroad.tools.report.browser.relief import relief
+from flexroad.tools.report.browser.tiles import (
+    TileTable,
+    as_script,
+    errors,
+    map_data,
+    numeric_columns,
+    tile_table,
+)
+from flexroad.tools.report.content import ESTIMATE_MEANING, WORST, Content
+from flexroad.tools.report.pages import MAIN, WORST_ESTIMATES, TilePictures, sections, template
+from flexroad.tools.report.pictures import tile_pictures
+
+pyproj = lazy("pyproj")
+
+HERE = Path(__file__).parent
+SCRIPT = HERE.resolve().parents[2] / "viewer" / "dist" / "report" / "page.js"
+"""Built from viewer/src/report. Folders of a checkout's package are links, which resolve() follows."""
+NAMED = 5
+"""Tiles without a position that are named."""
+ESTIMATE, TRUE_ERROR = "error_estimate_m", "l2_road_m"
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A tile to look at."""
+
+    tile_id: str
+    number: int
+    """Its position in the catalog."""
+    figure: str
+    """The figure by which it is ranked, in words."""
+    reasons: list[Reason]
+    tile: TilePictures | None
+    """Its pictures; None if there are none."""
+    view: str
+    """Address of the tile in the 3D viewer; empty without one."""
+
+    @property
+    def pair(self) -> tuple[tuple[str, bytes], ...]:
+        """The two most telling pictures: the first and the last."""
+        pictures = () if self.tile is None else self.tile.pictures
+        return tuple(dict.fromkeys((*pictures[:1], *pictures[-1:])))
+
+    @property
+    def more(self) -> tuple[tuple[str, bytes], ...]:
+        """The other pictures."""
+        return () if self.tile is None else self.tile.pictures[1:-1]
+
+
+def html_page(
+    run: Run,
+    content: Content,
+    viewer: str = "",
+    before: tuple[str, pd.DataFrame] | None = None,
+    track: Track = untracked,
+) -> str:
+    """Return the report as one self-contained HTML page.
+
+    Parameters
+    ----------
+    run : Run
+    content : Content
+        Its tables.
+    viewer : str
+        Address of the page of the 3D viewer, relative to the report; empty without one.
+    before : tuple, optional
+        Name and rows of another run over the same tiles, for a comparison.
+    track : callable
+        Shows the progress.
+    """
+    table, failed = tile_table(run.catalog.tiles, content), errors(content)
+    options: Options = run.config.chains[content.variant]["assess"]
+    ranked_by, first = ranking(table)
+    pictures = {tile.tile_id: tile for tile in tile_pictures(run, content, first, track)}
+    comparison = compare(table, before[1], content.variant, before[0]) if before else None
+    numbers = {tile.id: i for i, tile in enumerate(table.tiles)}
+    background = relief(run, table.finished, content.results, track)
+    data = _data(table, failed, options, pictures, viewer, comparison)
+    if background:
+        places = [background.places.get(tile.id) for tile in table.tiles]
+        data["relief"] = {"side": background.side_px, "columns": background.columns, "places": places}
+    script = SCRIPT.read_text(encoding="utf-8")
+    return template("page.html.j2", HERE).render(
+        content=content,
+        style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
+        script=Markup(script),
+        script_hash=f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}",
+        data=Markup(as_script(data)),
+        headline=headline(table, content.counts.skipped),
+        cards=cards(table),
+        statements=statements(content, table, failed, str(run.path)),
+        crs=_crs_name(table.crs),
+        unplaced=_unplaced(table),
+        relief=background.webp if background else None,
+        charts=list(histograms(numeric_columns(table), _limits(options))),
+        comparison=comparison,
+        looks=[_look(name, table, numbers, options, pictures, viewer) for name in first],
+        ranked_by=ranked_by,
+        meaning=ESTIMATE_MEANING.replace("`", ""),
+        viewer=viewer,
+        view_command=f"flexroad view {shlex.quote(str(run.path))}",
+        sections=[one for one in sections(content) if one[0] not in (MAIN, WORST_ESTIMATES)],
+        tiles=[(numbers[name], tile) for name, tile in pictures.items() if name not in first],
+    )  # fmt: skip
+
+
+def ranking(table: TileTable) -> tuple[str, list[str]]:
+    """Return by what tiles are ranked, in words, and the ids of the worst tiles, the worst first."""
+    for column, words in (
+        (ESTIMATE, "with the highest error estimate, highest first"),
+        (TRUE_ERROR, "with the highest road error (L2), highest first"),
+    ):
+        values = pd.to_numeric(table.frame[column], errors="coerce").dropna()
+        if len(values):
+            # Of equal values the first in the catalog.
+            return words, [
+                str(name) for name in values.sort_values(ascending=False, kind="stable").index[:WORST]
+            ]
+    return "", []
+
+
+def _data(
+    table: TileTable,
+    failed: dict[str, str],
+    options: Options,
+    pictures: Mapping[str, TilePictures],
+    viewer: str,
+    comparison: Comparison | None,
+) -> dict[str, Any]:
+    data = map_data(table, failed, {} if comparison is None else comparison.columns)
+    limits = _limits(options)
+    for column in data["columns"]:
+        column["limit"] = limits.get(column["key"])
+    data["meanings"] = {flag: one for flag, one in described(options).items() if flag in data["flagNames"]}
+    data["viewer"] = viewer
+    data["places"] = {
+        i: {flag: [round(float(value), 2) for value in place] for flag, place in found.places.items()}
+        for i, tile in enumerate(table.tiles)
+        if (found := pictures.get(tile.id)) and found.places
+    }
+    return data
+
+
+def _limits(options: Options) -> dict[str, float]:
+    """Return the thresholds of the flags by column, in the unit of the page."""
+    shares = {"off_dtm_road", "inferred_road", "dropped_road", "bounded_weights"}
+    return {name: getattr(options, name) * (100 if name in shares else 1) for name in FLAGS.values()}
+
+
+def _look(
+    name: str,
+    table: TileTable,
+    numbers: Mapping[str, int],
+    options: Options,
+    pictures: Mapping[str, TilePictures],
+    viewer: str,
+) -> _Look:
+    row: dict[str, Any] = dict(table.frame.loc[name])
+    found = pictures.get(name)
+    estimate, true = row[ESTIMATE], row[TRUE_ERROR]
+    parts = [f"Error estimate {estimate:.2g} m"] if np.isfinite(estimate) else []
+    parts += [f"road error (L2) {true:.2g} m"] if np.isfinite(true) else []
+    return _Look(
+        name,
+        numbers[name],
+        f"{'; '.join(parts)}.",
+        reasons(row, options, found.places if found else {}, found.notes if found else ()),
+        found,
+        f"{viewer}#tile={quote(name, safe='')}" if viewer else "",
+    )
+
+
+def _crs_name(crs: str) -> str:
+    """Return code and name of a CRS for the line below the map."""
+    try:
+        name = pyproj.CRS.from_user_input(crs).name
+    except pyproj.exceptions.CRSError:
+        return printable(crs)
+    return printable(f"{crs} ({name})" if len(crs) < 20 else name)
+
+
+def _unplaced(table: TileTable) -> str:
+    missing = [tile.id for tile, box in zip(table.tiles, table.bounds, strict=True) if np.isnan(box[0])]
+    if not missing:
+        return ""
+    more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
+    names = f"{', '.join(missing[:NAMED])}{more}"
+    return f"Not on the map, because their position is not known: {count(len(missing), 'tile')}: {names}."

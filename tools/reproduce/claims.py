@@ -1,0 +1,130 @@
+"""The test of the paper's claims on a run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from flexroad.tasks.types import Floats
+from flexroad.tools.reproduce.bootstrap import LEVEL, Means, interval
+from flexroad.tools.reproduce.published import GEROD, Claim, T, published
+
+HELD, WEAKER, STRONGER, NOT_HELD = "held", "weaker", "stronger", "not held"
+NOT_DECIDED, NOT_TESTED = "not decided", "not tested"
+REACH = 2.0
+"""A change is stronger if its log ratio is more than `REACH` times the paper's, weaker below 1 / `REACH`."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A claim with the paper's figures, a run's figures and the result of the test."""
+
+    claim: Claim
+    paper: str
+    """The paper's figures, from its tables."""
+    ours: str
+    """The run's figures; "–" if not tested."""
+    certainty: str
+    """Share of resamples with the order; or interval of the change, and share with the means' verdict."""
+    verdict: str
+
+
+def check(claim: Claim, means: Means, dataset: str = GEROD) -> Verdict:
+    """Test a claim on a run.
+
+    An order holds if the means over tiles are in that order. A change holds if it has the paper's sign and
+    the logarithm of its ratio is between half and twice that of the paper's tables; below that range it is
+    weaker, above it stronger. Whatever the verdict, it is "not decided" if fewer than `LEVEL` percent of the
+    resamples give it.
+
+    Parameters
+    ----------
+    claim : Claim
+        A claim of the paper.
+    means : Means
+        Means of the run.
+    dataset : str
+        The paper's dataset that the run is compared with; claims about other datasets are not tested.
+    """
+    paper = [_paper(claim, name) for name in claim.variants]
+    if claim.dataset != dataset or not means.variants.issuperset(claim.variants):
+        printed = _ordered(claim.figure, paper) if claim.quoted is None else percent(paper[1] / paper[0])
+        return Verdict(claim, printed, "–", "–", NOT_TESTED)
+    if claim.quoted is None:
+        return _check_order(claim, paper, means)
+    return _check_change(claim, paper[1] / paper[0], means)
+
+
+def percent(ratio: float) -> str:
+    """Return a ratio as a change in percent: 2.11 is +111%."""
+    change = 100 * (ratio - 1)
+    if not math.isfinite(change):
+        return "–"
+    # Adding 0 turns -0.0 into 0.0.
+    return f"{change:+.0f}%" if abs(change) >= 10 else f"{round(change, 1) + 0:+.1f}%"
+
+
+def _check_order(claim: Claim, paper: list[float], means: Means) -> Verdict:
+    ours = [means.mean[name, claim.figure] for name in claim.variants]
+    resampled = np.array([means.resampled[name, claim.figure] for name in claim.variants])
+    within = 1 + claim.slack
+    holds = all(a <= b * within for a, b in pairwise(ours))
+    share = float((resampled[:-1] <= resampled[1:] * within).all(axis=0).mean())
+    return Verdict(
+        claim,
+        _ordered(claim.figure, paper),
+        _ordered(claim.figure, ours),
+        f"{100 * share:.0f}% of resamples",
+        _if_certain(HELD if holds else NOT_HELD, share if holds else 1 - share),
+    )
+
+
+def _check_change(claim: Claim, paper: float, means: Means) -> Verdict:
+    base, variant = claim.variants
+    ratio, resampled = means.ratio(variant, base, claim.figure)
+    low, high = interval(resampled)
+    verdict = strength(ratio, paper)
+    share = _share(verdict, paper, resampled)
+    certainty = f"{percent(low)} to {percent(high)}, {100 * share:.0f}% of resamples"
+    return Verdict(claim, percent(paper), percent(ratio), certainty, _if_certain(verdict, share))
+
+
+def strength(ratio: float, paper: float) -> str:
+    """Return how our ratio compares with the paper's: held, weaker, stronger, not held or not tested."""
+    if not (math.isfinite(ratio) and ratio > 0):
+        return NOT_TESTED
+    relative = math.log(ratio) / math.log(paper)
+    if relative <= 0:
+        return NOT_HELD
+    return STRONGER if relative > REACH else WEAKER if relative < 1 / REACH else HELD
+
+
+def decided(verdict: str, paper: float, resampled: Floats) -> bool:
+    """Return whether enough resampled ratios give the same verdict."""
+    return _if_certain(verdict, _share(verdict, paper, resampled)) == verdict
+
+
+def _share(verdict: str, paper: float, resampled: Floats) -> float:
+    """Return the share of resampled ratios with this verdict."""
+    return float(np.mean([strength(float(ratio), paper) == verdict for ratio in resampled]))
+
+
+def _if_certain(verdict: str, share: float) -> str:
+    return verdict if verdict == NOT_TESTED or 100 * share >= LEVEL else NOT_DECIDED
+
+
+def _paper(claim: Claim, variant: str) -> float:
+    row = published(variant, claim.dataset)
+    if row is None:
+        raise KeyError(variant)
+    return row.value(claim.figure)
+
+
+def _ordered(figure: str, values: list[float]) -> str:
+    """Return the values with "<", "=" or ">" between neighbours."""
+    texts = [f"{value:,.0f}" if figure == T else f"{value:.3f}" for value in values]
+    signs = ["<" if a < b else "=" if a == b else ">" for a, b in pairwise(values)]
+    return " ".join([texts[0], *(part for pair in zip(signs, texts[1:], strict=True) for part in pair)])

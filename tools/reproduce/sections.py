@@ -1,0 +1,341 @@
+"""The tables of the comparison with the paper, with cells formatted as text."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from flexroad.catalog.text import count
+from flexroad.tools.report.content import FIGURES
+from flexroad.tools.reproduce.bootstrap import LEVEL, Means, bootstrap
+from flexroad.tools.reproduce.claims import (
+    HELD,
+    NOT_DECIDED,
+    NOT_HELD,
+    NOT_TESTED,
+    STRONGER,
+    WEAKER,
+    Verdict,
+    decided,
+    percent,
+    strength,
+)
+from flexroad.tools.reproduce.metrics_data import MetricsData
+from flexroad.tools.reproduce.published import BASE, Row
+
+GROUPS = (("l2_road_m", "l2_terrain_m"), ("mad_road_deg", "mad_terrain_deg"), ("triangles",))
+"""Figures that share a table; all five in one table would be wider than a page."""
+ROAD_L2 = "l2_road_m"
+FIGURES_SCORED = ("l2_road_m", "l2_terrain_m", "mad_road_deg", "mad_terrain_deg")
+"""Without T, which depends on the mask and the sampling alone."""
+LEAST = 0.05
+"""Changes of the paper up to this size are not scored: their sign is no statement."""
+KINDS = {HELD: "within", WEAKER: "weaker", STRONGER: "stronger", NOT_HELD: "opposite or flat"}
+REASONS = {
+    ("wo_dynamic", "l2_road_m"): "The same surface, sampled at the same points on roads.",
+    ("wo_dynamic", "l2_terrain_m"): "The same surface, sampled at 1 m instead of 10 m: it is followed more "
+    "closely. That it becomes less accurate does not follow from the paper's text.",
+    ("wo_nurbs", "mad_terrain_deg"): "The DTM at 1 m against triangles of 10 m: the DTM of the benchmark is "
+    "smooth, so the triangles meet at larger angles.",
+    ("wo_dtm", "mad_terrain_deg"): "Without the DTM the regulariser alone shapes the terrain: it is flatter. "
+    "The paper does not say what shapes it there.",
+}
+"""Why a change of the benchmark has another sign than the paper's, by variant and figure."""
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """One table of the page with its heading."""
+
+    title: str
+    table: pd.DataFrame
+    line: str = ""
+    """The data of the table, if not the page's main data."""
+
+
+def side_by_side(
+    name: str, rows: tuple[Row, ...], ours: Mapping[str, Means], line: str = ""
+) -> Iterator[Section]:
+    """Yield a table of the paper with our figures beside it, one section per group of figures.
+
+    Parameters
+    ----------
+    name : str
+        Name of the table, the first part of the titles.
+    rows : tuple of Row
+        The paper's rows; every variant is in `ours`.
+    ours : Mapping[str, Means]
+        Our means by column name; the difference from the paper is added if there is only one. A variant that
+        a column lacks has a dash there.
+    line : str
+        The data of the table, if not the page's main data.
+    """
+    for figures in GROUPS:
+        table = pd.DataFrame({"variant": [row.label for row in rows]})
+        for figure in figures:
+            label, paper = FIGURES[figure], [row.value(figure) for row in rows]
+            table[f"{label}, paper"] = [format_figure(value, figure) for value in paper]
+            for column, means in ours.items():
+                table[f"{label}, {column}"] = [_with_interval(means, row.variant, figure) for row in rows]
+            if len(ours) == 1:
+                (means,) = ours.values()
+                values = [means.mean[row.variant, figure] for row in rows]
+                table[f"{label}, difference"] = [
+                    format_difference(a - b, figure) for a, b in zip(values, paper, strict=True)
+                ]
+        yield Section(f"{name}: {label_without_unit(figures[0]).split()[0]}", table, line)
+
+
+def numbers(name: str, rows: tuple[Row, ...], classes: str, means: Means, data: str) -> pd.DataFrame:
+    """Return every number of a table, one per row, unrounded."""
+    records = []
+    for row in rows:
+        for figure in FIGURES:
+            paper, ours = row.value(figure), means.mean[row.variant, figure]
+            low, high = means.interval(row.variant, figure)
+            records.append(
+                (name, row.label, row.variant, classes, figure, paper, ours, low, high, ours - paper, data)
+            )
+    columns = "table label variant classes figure paper ours low high difference data".split()
+    return pd.DataFrame(records, columns=columns)
+
+
+def verdicts_table(verdicts: Mapping[str, list[Verdict]]) -> pd.DataFrame:
+    """Return claims with their verdicts: all columns for the first run, two columns for each other run."""
+    first, *others = verdicts.values()
+    table = pd.DataFrame(
+        {
+            "claim": [v.claim.text for v in first],
+            "section": [v.claim.where for v in first],
+            "paper": [v.paper for v in first],
+            "ours": [v.ours for v in first],
+            "certainty": [v.certainty for v in first],
+            "verdict": [v.verdict for v in first],
+        }
+    )
+    for name, other in zip(list(verdicts)[1:], others, strict=True):
+        table[f"ours, {name}"] = [v.ours for v in other]
+        table[f"verdict, {name}"] = [v.verdict for v in other]
+    return table
+
+
+def label_without_unit(figure: str) -> str:
+    """Return a figure's label without the unit."""
+    return FIGURES[figure].split(" (")[0]
+
+
+def format_figure(value: float, figure: str) -> str:
+    """Return a figure as text."""
+    if not math.isfinite(value):
+        return "–"
+    return f"{value:,.0f}" if figure == "triangles" else f"{value:.3f}"
+
+
+def format_difference(value: float, figure: str) -> str:
+    """Return a difference as text, with its sign."""
+    if not math.isfinite(value):
+        return "–"
+    # Adding 0 turns -0.0 into 0.0.
+    return f"{value:+,.0f}" if figure == "triangles" else f"{round(value, 3) + 0:+.3f}"
+
+
+def _with_interval(means: Means, variant: str, figure: str) -> str:
+    if variant not in means.variants:
+        return "–"
+    low, high = means.interval(variant, figure)
+    mean, low_text, high_text = (
+        format_figure(value, figure) for value in (means.mean[variant, figure], low, high)
+    )
+    return f"{mean} [{low_text}, {high_text}]"
+
+
+class _Change(NamedTuple):
+    """One cell of Table II as a change from the full pipeline, and ours."""
+
+    row: Row
+    figure: str
+    paper: float
+    """The paper's ratio to the full pipeline."""
+    ours: float
+    verdict: str
+    """`HELD`, `WEAKER`, `STRONGER` or `NOT_HELD`, by the rule for claims."""
+    certain: bool
+    """Whether enough resamples of the tiles give this verdict."""
+
+
+def changes(rows: tuple[Row, ...], means: Means) -> list[_Change]:
+    """Return the changes of Table II that exceed `LEAST` in the paper."""
+    base = next(row for row in rows if row.variant == BASE)
+    scored = []
+    for row in rows:
+        for figure in FIGURES_SCORED:
+            paper = row.value(figure) / base.value(figure)
+            if row is base or abs(paper - 1) <= LEAST:
+                continue
+            ours, resampled = means.ratio(row.variant, BASE, figure)
+            verdict = strength(ours, paper)
+            if verdict != NOT_TESTED:
+                certain = decided(verdict, paper, resampled)
+                scored.append(_Change(row, figure, paper, ours, verdict, certain))
+    return scored
+
+
+def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
+    """Return the counts of the changes by figure, and the list of those that are opposite or flat."""
+    scored = changes(rows, means)
+    if not scored:
+        return ()
+    counts = pd.DataFrame([_counts(f"{label_without_unit(f)}", [c for c in scored if c.figure == f])
+                           for f in FIGURES_SCORED] + [_counts("all", scored)])  # fmt: skip
+    verdicts = Counter(change.verdict for change in scored)
+    kinds = ", ".join(f"{verdicts[kind]} {name}" for kind, name in KINDS.items())
+    line = (
+        f"{len(scored)} changes of L2 and MAD by more than {LEAST:.0%} in the paper: {kinds}. Within: the "
+        "logarithm of our ratio is between half and twice that of the paper's; weaker: below; stronger: "
+        "above; opposite or flat: no change or one of the other sign. Not decided: of these, the changes for "
+        f"which fewer than {LEVEL}% of the resamples give the same answer."
+    )
+    sections = [Section("Table II: how close the changes are", counts, line)]
+    opposite = [change for change in scored if change.verdict == NOT_HELD]
+    if opposite:
+        table = pd.DataFrame([_opposite(change) for change in opposite])
+        sections.append(Section("Table II: changes that are opposite or flat", table))
+    return tuple(sections)
+
+
+def _counts(name: str, scored: list[_Change]) -> dict[str, str]:
+    verdicts = Counter(change.verdict for change in scored)
+    undecided = sum(not change.certain for change in scored)
+    cells = {"figure": name, "changes": len(scored)}
+    cells |= {column: verdicts[kind] for kind, column in KINDS.items()} | {NOT_DECIDED: undecided}
+    return {column: str(value) for column, value in cells.items()}
+
+
+def _opposite(change: _Change) -> dict[str, str]:
+    return {
+        "variant": change.row.label,
+        "figure": label_without_unit(change.figure),
+        "paper": percent(change.paper),
+        "ours": percent(change.ours),
+        "reason": REASONS.get((change.row.variant, change.figure), "–"),
+    }
+
+
+def literal_column(data: MetricsData) -> dict[str, Means]:
+    """Return the means of the literal run by the name of its column; empty without such a run."""
+    return {_name(data): _means(data.literal)} if data.literal else {}
+
+
+def literal_notes(data: MetricsData) -> Iterator[str]:
+    """Yield the note that explains the second column, if there is one."""
+    if data.literal:
+        yield (
+            f"The column “{_name(data)}” has the paper read literally: the points S(u, v) lie in space where "
+            "the weights move them, weights are positive without bounds, and the last step of the fit is its "
+            f"result (configs/literal.yaml). {data.literal.line} It was not tuned."
+        )
+
+
+def literal_numbers(tables: Mapping[str, tuple[Row, ...]], data: MetricsData) -> list[pd.DataFrame]:
+    """Return every number of the second column, a table each; see `sections.numbers`."""
+    if not data.literal:
+        return []
+    means, run = _means(data.literal), data.literal
+    named = {
+        name: tuple(row for row in rows if row.variant in means.variants) for name, rows in tables.items()
+    }
+    return [
+        numbers(name, rows, run.classes[0], means, f"{run.dataset}; read literally")
+        for name, rows in named.items()
+    ]
+
+
+def literal_sections(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Section]:
+    """Yield the factors between the paper's figures and those of both columns, on the tiles of both."""
+    if not data.literal or not rows:
+        return
+    literal = _means(data.literal)
+    tiles = data.literal.tiles.index[data.literal.tiles.complete]
+    part = replace(data, rows=data.rows[data.rows.tile_id.isin(tiles)])
+    columns = {"ours": _means(part), "literal": literal}
+    rows = tuple(row for row in rows if row.variant in literal.variants)
+    table = pd.DataFrame({"variant": [*(row.label for row in rows), "all"]})
+    for kind in ("figures", "changes"):
+        for name, means in columns.items():
+            distances = distances_of(rows, means, relative=kind == "changes")
+            table[f"{kind}, {name}"] = [_factor(row) for row in (*distances, distances.ravel())]
+    yield Section(
+        "Table II: factors from the paper",
+        table,
+        f"Typical factor between the paper and us over L2 and MAD of road and terrain, on "
+        f"{count(len(tiles), 'tile')}: the exponential of the mean absolute logarithm of the ratio, 1 if "
+        "equal. Figures: of the row itself. Changes: of the row relative to the full pipeline.",
+    )
+
+
+def road_sections(rows: tuple[Row, ...], means: Means, data: MetricsData) -> Iterator[Section]:
+    """Yield L2 on roads against the reference and against the DSM, if there is a run with the DSM."""
+    if not data.dsm:
+        return
+    table = pd.DataFrame({"variant": [row.label for row in rows]})
+    table[f"{FIGURES[ROAD_L2]}, paper"] = [format_figure(row.value(ROAD_L2), ROAD_L2) for row in rows]
+    for name, column in (("reference", means), ("DSM", _means(data.dsm))):
+        table[f"{FIGURES[ROAD_L2]}, ours by the {name}"] = [
+            _with_interval(column, row.variant, ROAD_L2) for row in rows
+        ]
+    yield Section(
+        "L2 on roads by the reference and by the DSM",
+        table,
+        "The same meshes and the same road mask, measured against the reference, and against the DSM where "
+        "it has a height.",
+    )
+
+
+def road_numbers(rows: tuple[Row, ...], data: MetricsData) -> list[pd.DataFrame]:
+    """Return L2 on roads against the DSM as rows of `numbers`, if there is a run with it."""
+    if not data.dsm:
+        return []
+    name = f"{data.dsm.dataset}; against the DSM"
+    table = numbers("L2 on roads by the DSM", rows, data.dsm.classes[0], _means(data.dsm), name)
+    return [table[table.figure == ROAD_L2]]
+
+
+def distances_of(rows: tuple[Row, ...], means: Means, relative: bool) -> np.ndarray:
+    """Return the absolute logarithms of the ratios of our figures to the paper's, ``(rows, 4)``.
+
+    Parameters
+    ----------
+    rows : tuple of Row
+        Rows of Table II with the full pipeline.
+    means : Means
+        Our means.
+    relative : bool
+        Whether to compare the ratios to the full pipeline in place of the figures.
+    """
+    paper = np.array([[row.value(figure) for figure in FIGURES_SCORED] for row in rows])
+    ours = np.array([[means.mean[row.variant, figure] for figure in FIGURES_SCORED] for row in rows])
+    logs = np.log(ours / paper)
+    base = next(number for number, row in enumerate(rows) if row.variant == BASE)
+    return np.asarray(np.abs(logs - logs[base] if relative else logs))
+
+
+def _factor(distances: np.ndarray) -> str:
+    factor = math.exp(float(np.mean(distances)))
+    return f"{factor:.2f}" if factor < 100 else f"{factor:.0f}"
+
+
+def _means(data: MetricsData) -> Means:
+    return bootstrap(data.part(data.classes[0]))
+
+
+def _name(data: MetricsData) -> str:
+    if not data.literal:
+        raise ValueError("no literal run")
+    tiles, all_tiles = (int(part.tiles.complete.sum()) for part in (data.literal, data))
+    return "literal" if tiles == all_tiles else f"literal ({tiles} tiles)"

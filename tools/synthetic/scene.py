@@ -1,0 +1,263 @@
+"""A scene: the rasters that a survey would deliver for one tile, and the true ground and roads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.prepare.points.binning import bins
+from flexroad.tools.prepare.types import Points
+from flexroad.tools.synthetic.network import Box, Plan, find_stratum
+from flexroad.tools.synthetic.noise import generator, waves
+from flexroad.tools.synthetic.objects import GroundAt
+from flexroad.tools.synthetic.options import DEFAULTS, SceneOptions
+from flexroad.tools.synthetic.population import Objects, populate
+from flexroad.tools.synthetic.segmentation import segmentation
+from flexroad.tools.synthetic.spoilers import BARE, Canvas, Kind, surface_model
+from flexroad.tools.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
+from flexroad.tools.synthetic.survey_errors import changes, growth, mixed, rise, scars
+from flexroad.tools.synthetic.voids import hidden, water
+
+__all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
+
+OBJECT_REACH_M = 45.0
+"""Greatest distance of a house, crown, car or patch from its street's centre line (m)."""
+DTM_BLUR_M = 1.0
+"""Standard deviation of the Gaussian that models the DTM's smoothing by interpolation (m)."""
+DTM_GRAIN_M = 3.0
+"""Correlation length of the DTM's noise (m)."""
+FLIGHT_WAVES_M = (300.0, 1500.0)
+"""Shortest and longest wave of the offset between two surveys (m)."""
+GROUND, DECK, OTHER = 2, 17, 1
+"""Classes by ASPRS LAS 1.4; what is neither ground nor deck is unclassified."""
+DECK_M = 0.5
+"""The true surface is a deck where it is this much above the terrain model (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One tile of a synthetic world."""
+
+    grid: Grid
+    stratum: str
+    dsm: Floats
+    """Surface model with houses, crowns, cars and noise, ``(H, W)``, m; NaN where it has no height."""
+    dtm: Floats
+    """Terrain model without bridges, smoothed and noisy, ``(H, W)``, m."""
+    road_mask: Bools
+    """Road with the errors of a segmentation, ``(H, W)``."""
+    reference: Floats
+    """True height of road and terrain with bridges at the time of the DSM, ``(H, W)``, m."""
+    extended_dtm: Floats
+    """The DTM with the bridges' decks: the paper's reference, ``(H, W)``, m."""
+    reference_road: Bools
+    """True road, ``(H, W)``."""
+    kind: NDArray[np.uint8]
+    """Object that the surface model shows, a `Kind` per cell, ``(H, W)``."""
+    levels: Mapping[int, Floats] = field(default_factory=dict)
+    """True height of each level, ``(H, W)``, m, NaN where it is not; only of `tools.synthetic.crossings`."""
+
+    @property
+    def layers(self) -> Mapping[str, NDArray[np.generic]]:
+        """The rasters, by the catalog's layer names."""
+        return {
+            "dsm": self.dsm,
+            "dtm": self.dtm,
+            "road_mask": self.road_mask,
+            "reference": self.reference,
+            "reference_road": self.reference_road,
+        }
+
+
+def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: SceneOptions = DEFAULTS) -> Scene:
+    """Make one tile of the world of a seed.
+
+    Ground, streets, objects and errors of the mask are functions of seed and absolute coordinates, so tiles
+    of one seed join without a step. The noise of the heights is drawn per tile.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the world, 0 or more.
+    stratum : str, optional
+        Stratum of the complete world: ``urban``, ``suburban`` or ``rural``; by default a mix of districts.
+
+    Raises
+    ------
+    TaskError
+        If the seed is negative or the stratum unknown.
+    """
+    if seed < 0:
+        raise TaskError(f"a seed is 0 or more, not {seed}")
+    if stratum is not None:
+        find_stratum(stratum)
+    plan = plan_of(seed, stratum, options)
+    # A margin, so that the smoothing of the terrain model has no edge effect on the tile.
+    wide = grid.buffered(4 * DTM_BLUR_M)
+    canvas, inner = Canvas.of(wide, plan), wide.window(grid)
+    ground_at = _ground_near(canvas, options)
+    here = ground_at(canvas.x, canvas.y)
+    truth = _truth(canvas, here, options)
+    streets = plan.streets(_box(canvas, OBJECT_REACH_M))
+    farther = plan.streets(_box(canvas, 2 * OBJECT_REACH_M))
+    objects = populate(streets, farther, seed, ground_at, options)
+    rng = generator(seed, "survey", *map(int, grid.origin))
+    dsm, kind = _survey(canvas, here, truth, objects, options, rng)
+    offset = _flight_offset(canvas, options.flight_offset_m)
+    bare = here.bare + scars(canvas, objects.houses, seed, options.scars_m) + offset
+    dtm = terrain_model(bare, wide.cell, options.dtm_noise_m, rng)
+    return Scene(
+        grid=grid,
+        stratum=plan.stratum_at(*_centre(canvas)).name,
+        dsm=dsm[inner],
+        dtm=dtm[inner],
+        road_mask=segmentation(canvas, here.edge, objects, ground_at, options)[inner],
+        reference=truth[inner],
+        extended_dtm=np.where(here.deck, here.graded + offset, dtm)[inner],
+        reference_road=here.road[inner],
+        kind=kind[inner],
+    )
+
+
+def true_height(grid: Grid, seed: int, stratum: str | None, options: SceneOptions) -> Floats:
+    """Return ``reference`` of the scene that `make_scene` gives for these arguments, ``(H, W)``, m."""
+    wide = grid.buffered(4 * DTM_BLUR_M)
+    canvas = Canvas.of(wide, plan_of(seed, stratum, options))
+    here = _ground_near(canvas, options)(canvas.x, canvas.y)
+    return _truth(canvas, here, options)[wide.window(grid)]
+
+
+def plan_of(seed: int, stratum: str | None, options: SceneOptions) -> Plan:
+    """Return the street plan of a world."""
+    return Plan(
+        seed,
+        options.block_m,
+        options.stream_share,
+        stratum,
+        options.turn_deg,
+        options.sunken_share,
+        options.cross_slope,
+        options.medians,
+        options.roundabouts,
+    )
+
+
+def _truth(canvas: Canvas, here: Ground, options: SceneOptions) -> Floats:
+    """Return the true height at the time of the DSM, ``(H, W)``, m; the DTM is of the time before."""
+    found = changes(canvas.plan.streets(_box(canvas, OBJECT_REACH_M)), canvas.plan.seed, options.works)
+    if not found:
+        return here.height
+    return np.where(here.deck, here.height, here.height + rise(found, canvas.x, canvas.y))
+
+
+def _survey(
+    canvas: Canvas,
+    here: Ground,
+    truth: Floats,
+    objects: Objects,
+    options: SceneOptions,
+    rng: np.random.Generator,
+) -> tuple[Floats, NDArray[np.uint8]]:
+    """Return the surface model with noise (m) and the `Kind` of each cell."""
+    dsm, kind = surface_model(canvas, truth, here.deck, objects, options.overhang_m, rng)
+    dsm += rng.uniform(*options.dsm_noise_m) * rng.standard_normal(dsm.shape)
+    if options.growth_m > 0:
+        seed = canvas.plan.seed
+        height = options.density * growth(seed, canvas.x, canvas.y, here.edge, options.growth_m, rng)
+        overgrown = (kind == Kind.GROUND) & (height > 0)
+        dsm[overgrown] += height[overgrown]
+        kind[overgrown] = Kind.PLANTS
+    if options.mixed > 0:
+        dsm, chosen = mixed(dsm, truth, options.mixed, rng)
+        kind[chosen & np.isin(kind, BARE) & (dsm > truth)] = Kind.MIXED
+    if options.voids > 0:
+        without = water(canvas, canvas.plan.streams(_box(canvas, 0))) & ~here.deck
+        without |= hidden(canvas, dsm, objects.crowns, canvas.plan.seed, options.voids)
+        dsm[without] = np.nan
+    return dsm, kind
+
+
+def _ground_near(canvas: Canvas, options: SceneOptions) -> GroundAt:
+    """Return the function that gives the ground at points on the canvas and near it."""
+    plan = canvas.plan
+    land = relief(plan.seed, options.slope, options.roughness_m, options.datum_m, options.embankment_m)
+    # Objects may lie beyond the tile, and the streets that shape their ground even farther.
+    box = _box(canvas, 2 * OBJECT_REACH_M)
+    circles = tuple(plan.circles(box, CIRCLE_M + REACH_M))
+    ways = Ways(
+        plan.streets(box),
+        tuple(plan.streams(box)),
+        circles,
+        curb_m=options.curb_m,
+        wall_m=options.wall_m,
+        hump_m=options.hump_m,
+    )
+    return partial(ground, land, ways)
+
+
+def terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Generator) -> Floats:
+    """Return the bare ground, smoothed and with correlated noise, as interpolated from ground points."""
+    grain = gaussian_filter(rng.standard_normal(bare.shape), DTM_GRAIN_M / cell)
+    # A Gaussian of sigma cells reduces the deviation of white noise to 1 / (2 sigma sqrt(pi)).
+    gain = max(2 * np.sqrt(np.pi) * DTM_GRAIN_M / cell, 1.0)
+    smooth: Floats = gaussian_filter(bare, DTM_BLUR_M / cell, mode="nearest") + noise_m * gain * grain
+    return smooth
+
+
+def _flight_offset(canvas: Canvas, rms_m: float) -> Floats:
+    """Return the slowly varying offset of the DTM's survey from the DSM's (m), ``(H, W)``."""
+    lengths = np.geomspace(*FLIGHT_WAVES_M, 5)
+    field = waves(generator(canvas.plan.seed, "flights"), lengths, rms_m * np.sqrt(2 / lengths.size))
+    return field(canvas.x, canvas.y)
+
+
+def _box(canvas: Canvas, margin_m: float) -> Box:
+    """Return the plan's box around a canvas."""
+    x, y = canvas.x, canvas.y
+    return (
+        float(x.min()) - margin_m,
+        float(y.min()) - margin_m,
+        float(x.max()) + margin_m,
+        float(y.max()) + margin_m,
+    )
+
+
+def _centre(canvas: Canvas) -> tuple[float, float]:
+    west, south, east, north = canvas.grid.bounds
+    return canvas.plan.from_map((west + east) / 2, (south + north) / 2)
+
+
+def scan(scene: Scene, per_m2: float, noise_m: float, seed: int = 0) -> Points:
+    """Return points on a scene's surface, at random positions.
+
+    Heights are those of the true ground, linear between cell centres, plus what stands on the point's cell.
+
+    Parameters
+    ----------
+    scene : Scene
+        A scene without noise of its own (`SceneOptions.dsm_noise_m`).
+    per_m2 : float
+        Number of points per m2.
+    noise_m : float
+        Standard deviation of their heights (m).
+    """
+    grid, rng = scene.grid, generator(seed, "scan", *map(int, scene.grid.origin))
+    west, south, east, north = grid.bounds
+    number = round(per_m2 * (east - west) * (north - south))
+    easting, northing = rng.uniform(west, east, number), rng.uniform(south, north, number)
+    at = (north - northing) / grid.cell - 0.5, (easting - west) / grid.cell - 0.5
+    ground = map_coordinates(scene.reference, at, order=1, mode="nearest")
+    cells = bins(easting, northing, grid)
+    bare = np.isin(scene.kind, BARE)
+    above = np.where(bare, 0.0, scene.dsm - scene.reference).ravel()[cells]
+    deck = bare & (scene.reference - scene.dtm > DECK_M)
+    kind = np.where(deck, DECK, np.where(bare, GROUND, OTHER)).astype(np.uint8).ravel()[cells]
+    return Points(easting, northing, ground + above + noise_m * rng.standard_normal(number), kind)

@@ -1,0 +1,139 @@
+"""What makes the rasters of a survey differ from the true ground, besides noise and objects.
+
+Changes between two surveys (new road surfaces, new kerbs, excavations), low vegetation that a scan does not
+penetrate, mixed cells at edges and walls, and errors of a terrain model under houses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.synthetic.network import Street
+from flexroad.tools.synthetic.noise import generator, waves
+from flexroad.tools.synthetic.objects import House
+from flexroad.tools.synthetic.spoilers import Canvas
+
+KINDS = ("surface", "kerb", "excavation")
+LENGTH_M = {"surface": (30.0, 100.0), "kerb": (8.0, 30.0), "excavation": (4.0, 20.0)}
+RISE_M = {"surface": (0.02, 0.06), "kerb": (0.10, 0.15), "excavation": (-2.0, -0.6)}
+PAVEMENT_M = 2.2
+"""Width of the carriageway's edge that a new kerb takes (m)."""
+TRENCH_M = (1.5, 4.0)
+"""Width of an excavation (m)."""
+BESIDE_M = 3.0
+"""Greatest distance of an excavation's middle from the carriageway (m)."""
+WALL_M = 1.5
+"""Least height step to a neighbouring cell that counts as a wall (m)."""
+THICKET_M = (6.0, 60.0)
+"""Shortest and longest wave of the thickets (m)."""
+CLEAR_M = 1.5
+"""Width of the strip beside a carriageway without vegetation (m)."""
+RIM_M = 1.5
+"""Distance beyond the walls to which the ground was removed with the house (m)."""
+TILT = 0.5
+"""Tilt of a scar, as a fraction of its depth."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A stretch of a street whose height changed; lengths in m along and across the centre line."""
+
+    street: Street
+    start: float
+    end: float
+    left: float
+    right: float
+    rise: float
+    """Height of the later survey over the earlier one."""
+
+
+def changes(streets: Sequence[Street], seed: int, mean: float) -> tuple[Change, ...]:
+    """Return the changes of some streets, ``mean`` per street on average."""
+    return tuple(change for street in streets for change in _of(street, seed, mean)) if mean > 0 else ()
+
+
+def _of(street: Street, seed: int, mean: float) -> list[Change]:
+    rng = generator(seed, "works", *street.key)
+    return [_drawn(street, str(rng.choice(KINDS)), rng) for _ in range(rng.poisson(mean))]
+
+
+def _drawn(street: Street, kind: str, rng: np.random.Generator) -> Change:
+    half, side = street.half_width_m, rng.choice((-1, 1))
+    length, rise = rng.uniform(*LENGTH_M[kind]), rng.uniform(*RISE_M[kind])
+    start = rng.uniform(street.start, max(street.end - length, street.start))
+    if kind == "surface":
+        left, right = -half, half
+    elif kind == "kerb":
+        left, right = sorted((side * (half - PAVEMENT_M), side * half))
+    else:
+        middle, width = rng.uniform(-1, 1) * (half + BESIDE_M), rng.uniform(*TRENCH_M)
+        left, right = middle - width / 2, middle + width / 2
+    return Change(street, start, min(start + length, street.end), left, right, rise)
+
+
+def rise(found: Sequence[Change], x: Floats, y: Floats) -> Floats:
+    """Return by how much the later survey's ground is higher at points in the plan's frame (m)."""
+    total = np.zeros(np.shape(x))
+    for change in found:
+        along, _ = change.street.foot(x, y)
+        lateral = change.street.lateral(x, y, along)
+        inside = (along >= change.start) & (along <= change.end)
+        inside &= (lateral >= change.left) & (lateral <= change.right)
+        # Beyond a street's ends the foot stays at the end.
+        inside &= (along > change.street.start) & (along < change.street.end)
+        total[inside] = change.rise
+    return total
+
+
+def mixed(dsm: Floats, truth: Floats, share: float, rng: np.random.Generator) -> tuple[Floats, Bools]:
+    """Return the surface model with a fraction of the cells at walls mixed (m), and the mask of those cells.
+
+    A mixed cell is never below the true ground.
+    """
+    low, high = minimum_filter(dsm, 3), maximum_filter(dsm, 3)
+    chosen = (high - low > WALL_M) & (rng.random(dsm.shape) < share)
+    between = np.maximum(low + rng.random(dsm.shape) * (high - low), truth)
+    return np.where(chosen, between, dsm), chosen
+
+
+def growth(
+    seed: int, x: Floats, y: Floats, edge: Floats, height_m: float, rng: np.random.Generator
+) -> Floats:
+    """Return the height of low vegetation, ``(H, W)``, m; 0 where there is none.
+
+    Parameters
+    ----------
+    x, y, edge : (H, W) array
+        Coordinates in the plan's frame, and distance to the nearest carriageway (m).
+    height_m : float
+        Mean height inside a thicket (m).
+    rng : numpy.random.Generator
+        Draws the height of each cell relative to the mean.
+    """
+    lengths = np.geomspace(*THICKET_M, 18)
+    thick = waves(generator(seed, "thickets"), lengths, np.sqrt(2 / lengths.size))(x, y)
+    covered: Bools = (thick > 0) & (edge > CLEAR_M)
+    # A skewed distribution of mean 1: most cells are lower than the mean, a few are far higher.
+    ragged: Floats = rng.gamma(2.0, 0.5, x.shape)
+    return np.where(covered, height_m * np.minimum(thick, 1) * ragged, 0.0)
+
+
+def scars(canvas: Canvas, houses: Sequence[House], seed: int, depth_m: float) -> Floats:
+    """Return the error of the terrain model under houses, ``(H, W)``, m; 0 elsewhere.
+
+    The error under a house is a tilted plane, as interpolation across a hole would give.
+    """
+    error = np.zeros(canvas.x.shape)
+    for house in houses if depth_m > 0 else ():
+        window = canvas.around(house.x, house.y, float(np.hypot(house.half_length, house.half_depth)) + RIM_M)
+        u, v = canvas.local(window, house.x, house.y, house.heading)
+        inside = (np.abs(u) <= house.half_length + RIM_M) & (np.abs(v) <= house.half_depth + RIM_M)
+        level, tilt = generator(seed, "scar", int(house.x // 1), int(house.y // 1)).normal(0, depth_m, 2)
+        plane = level + TILT * tilt * u / house.half_length
+        error[window] = np.where(inside, plane, error[window])
+    return error

@@ -1,0 +1,345 @@
+"""Train the head of `segment: dinov2` on some tiles of a catalog and validate it on others, which lie apart.
+
+Validation runs the segmenter as a run does, with the trained model but without cleanup: the metrics are those
+of the model alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from flexroad.catalog import Bounds, Catalog, Grid, Tile
+from flexroad.catalog.storage.scratch import ScratchFolder
+from flexroad.catalog.text import count, printable, shown
+from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.config.options import INPUTS, METHOD, VALIDATION, option
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks import load
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.orthophoto import read_photo
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.distances import within
+from flexroad.tasks.roads.extent import beyond_extent
+from flexroad.tasks.roads.mask_cleanup import NOTHING
+from flexroad.tasks.roads.mask_metrics import Quality, judge, together
+from flexroad.tasks.segment.dinov2 import segment as segmenter
+from flexroad.tasks.types import Bools, RoadMask, TileData
+from flexroad.tools.train import fit_head as head
+from flexroad.tools.train.fit_head import Epoch, Sample, Trained
+from flexroad.tools.train.spatial_split import Block, Split, inside, split, split_tile
+
+Labels = Literal["mask", "vector"]
+Log = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Options of ``flexroad train``."""
+
+    labels: Labels = option(
+        MISSING, INPUTS, "mask: the catalog's reference road or road mask; vector: its vector roads."
+    )
+    validation: float = option(
+        0.3, VALIDATION, "Share of the tiles for validation.", "SHARE", min=0.05, max=0.9
+    )
+    gap_m: float = option(
+        50.0,
+        VALIDATION,
+        "Distance of training cells from validation tiles (m).",
+        "METRES",
+        min=0,
+        name="gap-m",
+    )
+    ignore_m: float = option(
+        1.0,
+        VALIDATION,
+        "Distance of training cells from edges of labels (m).",
+        "METRES",
+        min=0,
+        name="ignore-m",
+    )
+    """Edges of labels are never exact."""
+    seed: int = option(0, METHOD, "Seed of the split and of the training.", "N", min=0)
+    settings: Mapping[str, Any] | None = None
+    """Options of the head's training, by name; None for the defaults."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Quality of the model on one block of the validation side."""
+
+    piece: Block
+    quality: Quality
+    inner: Quality
+    """Quality without the band along the labels' edges."""
+    mask: NDArray[np.uint8]
+    """Predicted mask of the tile's core, packed with 8 cells per byte."""
+    note: str = ""
+    """Error of the segmentation; empty if it succeeded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """Rasters for a map of one tile."""
+
+    grid: Grid
+    photo: NDArray[np.uint8]
+    """The orthophoto, ``(3, h, w)``."""
+    truth: Bools
+    """Road according to the labels, ``(H, W)``."""
+    predicted: Bools
+    """Road according to the model, ``(H, W)``."""
+
+
+@dataclass(frozen=True)
+class LabelledTiles:
+    """Reads tiles with their labels. Nothing is cached, so memory does not grow with the number of tiles."""
+
+    options: TrainOptions
+    load: load.Options
+    vectors: rasterise.Options
+
+    def labelled(self, tile: Tile) -> tuple[TileData, Bools] | None:
+        """Return a tile and its labels, ``(H, W)``, or None if it has no labels.
+
+        Raises
+        ------
+        TaskError
+            If the tile cannot be read.
+        """
+        data = load.load(tile, self.load)
+        if self.options.labels == "vector":
+            return None if data.roads is None else (data, rasterise.rasterise_roads(data, self.vectors))
+        road = data.road_mask if data.reference_road is None else data.reference_road
+        return None if road is None else (data, road)
+
+    def read(self, tile: Tile) -> tuple[TileData, Bools]:
+        """Return a tile that is expected to have labels, and its labels.
+
+        Raises
+        ------
+        TaskError
+            If the tile has no labels any more, or cannot be read.
+        """
+        labelled = self.labelled(tile)
+        if labelled is None:
+            raise TaskError(f"tile {tile.id} has lost its labels since training began; start again")
+        return labelled
+
+    def usable_cells(self, data: TileData, road: Bools) -> Bools:
+        """Return the cells within the survey and outside the band along label edges, ``(H, W)``."""
+        cell, width = data.grid.cell, self.options.ignore_m
+        band = within(road, cell, width) & within(~road, cell, width)
+        return ~beyond_extent(data) & ~band
+
+    def blocks(self, tile: Tile, parts: Sequence[Bounds]) -> list[Block]:
+        """Return a block for each part of a tile that has labelled cells."""
+        labelled = self.labelled(tile)
+        if labelled is None:
+            return []
+        data, road = labelled
+        usable = self.usable_cells(data, road)
+        per_part = [usable & inside(data.grid, bounds) for bounds in parts]
+        return [
+            Block(tile, bounds, int((cells & road).sum()), int((cells & ~road).sum()))
+            for bounds, cells in zip(parts, per_part, strict=True)
+            if cells.any()
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A trained model and its validation."""
+
+    options: TrainOptions
+    tiles: LabelledTiles
+    trained: Trained
+    split: Split
+    judged: tuple[Evaluation, ...]
+    notes: tuple[str, ...]
+
+    def preview(self, evaluation: Evaluation) -> Preview:
+        """Return the rasters for a map of one tile; the tile is read again."""
+        data, truth = self.tiles.read(evaluation.piece.tile)
+        window = data.grid.window(data.core)
+        mask = np.unpackbits(evaluation.mask, count=data.core.width * data.core.height).astype(bool)
+        # Tiles without a photo are left out from the start.
+        assert data.dop is not None
+        return Preview(
+            data.core, read_photo(data.dop, data.core).colour, truth[window], mask.reshape(data.core.shape)
+        )
+
+    @property
+    def quality(self) -> Quality:
+        """Quality over all blocks of the validation side."""
+        return together(one.quality for one in self.judged)
+
+    @property
+    def inner(self) -> Quality:
+        """Quality without the band along the labels' edges."""
+        return together(one.inner for one in self.judged)
+
+
+@dataclass(frozen=True)
+class Samples(Sequence[Sample]):
+    """The samples of one side; each is read when it is accessed."""
+
+    tiles: LabelledTiles
+    split: Split
+    part: Literal["train", "validate"]
+
+    @cached_property
+    def _blocks(self) -> tuple[Block, ...]:
+        return self.split.train if self.part == "train" else self.split.validate
+
+    def __len__(self) -> int:
+        return len(self._blocks)
+
+    def __getitem__(self, index: Any) -> Any:
+        block = self._blocks[index]
+        data, road = self.tiles.read(block.tile)
+        select = self.split.training_cells if self.part == "train" else inside
+        return Sample(data, road, self.tiles.usable_cells(data, road) & select(data.grid, block.bounds))
+
+
+def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> Outcome:
+    """Train a head on a catalog and validate it.
+
+    Parameters
+    ----------
+    catalog : Catalog
+    config : Config
+        Options of its first exported variant: those of `load`, and those of `segment` if it is dinov2.
+    options : TrainOptions
+    log : callable
+        Called with each line of progress.
+
+    Raises
+    ------
+    ConfigError
+        If one of the settings is unknown, or the labels cannot be used.
+    TaskError
+        If training fails.
+    """
+    settings = _settings(options)
+    tiles = LabelledTiles(options, _chain(config)["load"], _vector_options(config))
+    notes: list[str] = []
+    sides = _split(list(_labelled(catalog, tiles, notes)), options)
+    log(f"{count(len(sides.train), 'tile')} for training, {len(sides.validate)} for validation")
+    samples, validation = (Samples(tiles, sides, part) for part in ("train", "validate"))
+
+    def progress(done: int, of: int, last: Epoch) -> None:
+        log(f"epoch {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
+
+    trained = head.train(samples, validation, settings, progress)
+    with ScratchFolder() as folder:
+        model = Path(folder, f"model{trained.suffix}")
+        model.write_bytes(trained.model)
+        applied = segment_options(config, model)
+        judged = tuple(
+            _evaluate(block, tiles, lambda data: segmenter.segment(data, applied)) for block in sides.validate
+        )
+    notes += [f"{each.piece.tile.id}: {each.note}" for each in judged if each.note]
+    return Outcome(options, tiles, trained, sides, judged, tuple(notes))
+
+
+def segment_options(config: Config, model: Path) -> segmenter.Options:
+    """Return the options of `segment` for validation: as configured, but without cleanup."""
+    configured = _chain(config)["segment"]
+    given = configured.model_dump() if isinstance(configured, segmenter.Options) else {}
+    return segmenter.Options(**given | {"model": model, "cleanup": NOTHING})
+
+
+def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], RoadMask]) -> Evaluation:
+    data, road = tiles.read(block.tile)
+    surveyed = inside(data.grid, block.bounds) & ~beyond_extent(data)
+    note = ""
+    try:
+        mask = segment(data)
+        cells, probability = mask.mask, mask.probability
+    except TaskError as error:
+        # A tile whose segmentation fails counts as a tile without predicted road.
+        cells, probability, note = np.zeros_like(road), np.zeros(road.shape, np.float32), str(error)
+    whole, inner = (
+        judge(cells, probability, road, scored, data.grid)
+        for scored in (surveyed, surveyed & tiles.usable_cells(data, road))
+    )
+    core = cells[data.grid.window(data.core)]
+    return Evaluation(block, whole, inner, np.packbits(core), note)
+
+
+def _labelled(catalog: Catalog, tiles: LabelledTiles, notes: list[str]) -> Iterator[Block]:
+    """Yield the tiles with labels, a single tile in two parts; add a note for each that cannot be read."""
+    single = len(catalog.usable) == 1
+    for tile in catalog.tiles:
+        if tile.layer("dop") is None:
+            continue
+        bounds = tile.grid.bounds
+        try:
+            yield from tiles.blocks(
+                tile, split_tile(bounds, tiles.options.validation) if single else [bounds]
+            )
+        except TaskError as error:
+            notes.append(f"{tile.id} is left out: {error}")
+
+
+def _split(pieces: Sequence[Block], options: TrainOptions) -> Split:
+    _check_labels(pieces, options)
+    if len(pieces) == 1:
+        raise ConfigError(
+            f"only tile {pieces[0].tile.id} has labels, none is left for validation: label another one, or "
+            "make a catalog of this tile alone, which is then split in two"
+        )
+    sides = split(pieces, options.validation, options.gap_m, options.seed)
+    train = tuple(piece for piece in sides.train if sides.training_cells(piece.tile.grid, piece.bounds).any())
+    if not any(piece.road for piece in train):
+        raise ConfigError(
+            f"no road for training lies {options.gap_m:g} m or more from the validation tiles; "
+            "lower --gap-m, or label more tiles"
+        )
+    return Split(train, sides.validate, sides.gap_m)
+
+
+def _check_labels(pieces: Sequence[Block], options: TrainOptions) -> None:
+    if not pieces:
+        missing = {
+            "vector": "vectors of roads: give --roads to `flexroad catalog rasters`",
+            "mask": "a mask of roads: give --reference-road or --road-mask to `flexroad catalog rasters`",
+        }[options.labels]
+        raise ConfigError(f"no readable tile has {missing} and an orthophoto (--dop)")
+    road, ground = (sum(counts) for counts in zip(*((p.road, p.ground) for p in pieces), strict=True))
+    if not road or not ground:
+        raise ConfigError(
+            f"the labels of all {len(pieces)} tiles are {'road' if road else 'no road'}: training needs "
+            "both; check --road-value of `flexroad catalog rasters`, or the vectors' segment.where"
+        )
+
+
+def _settings(options: TrainOptions) -> head.Options:
+    try:
+        return head.Options(**{"seed": options.seed, **(options.settings or {})})
+    except ValidationError as error:
+        fault = error.errors()[0]
+        name = printable(".".join(str(part) for part in fault["loc"]))
+        raise ConfigError(
+            f"--set {name}: {fault['msg'].lower()}, not {shown(fault['input'])}; "
+            f"the training has {', '.join(head.Options.model_fields)}"
+        ) from error
+
+
+def _vector_options(config: Config) -> rasterise.Options:
+    """Return the options of vector roads: those of the configured segmenter, else the defaults."""
+    segment = _chain(config)["segment"]
+    return segment if isinstance(segment, rasterise.Options) else rasterise.DEFAULTS
+
+
+def _chain(config: Config) -> dict[str, Any]:
+    return config.chains[config.export.variants[0]]

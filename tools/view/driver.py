@@ -1,0 +1,419 @@
+"""A run as a folder that a browser opens without a server: page, scripts, and one script per tile.
+
+The page is written last, and an earlier one is removed first: a folder with a page is complete.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexroad.catalog import Bounds, Tile
+from flexroad.catalog.crs import in_plan, name, short, transformer
+from flexroad.catalog.ids import safe_name
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.storage.links import contained
+from flexroad.catalog.storage.paths import Location, absolute, exists, read, remove, visible_entry, write
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
+from flexroad.pipeline.run.record import Run, check_links
+from flexroad.pipeline.run.status import TileStatus, Track, ended, peek_statuses, untracked
+from flexroad.pipeline.store.records import LEVELS
+from flexroad.pipeline.worker.texture import tile_photo
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.load import layer_source
+from flexroad.tasks.meshing.normals import mesh_normals
+from flexroad.tasks.products import glb
+from flexroad.tasks.quality.support import top_support
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.centre_lines import read_centre_lines
+from flexroad.tasks.roads.rasterise import DEFAULTS
+from flexroad.tasks.roads.rasterise import Options as RoadOptions
+from flexroad.tasks.roads.routes import CentreLine
+from flexroad.tasks.spline.levelled import LevelledSurface, top_of
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import Floats
+from flexroad.tools.export.pieces import Piece, write_pieces
+from flexroad.tools.export.source import TileItem, layer_state
+from flexroad.tools.view import encoding as viewer
+
+shapely = lazy("shapely")
+
+VERSION = 100 * viewer.VERSION + glb.VERSION
+PAGE = "index.html"
+MARK = b'<meta name="generator" content="FlexRoad viewer">'
+"""Text of a page that this program has written."""
+OWNER = ".flexroad-viewer"
+"""File with the path of the run whose viewer the folder has."""
+PENDING, DONE, FAILED = range(3)
+"""States of tiles in the index."""
+MEASURES = {
+    "error_estimate_m": ("Error estimate", "m"),
+    "worst_error_estimate_m": ("Error estimate of the worst 25 m²", "m"),
+    "suspect_m2": ("Largest suspect patch", "m²"),
+    "measured_road": ("Road measured by the scan", "%"),
+    "dtm_road": ("Road from the terrain model", "%"),
+    "inferred_road": ("Road inferred", "%"),
+    "residual_p95_m": ("Road points off the surface, p95", "m"),
+    "edge_step_m": ("Step at the road's edge, p95", "m"),
+    "l2_road_m": ("Road against the reference", "m"),
+    "l2_terrain_m": ("Terrain against the reference", "m"),
+    "triangles": ("Triangles", ""),
+    "seconds": ("Computing time", "s"),
+}
+"""Title and unit of the columns of metrics.parquet that colour the map; % marks shares."""
+DIGITS = 4
+"""Digits of the figures in the index."""
+LOOPBACK = "127.0.0.1"
+NAMES = (LOOPBACK, "localhost")
+WGS84 = "EPSG:4326"
+QUALITY = 82
+"""Quality of the photos' JPEG."""
+SIMPLIFIED_M = 0.05
+"""Largest distance of a simplified road line from the given one (m)."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written."""
+
+    page: Location
+    tiles: int
+    """Tiles with a script."""
+    others: int
+    """Tiles on the map that have no surface."""
+    notes: tuple[str, ...]
+    """What some tiles lack, one line per tile."""
+
+
+def write_viewer(
+    run: Run,
+    out: Location,
+    executor: Executor,
+    ids: Sequence[str] = (),
+    bbox: Bounds | None = None,
+    photo_px: int = 1024,
+    track: Track = untracked,
+) -> Written:
+    """Write the viewer of a run, or of the selected tiles, into a folder.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is of the run or has other files, no tile can be shown, tiles have different CRSs,
+        or a tile's results cannot be read.
+    CatalogError
+        If an id is not in the run, or no tile touches the box.
+    OSError
+        If a file cannot be written.
+    """
+    tiles = shown_tiles(run, ids, bbox)
+    variant = run.config.export.variants[0]
+    _claim(out, run)
+    index, done = _index(run, tiles, variant)
+    options = run.config.chains[variant]["segment"]
+    roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
+    look = Look(run.origin, photo_px, roads)
+    finished = track(_finished(run, done, variant), "writing tiles", len(done))
+    with ended(finished):
+        rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
+    for file in built_files():
+        if file.name != PAGE:
+            write(out / file.name, file.read_bytes())
+    # In the order of the catalog: equal viewers are equal byte by byte.
+    places = {row["tile"]: row["places"] for row in rows}
+    index["tiles"]["places"] = [places.get(tile.id, {}) for tile in tiles]
+    found = {row["tile"]: row["picture"] for row in rows if row["picture"]}
+    pictures = {tile.id: found[tile.id] for tile in done if tile.id in found}
+    write(out / viewer.NAME_PICTURES, viewer.encode_pictures(pictures))
+    write(out / viewer.NAME_RUN, viewer.encode_run(index | {"pictures": bool(pictures)}))
+    write(out / PAGE, (_built() / PAGE).read_bytes())
+    notes = tuple(f"tile {row['tile']}: {note}" for row in rows for note in row["notes"])
+    return Written(out / PAGE, len(done), len(tiles) - len(done), notes)
+
+
+def shown_tiles(run: Run, ids: Sequence[str], bbox: Bounds | None) -> tuple[Tile, ...]:
+    """Return the tiles of the map.
+
+    Raises
+    ------
+    ConfigError
+        If none has a place, or they have different CRSs.
+    CatalogError
+        If an id is not in the run, or no tile touches the box.
+    """
+    tiles = tuple(tile for tile in run.catalog.select(ids, bbox).tiles if not tile.fault)
+    if not tiles:
+        raise ConfigError(
+            f"{run.path}: no selected tile has a usable entry in the catalog; see `flexroad status`"
+        )
+    systems = {tile.grid.crs for tile in tiles}
+    if len(systems) > 1:
+        raise ConfigError(f"{run.path} has tiles in {len(systems)} CRSs; select tiles of one with --bbox")
+    return tiles
+
+
+def built_files() -> list[Path]:
+    """Return the files that each viewer has: page, style, script and licences."""
+    return sorted(path for path in _built().iterdir() if path.is_file())
+
+
+def _built() -> Path:
+    # In a checkout the package's folders are links; resolve() leads to the root, which has viewer/.
+    return Path(__file__).resolve().parents[2] / "viewer" / "dist"
+
+
+def _claim(out: Location, run: Run) -> None:
+    """Take the folder for this run's viewer: remove the page of an earlier one, and note the run.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is the run, its store or one of their folders, has other files or links that lead
+        out of it, or is the viewer of another run.
+    """
+    for place in (run.path, run.store, run.path / "tiles"):
+        if absolute(out) == absolute(place) or absolute(out) in absolute(place).parents:
+            raise ConfigError(f"{out} is a folder of the run or above it; choose another one with -o")
+    for place in (run.store, run.path / "tiles"):
+        if absolute(place) in absolute(out).parents:
+            raise ConfigError(f"{out} lies in {place}, which belongs to the run; choose another with -o")
+    if isinstance(out, Path) and out.is_file():
+        raise ConfigError(f"{out} is a file; choose a folder with -o")
+    owner = read(out / OWNER).decode(errors="replace") if exists(out / OWNER) else ""
+    own = str(absolute(run.path))
+    # A folder inside the run may have been moved with it.
+    if owner and owner != own and absolute(run.path) not in absolute(out).parents:
+        raise ConfigError(f"{out} has the viewer of {owner}; choose another folder with -o, or remove it")
+    other = None if owner or (exists(out / PAGE) and MARK in read(out / PAGE)) else visible_entry(out)
+    if other is not None:
+        raise ConfigError(
+            f"{out} has files that are not of a viewer, such as {other}; choose another folder with -o"
+        )
+    check_links(out, below=True)
+    write(out / OWNER, own.encode())
+    remove(out / PAGE)
+
+
+def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[TileItem]:
+    place = RunPlace.of(run)
+    for tile, snapshot in snapshots(run, done, variant):
+        if snapshot:
+            photo_and_lines = (layer_state(tile, name) for name in ("dop", "roads"))
+            made_of = " ".join((snapshot.nodes["assess"], *photo_and_lines))
+            yield TileItem(FinishedTile(tile, variant, snapshot, place), made_of)
+
+
+def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any], list[Tile]]:
+    """Return the index of the run, and its finished tiles."""
+    states, rows, errors, stale = list[int](), list[dict[str, Any]](), list[str](), list[bool]()
+    for status in peek_statuses(run, tiles):
+        states.append(DONE if status.done else FAILED if status.failed else PENDING)
+        rows.append(_row(status, variant))
+        errors.append(_error(status))
+        stale.append(status.stale)
+    bounds = [tile.grid.bounds for tile in tiles]
+    measures = {name: [_figure(row.get(name)) for row in rows] for name in MEASURES}
+    known = {name: values for name, values in measures.items() if any(value is not None for value in values)}
+    columns = {
+        "id": [tile.id for tile in tiles],
+        "file": [safe_name(tile.id) for tile in tiles],
+        "west": [west for west, _, _, _ in bounds],
+        "south": [south for _, south, _, _ in bounds],
+        "width": [east - west for west, _, east, _ in bounds],
+        "height": [north - south for _, south, _, north in bounds],
+        "state": states,
+        "stale": stale,
+        "flags": [_flags(row) for row in rows],
+        "error": errors,
+        "measures": known,
+    }
+    crs, vertical = tiles[0].grid.crs, vertical_crs(tiles[0])
+    label = short(crs)
+    index = {
+        "name": run.path.name or "run",
+        "variant": variant,
+        "crs_name": label if label == name(in_plan(crs)) else f"{label}, {name(in_plan(crs))}",
+        "vertical": name(vertical) if vertical else None,
+        "origin": list(run.origin),
+        "measures": {key: dict(zip(("title", "unit"), MEASURES[key], strict=True)) for key in known},
+        "tiles": columns,
+    } | ({"levels": True} if any(LEVELS in row for row in rows) else {})
+    return index, [tile for tile, state in zip(tiles, states, strict=True) if state == DONE]
+
+
+def _row(status: TileStatus, variant: str) -> dict[str, Any]:
+    """Return the figures of a finished tile; none of others."""
+    rows: Iterable[dict[str, Any]] = status.last_record.rows if status.done and status.last_record else ()
+    return next((row for row in rows if row.get("variant") == variant), {})
+
+
+def _error(status: TileStatus) -> str:
+    failures = status.last_record.failures if status.failed and status.last_record else ()
+    lines = dict.fromkeys(f"{f.line}{f' [{f.file}]' if f.file else ''}" for f in failures)
+    return "; ".join(lines)
+
+
+def _flags(row: dict[str, Any]) -> list[str]:
+    return [flag for flag in (row.get("flags") or "").split(", ") if flag]
+
+
+def _figure(value: Any) -> float | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return float(f"{value:.{DIGITS}g}")
+
+
+class _Files(SimpleHTTPRequestHandler):
+    """Files of a folder, for requests to this computer by its own name."""
+
+    def send_head(self) -> Any:
+        # Else a page of the web could read the folder, by a name of its own that leads here.
+        host = self.headers.get("Host", "").rpartition(":")[0]
+        if host not in NAMES:
+            self.send_error(403)
+            return None
+        try:
+            contained(Path(self.translate_path(self.path)), Path(self.directory))
+        except (OSError, ValueError):
+            # A link that leads out of the folder, or no name of a file, such as /%00.
+            self.send_error(404)
+            return None
+        return super().send_head()
+
+    def list_directory(self, path: Any) -> Any:
+        self.send_error(404)
+
+    def end_headers(self) -> None:
+        # The folder may be written again while it is served.
+        self.send_header("Cache-Control", "no-cache")
+        super().end_headers()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+def server(folder: Path, port: int) -> ThreadingHTTPServer:
+    """Return a server of a folder on this computer's loopback address.
+
+    Parameters
+    ----------
+    port : int
+        0 for any free one.
+
+    Raises
+    ------
+    OSError
+        If the port is in use.
+    """
+    return ThreadingHTTPServer((LOOPBACK, port), partial(_Files, directory=str(folder)))
+
+
+@dataclass(frozen=True)
+class Look:
+    """Options of the tiles' scripts."""
+
+    origin: tuple[float, float]
+    """Whole-metre (easting, northing) that meshes of the run are relative to."""
+    photo_px: int
+    """Largest width and height of a photo (pixels)."""
+    roads: RoadOptions = DEFAULTS
+    """Selection of the road lines."""
+
+
+def piece(item: TileItem, look: Look) -> Piece:
+    """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks."""
+    tile = item.tile
+    source, notes = tile.tile, list[str]()
+    photo = _photo(source, look.photo_px, notes)
+    quality, surface, core = tile.quality, tile.surface, source.grid
+    top, support = None, quality.support
+    if isinstance(surface, LevelledSurface):
+        top = surface.top(*np.meshgrid(core.eastings, core.northings))
+        support = top_support(quality, top)
+    try:
+        data, (estimate, _) = tile.data, tile.top_errors
+    except ConfigError as error:
+        dsm = dtm = estimate = None
+        seen, places = "", {}
+        notes.append(f"no scan and terrain model to compare with: {error}")
+    else:
+        window = data.grid.window(data.core)
+        dsm, dtm = data.dsm[window], data.dtm[window]
+        height = top_of(surface).lattice(data.core.eastings, data.core.northings)
+        height[tile.road.outside[window]] = np.nan
+        road = tile.road.mask[window] if top is None else tile.road.mask[window] | (top > 0)
+        places = {flag: list(place) for flag, place in tile.flag_places.items()}
+        small = viewer.picture(height, road, data.core.cell)
+        seen = base64.b64encode(small).decode("ascii")
+    scene = viewer.TileScene(
+        tile.id,
+        glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
+        source.grid,
+        corners(source),
+        support,
+        dsm,
+        dtm,
+        estimate,
+        surface if isinstance(surface, NurbsSurface) and top is None else None,
+        None if top is None else top_of(surface).lattice(core.eastings, core.northings),
+        _lines(source, look.roads, notes),
+    )
+    name = f"tiles/{safe_name(tile.id)}{viewer.NAME_TILE}"
+    return Piece(
+        {name: viewer.encode_tile(scene)},
+        {"tile": tile.id, "notes": notes, "picture": seen, "places": places},
+    )
+
+
+def corners(tile: Tile) -> Floats:
+    """Return longitude and latitude of a tile's corners, ``(4, 2)``: SW, SE, NW, NE (degrees)."""
+    west, south, east, north = tile.grid.bounds
+    places = transformer(tile.grid.crs, WGS84).transform(
+        [west, east, west, east], [south, south, north, north]
+    )
+    return np.column_stack(places)
+
+
+def _photo(tile: Tile, largest_px: int, notes: list[str]) -> glb.Texture | None:
+    layer = tile.layer("dop")
+    layer = layer and layer.reaching(tile.grid.bounds)
+    if not layer:
+        return None
+    try:
+        photo = tile_photo(tile, layer, largest_px)
+    except TaskError as error:
+        notes.append(f"no photo: {error}")
+        return None
+    return glb.texture(photo, QUALITY) if photo else None
+
+
+def _lines(tile: Tile, options: RoadOptions, notes: list[str]) -> tuple[CentreLine, ...]:
+    """Return the centre lines of the catalog on a tile, cut at its edges."""
+    layer = tile.layer("roads")
+    source = layer and layer_source(replace(tile, layers=(layer,)), layer.name)
+    if not source:
+        return ()
+    bounds = tile.grid.bounds
+    try:
+        lines = read_centre_lines(source, bounds, tile.grid.crs, options).lines
+    except TaskError as error:
+        notes.append(f"no road lines: {error}")
+        return ()
+    parts = []
+    for line in lines:
+        cut = shapely.LineString(line.points).simplify(SIMPLIFIED_M).intersection(shapely.box(*bounds))
+        for part in shapely.get_parts(cut):
+            if part.geom_type == "LineString" and part.length > 0:
+                parts.append(replace(line, points=shapely.get_coordinates(part)))
+    return tuple(parts)
