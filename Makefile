@@ -64,12 +64,12 @@ reproduce: $(SURVEY) $(SCENES) $(LITERAL_SURVEY) ## The paper's tables and figur
 	$(BIN)/flexroad figures $(REPRODUCED)/segmented -o $(RESULTS)
 
 # Made once: rasters written anew have new times, and all that hangs on them would be computed again.
-MESHED := $(addprefix tools/synthetic/,dsc3d.py glb.py photogrammetry.py reconstruction.py triangles.py)
+MESHED := $(addprefix tools/synthetic/,command.py dsc3d.py photogrammetry.py reconstruction.py)
 MADE := $(filter-out $(MESHED),$(wildcard tools/synthetic/*.py))
 runs/synthetic-%-$(SEED)/survey/catalog.parquet: $(MADE) | $(STAMP)
 	$(BIN)/flexroad catalog synthetic --preset gerod -o $(@D) --tiles $* --seed $(SEED)
 
-$(SCENES): $(wildcard tools/synthetic/*.py tasks/acquire/*.py tasks/acquire/*/*.py tools/prepare/*.py) | $(STAMP)
+$(SCENES): $(wildcard tools/synthetic/*.py tools/prepare/*.py tools/prepare/*/*.py) | $(STAMP)
 	$(BIN)/flexroad catalog synthetic --preset dsc3d -o $(@D) --seed $(SEED)
 
 runs/gerod/survey/catalog.parquet: configs/gerod.yaml | $(STAMP)

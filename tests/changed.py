@@ -33,18 +33,19 @@ RUNS = {
 """What reads and writes the files of a run; the stages are pure functions."""
 AREAS = {
     "runs": RUNS,
-    "exports": RUNS | {"tools/export", "tasks/export"},
+    "exports": RUNS | {"tools/export", "tasks/products"},
     "pages": {
         "viewer",
-        "tasks/export",
+        "tasks/products",
         "tools/export",
         "tools/report",
+        "tools/view",
         "pipeline/run",
         "pipeline/store",
     },
-    "photos": {"catalog", "tasks/acquire", "tasks/io", "tools/prepare"},
+    "photos": {"catalog", "tasks/io", "tools/prepare"},
     "levels": {f"tasks/{name}" for name in ("filter", "fit", "levels", "roads", "segment", "spline")},
-    "readers": RUNS | {"pipeline/check", "tools/results", "tasks/acquire", "tasks/segment"},
+    "readers": RUNS | {"pipeline/check", "tools/check", "tools/prepare", "tools/results", "tasks/segment"},
 }
 
 

@@ -88,9 +88,9 @@ def test_options_are_those_of_the_models():
 @pytest.mark.parametrize("page", LIVE, ids=lambda page: page.name)
 def test_named_files_and_modules_exist(page):
     text = page.read_text()
-    files = re.findall(r"(?<![\w./])(?:catalog|pipeline|tasks|tests|configs)/[\w/]+\.\w+", text)
+    files = re.findall(r"(?<![\w./])(?:catalog|pipeline|tasks|tools|tests|configs)/[\w/]+\.\w+", text)
     assert [name for name in files if "NAME" not in name and not (ROOT / name).exists()] == []
-    modules = re.findall(r"flexroad\.((?:catalog|pipeline|tasks)\.[\w.]+)", text)
+    modules = re.findall(r"flexroad\.((?:catalog|pipeline|tasks|tools)\.[\w.]+)", text)
     folders = [ROOT / name.rpartition(".")[0].replace(".", "/") for name in modules]
     assert [str(path) for path in folders if not (path.exists() or path.with_suffix(".py").exists())] == []
 

@@ -15,18 +15,28 @@ from flexroad.catalog.sources import nrw, rasters, templates
 from flexroad.catalog.storage.unpack import unpack
 from flexroad.catalog.text import count
 from flexroad.catalog.tiling import Conversion, TilingResult
-from flexroad.pipeline.check.catalog import check
 from flexroad.pipeline.cli import options
-from flexroad.pipeline.cli.command import Command, group
+from flexroad.pipeline.cli.command import Command, LazyGroup, group
 from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES
-from flexroad.pipeline.graph.layers import fitting_config
+from flexroad.pipeline.config.options import INPUTS, MIN_COVER_HELP, OUTPUTS, TILES
 from flexroad.pipeline.run.progress import StepProgress
-from flexroad.tools.prepare.options import MIN_COVER_HELP
 
-app = group("catalog", "Make, show and check catalogs of tiles.")
+TOOLS = {
+    "synthetic": ("tools.synthetic.command", "Make synthetic scenes with known truth, and their catalog."),
+    "check": ("tools.check.command", "Check a catalog before a long run."),
+}
+"""The module of each command that a tool has, as in `main.COMMANDS`."""
+
+
+class _Catalogs(LazyGroup):
+    """The commands of this module, and those of tools."""
+
+    modules = TOOLS
+
+
+app = group("catalog", "Make, show and check catalogs of tiles.", _Catalogs)
 
 Output = Annotated[
     Path,
@@ -255,40 +265,6 @@ def _write_catalog(result: TilingResult, output: Path, strict: bool, config: str
         raise typer.Exit(1)
 
 
-@app.command("synthetic", cls=Command)
-def catalog_synthetic(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder to write.")],
-    preset: Annotated[
-        Literal["gerod", "dsc3d"] | None,
-        typer.Option(
-            help="gerod: separate tiles as in the paper; dsc3d: five meshes; default: adjacent tiles."
-        ),
-    ] = None,
-    tiles: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Number of tiles; default: 4, or all of the preset."),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the scenes.")] = 0,
-    tile_size: Annotated[
-        int | None, typer.Option(min=10, metavar="METRES", help="Size of a tile in m; default: 250.")
-    ] = None,
-    dop: Annotated[bool, typer.Option("--dop", help="Also make orthophotos with pixels of 0.5 m.")] = False,
-    decks: Annotated[
-        bool,
-        typer.Option("--decks", help="Make roads on decks and in tubes, with the heights of both levels."),
-    ] = False,
-) -> None:
-    """Make synthetic scenes with known truth, and their catalog."""
-    from flexroad.tools.synthetic.scenes import write_scenes  # noqa: PLC0415 loads scipy
-
-    path = write_scenes(output, tiles, seed, tile_size, dop, preset, decks)
-    echo(f"{count(len(Catalog.read(path).tiles), 'tile')} in {path}")
-    if decks:
-        echo(after_catalog(path, "production_vector", ["segment.levels=true"]))
-    else:
-        echo(after_catalog(path, {"gerod": "paper"}.get(preset or "", preset)))
-
-
 @app.command("show", cls=Command)
 def catalog_show(path: options.CatalogFile) -> None:
     """List the tiles of a catalog."""
@@ -303,32 +279,3 @@ def catalog_show(path: options.CatalogFile) -> None:
         echo(f"{tile.id}  {size}  {date}  {tile.stratum or '-'}  {layers}")
     systems = sorted({tile.grid.crs for tile in catalog.usable})
     echo(f"{count(len(catalog.tiles), 'tile')}, {', '.join(crs[:60] for crs in systems)}")
-
-
-@app.command("check", cls=Command)
-def catalog_check(
-    path: options.CatalogFile,
-    config: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FILE",
-            help="Configuration of the run; default: the one that fits the layers.",
-            rich_help_panel=INPUTS,
-        ),
-    ] = None,
-    decks: Annotated[
-        bool, typer.Option("--decks", help="Look for decks on all tiles, not only on 200 of them.")
-    ] = False,
-    allow: options.Allow = None,
-) -> None:
-    """Check a catalog before a long run.
-
-    Prints layers, what would fail in a run, the shift between photo and heights, and how many places look
-    like decks that no road names. These are written to decks.geojson beside the catalog.
-    """
-    catalog, faults = Catalog.read(path, allow or ()), 0
-    for remark in check(catalog, load_config(config or fitting_config(catalog)), path, decks):
-        echo(f"warning: {remark.text}" if remark.fault or remark.warning else remark.text)
-        faults += remark.fault
-    if faults:
-        raise typer.Exit(1)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
 import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from flexroad.pipeline.config.options import HEADINGS
 
@@ -21,9 +23,42 @@ MAX_NAME = 30
 """Longest name of an option, with its values, beside which a help page writes the meaning."""
 
 
-def group(name: str | None = None, help: str | None = None) -> typer.Typer:
+class LazyGroup(TyperGroup):
+    """A group that has commands of modules which are imported when the command is called."""
+
+    modules: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    """The module of each such command below `flexroad`, whose `app` has it, and the first line of its help.
+
+    Modules are text, so that the core imports no tool.
+    """
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        listed = {name: TyperCommand(name, help=text) for name, (_, text) in self.modules.items()}
+        self.commands = {**self.commands, **listed}
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command, None if there is no such one."""
+        if cmd_name in self.modules:
+            return _imported(self.modules[cmd_name][0], cmd_name)
+        return super().get_command(ctx, cmd_name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands of the help page, without importing them."""
+        TyperGroup(commands=dict(self.commands)).format_commands(ctx, formatter)
+
+
+@functools.cache
+def _imported(module: str, name: str) -> Any:
+    found = typer.main.get_group(importlib.import_module(f"flexroad.{module}").app)
+    return found if found.name == name else found.commands[name]
+
+
+def group(
+    name: str | None = None, help: str | None = None, cls: type[TyperGroup] | None = None
+) -> typer.Typer:
     """Return what a module registers its commands with: a group of the program if it has a name."""
-    return typer.Typer(name=name, help=help, no_args_is_help=True, rich_markup_mode=None)
+    return typer.Typer(name=name, help=help, cls=cls, no_args_is_help=True, rich_markup_mode=None)
 
 
 def _in_words(text: str) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from flexroad.catalog import Tile
 from flexroad.catalog.skipped import lines
 from flexroad.catalog.text import count
-from flexroad.pipeline.check.catalog import expected_failures
+from flexroad.pipeline.check.failures import expected_failures
 from flexroad.pipeline.check.reasons import Kind, reason
 from flexroad.pipeline.execute.adaptive import decision, workers_of
 from flexroad.pipeline.graph.borders import STAGE as BORDER

@@ -2,66 +2,52 @@
 
 from __future__ import annotations
 
-import functools
-import importlib
 import importlib.metadata
 import os
 import sys
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.text import one_line
 from flexroad.pipeline import IGNORED
 from flexroad.pipeline.cli import limits
+from flexroad.pipeline.cli.command import LazyGroup
 from flexroad.pipeline.cli.signals import INTERRUPTED, signals_interrupt
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
 COMMANDS = {
-    "init": ("init", "Say what a folder of downloads has, and which commands fit."),
-    "run": ("run", "Bring every tile of a run up to date."),
-    "rerun": ("run", "Bring tiles of a run up to date again."),
-    "status": ("run", "Show the state of a run and the failures of its tiles."),
-    "clean": ("clean", "Delete files that no run needs."),
-    "report": ("results", "Write a report on a run: failures, places, figures."),
-    "query": ("query", "Print heights, classes and flags at points or along lines."),
-    "lift": ("lift", "Write a road network or features with heights of a run."),
-    "export": ("export", "Write finished tiles in the formats of other programs."),
-    "view": ("view", "Write a run as a page for browsers: map and surface in 3D."),
-    "tables": ("results", "Write the paper's tables and claims beside the values of a run."),
-    "figures": ("results", "Draw the paper's figures from a run."),
-    "train": ("train", "Train the head of `segment: dinov2` on labelled tiles."),
-    "catalog": ("catalogs", "Make, show and check catalogs of tiles."),
-    "prepare": ("prepare", "Make rasters and a catalog of points, meshes or photographs."),
-    "config": ("configs", "Show configurations."),
+    "init": ("tools.check.command", "Say what a folder of downloads has, and which commands fit."),
+    "run": ("pipeline.cli.run", "Bring every tile of a run up to date."),
+    "rerun": ("pipeline.cli.run", "Bring tiles of a run up to date again."),
+    "status": ("pipeline.cli.run", "Show the state of a run and the failures of its tiles."),
+    "clean": ("pipeline.cli.clean", "Delete files that no run needs."),
+    "report": ("tools.report.command", "Write a report on a run: failures, places, figures."),
+    "query": ("tools.results.command", "Print heights, classes and flags at points or along lines."),
+    "lift": ("tools.lift.command", "Write a road network or features with heights of a run."),
+    "export": ("tools.export.command", "Write finished tiles in the formats of other programs."),
+    "view": ("tools.view.command", "Write a run as a page for browsers: map and surface in 3D."),
+    "tables": ("tools.reproduce.command", "Write the paper's tables and claims beside the values of a run."),
+    "figures": ("tools.reproduce.command", "Draw the paper's figures from a run."),
+    "train": ("tools.train.command", "Train the head of `segment: dinov2` on labelled tiles."),
+    "catalog": ("pipeline.cli.catalogs", "Make, show and check catalogs of tiles."),
+    "prepare": ("tools.prepare.command", "Make rasters and a catalog of points, meshes or photographs."),
+    "config": ("pipeline.cli.configs", "Show configurations."),
 }
-"""The module of each command, whose `app` has it, and the first line of its help."""
+"""The module of each command and the first line of its help (`LazyGroup.modules`)."""
 
 
-class Commands(TyperGroup):
-    """The commands of the program; the module of a command is imported when the command is called."""
+class Commands(LazyGroup):
+    """The commands of the program."""
 
-    def __init__(self, **attributes: Any) -> None:
-        super().__init__(**attributes)
-        self.commands = {name: TyperCommand(name, help=text) for name, (_, text) in COMMANDS.items()}
+    modules = COMMANDS
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command, None if there is no such one; the limits of this process suffice for it."""
         limits.check(cmd_name)
-        return _imported(cmd_name) if cmd_name in COMMANDS else None
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of commands of the help page, without importing them."""
-        TyperGroup(commands=dict(self.commands)).format_commands(ctx, formatter)
-
-
-@functools.cache
-def _imported(name: str) -> Any:
-    group = typer.main.get_group(importlib.import_module(f"flexroad.pipeline.cli.{COMMANDS[name][0]}").app)
-    return group if group.name == name else group.commands[name]
+        return super().get_command(ctx, cmd_name)
 
 
 app = typer.Typer(

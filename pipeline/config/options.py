@@ -22,6 +22,7 @@ HEADINGS = (
     ALARMS,
 )
 """In the order of a help page."""
+MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
 
 
 def option(default: Any, heading: str, help: str, metavar: str | None = None, **more: Any) -> Any:

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from shapely import STRtree, box, points
 
 from flexroad.catalog import Bounds
+from flexroad.catalog.crs import same, transformer
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import has_borders
@@ -34,11 +36,47 @@ from flexroad.pipeline.run.tile_steps import largest_tile_step
 from flexroad.tasks.quality.flagged import UNKNOWN, Bits
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
-from flexroad.tasks.types import Floats, RoadMask, Surface
-from flexroad.tools.lift.types import Heights
+from flexroad.tasks.types import Bools, Floats, RoadMask, Surface
+
+Places = slice | Bools | NDArray[np.intp]
 
 AT_ONCE = 50_000
 """Number of points of which the tiles are looked up together: geometries take much memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """Heights of n points on each level."""
+
+    numbers: tuple[int, ...]
+    """The k levels, ascending; 0, the ground, is one of them."""
+    z: Floats
+    """``(k, n)``, m; NaN where a level is not, and beyond the surface."""
+    flags: Bits | None = None
+    """``(k, n)``, flags of the surface by `tasks.quality.flagged`; None if it has none."""
+
+    def __getitem__(self, places: Places) -> Heights:
+        flags = None if self.flags is None else self.flags[:, places]
+        return replace(self, z=self.z[:, places], flags=flags)
+
+    def flags_on(self, numbers: NDArray[np.int8]) -> Bits:
+        """Return the flags of the points on given levels, ``(n,)``."""
+        found = np.zeros(len(numbers), np.uint16)
+        if self.flags is not None:
+            for number, row in zip(self.numbers, self.flags, strict=True):
+                found[numbers == number] = row[numbers == number]
+        return found
+
+    @property
+    def ground(self) -> Floats:
+        """Heights of level 0, ``(n,)``, m."""
+        return np.asarray(self.z[self.numbers.index(0)])
+
+    @property
+    def several(self) -> Bools:
+        """Whether a point has another level than the ground, ``(n,)``."""
+        others = [number != 0 for number in self.numbers]
+        return np.asarray(np.isfinite(self.z[others]).any(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,3 +363,43 @@ def _by_level(
         else:
             continue
         yield number, selected[here], surface.at(number)
+
+
+def crs_of(ground: Ground) -> str | None:
+    """Return the CRS of a run, None if its tiles have several."""
+    systems = {tile.grid.crs for tile in ground.run.catalog.usable}
+    return systems.pop() if len(systems) == 1 else None
+
+
+def required_crs(ground: Ground) -> str:
+    """Return the CRS of a run.
+
+    Raises
+    ------
+    ConfigError
+        If its tiles have several.
+    """
+    crs = crs_of(ground)
+    if crs is None:
+        raise ConfigError(
+            f"the tiles of {ground.run.path} have several CRSs; give points in that of the tile, as a CSV "
+            "with easting and northing"
+        )
+    return crs
+
+
+def to_crs(x: Floats, y: Floats, source: str | None, target: str) -> tuple[Floats, Floats]:
+    """Return coordinates in another CRS; NaN where they cannot be transformed.
+
+    Parameters
+    ----------
+    x, y : ndarray, (n,)
+        First east, then north, whatever the order of the axes of the CRS.
+    source : str or None
+        None if they already are in the CRS ``target``.
+    """
+    if source is None or same(source, target):
+        return x, y
+    east, north = transformer(source, target).transform(x, y)
+    finite = np.isfinite(east) & np.isfinite(north)
+    return np.where(finite, east, math.nan), np.where(finite, north, math.nan)

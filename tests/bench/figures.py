@@ -10,7 +10,8 @@ import subprocess
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-SOURCE = ("catalog", "tasks", "pipeline", "flexroad")
+CORE = ("catalog", "tasks", "pipeline", "flexroad")
+TOOLS = sorted(folder.name for folder in (ROOT / "tools").iterdir() if (folder / "__init__.py").is_file())
 
 
 def tracked(*patterns: str) -> list[Path]:
@@ -36,14 +37,18 @@ def inner_imports(tree: ast.Module) -> int:
 
 
 def main() -> None:
-    source = [file for file in tracked(*SOURCE) if file.suffix == ".py"]
+    core, tools = (
+        [file for file in tracked(*folders) if file.suffix == ".py"] for folders in (CORE, ["tools"])
+    )
+    source = core + tools
     tests = [file for file in tracked("tests") if file.suffix == ".py"]
     trees = [ast.parse(file.read_text()) for file in source]
     classes = [node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)]
     pages = [file for file in tracked("docs") if file.suffix == ".md"]
     live = [file for file in pages if not {"archive", "results"} & set(file.parts)]
     figures = {
-        "source: lines of Python": lines(source),
+        "core: lines of Python": lines(core),
+        "tools: lines of Python": lines(tools),
         "source: files": len(source),
         "source: public classes": sum(not name.startswith("_") for name in classes),
         "source: imports in functions": sum(map(inner_imports, trees)),
@@ -53,6 +58,8 @@ def main() -> None:
         "docs: words": words(live),
         "docs: words of results, archive": words(pages) - words(live),
     }
+    for folder in (*CORE[:3], *(f"tools/{name}" for name in TOOLS)):
+        figures[f"{folder}: lines"] = lines([file for file in source if file.is_relative_to(ROOT / folder)])
     for name, value in figures.items():
         print(f"{name:32}{value:8,}")
 

@@ -12,7 +12,7 @@ from flexroad.catalog.grid import overlap
 from flexroad.catalog.sources.rasters import index
 from flexroad.catalog.tile import REACH_M
 from flexroad.catalog.tiling import Conversion
-from flexroad.pipeline.check.catalog import expected_failures
+from flexroad.pipeline.check.failures import expected_failures
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.graph.sources import SourceFiles
 from flexroad.tasks import load

@@ -1,4 +1,4 @@
-"""``flexroad init``: say what a folder of downloads has, and which commands fit it."""
+"""``flexroad init`` and ``catalog check``: what a folder or a catalog has, and what would fail."""
 
 from __future__ import annotations
 
@@ -10,9 +10,15 @@ from typing import Annotated
 
 import typer
 
+from flexroad.catalog import Catalog
+from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.config.options import INPUTS
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.layers import fitting_config
+from flexroad.tools.check.catalog import check
 from flexroad.tools.check.downloads import MAX_FILES, Download, Proposal, gerod, look, proposals
 
 app = group()
@@ -115,3 +121,32 @@ def _write(path: Path, folder: Path, proposed: Sequence[Proposal]) -> None:
     except OSError as error:
         raise ConfigError(f"cannot write --write {path}: {error.strerror or error}") from error
     echo(f"wrote {path}")
+
+
+@app.command("check", cls=Command)
+def catalog_check(
+    path: options.CatalogFile,
+    config: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FILE",
+            help="Configuration of the run; default: the one that fits the layers.",
+            rich_help_panel=INPUTS,
+        ),
+    ] = None,
+    decks: Annotated[
+        bool, typer.Option("--decks", help="Look for decks on all tiles, not only on 200 of them.")
+    ] = False,
+    allow: options.Allow = None,
+) -> None:
+    """Check a catalog before a long run.
+
+    Prints layers, what would fail in a run, the shift between photo and heights, and how many places look
+    like decks that no road names. These are written to decks.geojson beside the catalog.
+    """
+    catalog, faults = Catalog.read(path, allow or ()), 0
+    for remark in check(catalog, load_config(config or fitting_config(catalog)), path, decks):
+        echo(f"warning: {remark.text}" if remark.fault or remark.warning else remark.text)
+        faults += remark.fault
+    if faults:
+        raise typer.Exit(1)

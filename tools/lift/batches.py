@@ -7,8 +7,9 @@ from typing import TypeVar
 
 import numpy as np
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.types import Floats
-from flexroad.tools.lift.types import Heights, HeightsAt
+from flexroad.tools.lift.types import HeightsAt
 
 POINTS = 500_000
 """Number of points of a batch: some 200 MB with their heights and what they belong to."""

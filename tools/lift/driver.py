@@ -30,15 +30,13 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import passing
-from flexroad.pipeline.run.points import Ground
+from flexroad.pipeline.run.points import Ground, Heights, required_crs, to_crs
 from flexroad.pipeline.run.tile_steps import length_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tasks.types import Floats
 from flexroad.tools.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text
-from flexroad.tools.lift.types import Frame, Heights, Lifted, Options
-from flexroad.tools.results.query import required_crs
-from flexroad.tools.results.query_files import to_crs
+from flexroad.tools.lift.types import Frame, Lifted, Options
 
 if TYPE_CHECKING:
     import geopandas

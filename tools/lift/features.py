@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.lazy import lazy
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.quality.flagged import Bits, passed
 from flexroad.tasks.roads import level_numbers
@@ -20,7 +21,7 @@ from flexroad.tools.lift.batches import POINTS
 from flexroad.tools.lift.levels import ANY, Numbers, along
 from flexroad.tools.lift.lines import STEP_M, Line, largest, steepest
 from flexroad.tools.lift.shapes import POINT, POLYGON, Shape
-from flexroad.tools.lift.types import Heights, Lifted, Options, RunSurface, Steep
+from flexroad.tools.lift.types import Lifted, Options, RunSurface, Steep
 
 if TYPE_CHECKING:
     import pandas as pd

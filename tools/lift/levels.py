@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.roads.level_numbers import OSM_TAGS, level_numbers
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.lift.types import Heights
 
 ANY = np.int8(-128)
 """A wanted level that is not known."""

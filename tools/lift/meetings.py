@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.lift.levels import ANY, Numbers, along, stretches
 from flexroad.tools.lift.lines import Line
-from flexroad.tools.lift.types import Heights
 
 FAR_M = 1e12
 """A coordinate that is beyond all others."""

@@ -12,6 +12,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Bools, Floats
@@ -22,7 +23,7 @@ from flexroad.tools.lift.lines import steepest
 from flexroad.tools.lift.plan_view import numbers
 from flexroad.tools.lift.profile import AHEAD_M, value_at
 from flexroad.tools.lift.road_profiles import NONE, CrossSections
-from flexroad.tools.lift.types import Frame, Heights, HeightsAt, Lifted, Options, Steep
+from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, Steep
 from flexroad.tools.lift.xml_text import Part
 
 NOUN = "road"

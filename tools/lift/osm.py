@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.text import shown
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
@@ -21,7 +22,7 @@ from flexroad.tools.lift.batches import POINTS, with_heights
 from flexroad.tools.lift.levels import Numbers, along, level_of, tagged_level
 from flexroad.tools.lift.lines import Line, largest
 from flexroad.tools.lift.meetings import Meetings
-from flexroad.tools.lift.types import Frame, Heights, HeightsAt, Lifted, Options
+from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options
 from flexroad.tools.lift.xml_text import Part
 
 NOUN = "way"

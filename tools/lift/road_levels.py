@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from flexroad.tools.lift.types import Heights
+from flexroad.pipeline.run.points import Heights
 
 Contact = tuple[str, bool]
 """A road and whether it is its end; else its start."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.text import shown
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
@@ -19,7 +20,7 @@ from flexroad.tools.lift.batches import with_heights
 from flexroad.tools.lift.levels import ANY, Numbers, along, level_of, tagged_level
 from flexroad.tools.lift.lines import STEP_M, Line, largest
 from flexroad.tools.lift.meetings import Meetings
-from flexroad.tools.lift.types import Frame, Heights, HeightsAt, Lifted, Options
+from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options
 from flexroad.tools.lift.xml_text import Part
 
 NOUN = "edge"

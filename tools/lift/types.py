@@ -9,46 +9,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.tasks.quality.flagged import Bits
-from flexroad.tasks.types import Bools, Floats
-
-Places = slice | Bools | NDArray[np.intp]
-
-
-@dataclass(frozen=True, eq=False)
-class Heights:
-    """Heights of n points on each level."""
-
-    numbers: tuple[int, ...]
-    """The k levels, ascending; 0, the ground, is one of them."""
-    z: Floats
-    """``(k, n)``, m; NaN where a level is not, and beyond the surface."""
-    flags: Bits | None = None
-    """``(k, n)``, flags of the surface by `tasks.quality.flagged`; None if it has none."""
-
-    def __getitem__(self, places: Places) -> Heights:
-        flags = None if self.flags is None else self.flags[:, places]
-        return replace(self, z=self.z[:, places], flags=flags)
-
-    def flags_on(self, numbers: NDArray[np.int8]) -> Bits:
-        """Return the flags of the points on given levels, ``(n,)``."""
-        found = np.zeros(len(numbers), np.uint16)
-        if self.flags is not None:
-            for number, row in zip(self.numbers, self.flags, strict=True):
-                found[numbers == number] = row[numbers == number]
-        return found
-
-    @property
-    def ground(self) -> Floats:
-        """Heights of level 0, ``(n,)``, m."""
-        return np.asarray(self.z[self.numbers.index(0)])
-
-    @property
-    def several(self) -> Bools:
-        """Whether a point has another level than the ground, ``(n,)``."""
-        others = [number != 0 for number in self.numbers]
-        return np.asarray(np.isfinite(self.z[others]).any(axis=0))
-
+from flexroad.pipeline.run.points import Heights
+from flexroad.tasks.types import Floats
 
 HeightsAt = Callable[[Floats, Floats], Heights]
 """Heights at x and y, ``(n,)`` each, in the coordinates of the file."""

@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from flexroad.catalog.limits import MIN_COVER
-from flexroad.pipeline.config.options import INPUTS, OUTPUTS, RASTERS, option
+from flexroad.pipeline.config.options import INPUTS, MIN_COVER_HELP, OUTPUTS, RASTERS, option
 from flexroad.pipeline.errors import ConfigError
-
-MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
 
 
 def written(paths: Iterable[Path]) -> datetime:

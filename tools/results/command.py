@@ -15,7 +15,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.points import Ground
+from flexroad.pipeline.run.points import Ground, required_crs
 from flexroad.tools.results.query import (
     LevelWanted,
     along_lines,
@@ -23,7 +23,6 @@ from flexroad.tools.results.query import (
     beyond_survey,
     on_flagged,
     outside,
-    required_crs,
 )
 from flexroad.tools.results.query_files import LONLAT, parse_csv, read_lines, read_points
 

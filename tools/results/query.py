@@ -19,12 +19,12 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, reason
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import SEE_REPORT
-from flexroad.pipeline.run.points import Answer, Ground
+from flexroad.pipeline.run.points import Answer, Ground, crs_of, required_crs, to_crs
 from flexroad.pipeline.run.tile_steps import LARGEST_M, REMEDY, length_text
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.quality.flagged import Bits, flag_names
 from flexroad.tasks.types import Floats
-from flexroad.tools.results.query_files import Points, to_crs
+from flexroad.tools.results.query_files import Points
 
 if TYPE_CHECKING:
     import geopandas
@@ -105,29 +105,6 @@ class AnswerTable:
             except ERRORS as error:
                 raise ConfigError(f"{path}: cannot be written: {reason(error)}; write a CSV") from error
             write(parse_location(path), file.read_bytes())
-
-
-def crs_of(ground: Ground) -> str | None:
-    """Return the CRS of a run, None if its tiles have several."""
-    systems = {tile.grid.crs for tile in ground.run.catalog.usable}
-    return systems.pop() if len(systems) == 1 else None
-
-
-def required_crs(ground: Ground) -> str:
-    """Return the CRS of a run.
-
-    Raises
-    ------
-    ConfigError
-        If its tiles have several.
-    """
-    crs = crs_of(ground)
-    if crs is None:
-        raise ConfigError(
-            f"the tiles of {ground.run.path} have several CRSs; give points in that of the tile, as a CSV "
-            "with easting and northing"
-        )
-    return crs
 
 
 def at_points(ground: Ground, points: Points, level: LevelWanted = None) -> AnswerTable:

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from flexroad.catalog.crs import in_plan, is_geographic, same, short, transformer
+from flexroad.catalog.crs import in_plan, is_geographic, same, short
 from flexroad.catalog.guard.open_vector import ERRORS, encoding_note, in_its_encoding, vector_name
 from flexroad.catalog.guard.refused import Refused
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import reason, shown
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run.points import to_crs
 from flexroad.tasks import memory
 from flexroad.tasks.io.vectors import WHOLE
 from flexroad.tasks.types import Floats
@@ -285,20 +286,3 @@ def _features(path: Path, crs: str | None, layer: str | None) -> tuple[list[Floa
         raise ConfigError(f"{path}: has features of the type {others[0]}, not lines; points go to --points")
     merged = [shapely.line_merge(shape) for shape in shapes]
     return [shapely.get_coordinates(part) for part in shapely.get_parts(merged)], table.crs.to_wkt()
-
-
-def to_crs(x: Floats, y: Floats, source: str | None, target: str) -> tuple[Floats, Floats]:
-    """Return coordinates in another CRS; NaN where they cannot be transformed.
-
-    Parameters
-    ----------
-    x, y : ndarray, (n,)
-        First east, then north, whatever the order of the axes of the CRS.
-    source : str or None
-        None if they already are in the CRS ``target``.
-    """
-    if source is None or same(source, target):
-        return x, y
-    east, north = transformer(source, target).transform(x, y)
-    finite = np.isfinite(east) & np.isfinite(north)
-    return np.where(finite, east, math.nan), np.where(finite, north, math.nan)

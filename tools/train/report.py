@@ -105,7 +105,7 @@ def _page(outcome: Outcome, name: str) -> str:
             for evaluation in outcome.judged
         ]
     )
-    return template("training.html.j2").render(
+    return template("training.html.j2", Path(__file__).parent).render(
         title=f"Road model {name}",
         state=summary(outcome),
         lines=_lines(outcome),

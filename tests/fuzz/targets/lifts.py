@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks import TaskError
 from flexroad.tools.lift import xml_text
 from flexroad.tools.lift.driver import XML_FORMATS
-from flexroad.tools.lift.types import Heights, Options
+from flexroad.tools.lift.types import Options
 from tests.tools.lift import test_osm, test_sumo
 from tests.tools.lift.test_opendrive import ARC, road, structure, write
 

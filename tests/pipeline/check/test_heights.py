@@ -6,7 +6,7 @@ import pytest
 from flexroad.catalog import LAYERS, Catalog
 from flexroad.catalog.sources.rasters import index
 from flexroad.pipeline.check import trial
-from flexroad.pipeline.check.catalog import expected_failures
+from flexroad.pipeline.check.failures import expected_failures
 from flexroad.pipeline.check.heights import height_findings
 from flexroad.pipeline.check.trial import trials
 from flexroad.pipeline.config.loading import load_config

@@ -11,7 +11,7 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.sources import rasters
 from flexroad.catalog.text import some
 from flexroad.pipeline.check import trial
-from flexroad.pipeline.check.catalog import expected_failures
+from flexroad.pipeline.check.failures import expected_failures
 from flexroad.pipeline.check.trial import trials
 from flexroad.pipeline.config.loading import load_config
 from flexroad.tasks.load import READS

@@ -10,6 +10,7 @@ from typing import Any, get_args, get_origin
 import pytest
 import typer
 
+from flexroad.pipeline.cli.catalogs import TOOLS
 from flexroad.pipeline.cli.main import COMMANDS as LISTED
 from flexroad.pipeline.cli.main import app
 from flexroad.pipeline.graph.stages import STAGE_NAMES
@@ -87,12 +88,12 @@ def test_help_lists_commands_as_their_own_pages_describe_them():
 
 
 def test_commands_of_all_modules_are_listed():
-    names = {module for module, _ in LISTED.values()}
+    listed = {**LISTED, **TOOLS}
     written = set()
-    for name in names:
-        group = typer.main.get_group(importlib.import_module(f"flexroad.pipeline.cli.{name}").app)
+    for name in {module for module, _ in listed.values()}:
+        group = typer.main.get_group(importlib.import_module(f"flexroad.{name}").app)
         written |= {group.name} if group.name else set(group.commands)
-    assert written == set(LISTED)
+    assert written == set(listed)
 
 
 def test_help_lists_options_under_headings():

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tools.lift import batches
-from flexroad.tools.lift.types import Heights
 
 
 def test_each_part_has_its_heights_in_order_whatever_the_batch(monkeypatch):

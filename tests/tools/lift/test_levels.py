@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tools.lift.levels import ANY, along, level_of, tagged_level
-from flexroad.tools.lift.types import Heights
 
 S = np.arange(60.0)
 GROUND = 100 + 0.01 * S

@@ -7,9 +7,10 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tools.lift import opendrive, plan_view
 from flexroad.tools.lift.lanes import extent
-from flexroad.tools.lift.types import Frame, Heights, Lifted, Options
+from flexroad.tools.lift.types import Frame, Lifted, Options
 from tests.read_opendrive import place, polynomial
 
 LEVEL = 'level="false"'

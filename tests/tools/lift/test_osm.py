@@ -6,9 +6,10 @@ import numpy as np
 import pyproj
 import pytest
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift import osm
-from flexroad.tools.lift.types import Frame, Heights, Options
+from flexroad.tools.lift.types import Frame, Options
 
 WEST, SOUTH = 9.0, 50.55
 EAST_M, NORTH_M = (

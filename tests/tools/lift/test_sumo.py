@@ -9,9 +9,10 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift import sumo
-from flexroad.tools.lift.types import Frame, Heights, Options
+from flexroad.tools.lift.types import Frame, Options
 from tests import validators
 
 HEAD = """<?xml version="1.0" encoding="UTF-8"?>

@@ -13,10 +13,11 @@ from flexroad.catalog.guard import kept_rasters
 from flexroad.catalog.guard.open_raster import open_alone
 from flexroad.catalog.sources import rasters
 from flexroad.catalog.tile import faulty
-from flexroad.pipeline.check.catalog import check, expected_failures
+from flexroad.pipeline.check.failures import expected_failures
 from flexroad.pipeline.config.loading import load_config
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.load import Options, load
+from flexroad.tools.check.catalog import check
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests.make_rasters import write
 from tests.permissions import permissions_enforced
