@@ -52,7 +52,8 @@ def test_container_context_is_enough_to_build_the_wheel(tmp_path):
     subprocess.run([*build, context], check=True, capture_output=True)
     (wheel,) = built.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    files = [path for part in ("catalog", "tasks", "pipeline", "tools") for path in (ROOT / part).rglob("*.py")]
+    parts = ("catalog", "tasks", "pipeline", "tools")
+    files = [path for part in parts for path in (ROOT / part).rglob("*.py")]
     files += (ROOT / "configs").glob("*.yaml")
     files += filter(Path.is_file, (ROOT / "viewer" / "dist").rglob("*"))
     assert {f"flexroad/{path.relative_to(ROOT)}" for path in files} <= set(names)

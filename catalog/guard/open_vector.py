@@ -15,6 +15,7 @@ import os
 import re
 import shutil
 import sqlite3
+import struct
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from functools import lru_cache, partial
@@ -38,6 +39,9 @@ UNKNOWN = (
     "is not a vector file: it is no GeoPackage, SpatiaLite, FlatGeobuf, Shapefile, GeoJSON or OSM file; "
     "convert it with ogr2ogr, e.g. ogr2ogr NEW.gpkg FILE"
 )
+SHAPEFILE = b"\0\0\x27\x0a"
+SHAPEFILE_HEADER_BYTES = 100
+DBF_HEADER_BYTES = 32
 SQLITE = b"SQLite format 3\0"
 GEOPACKAGES = (b"GPKG", b"GP10", b"GP11")
 WAL_MODE = b"\2\2"
@@ -83,8 +87,11 @@ def vector_name(path: Path) -> str:
         _require_no_linked_crs(path)
         # The prefix selects the driver, so that a mark of another format in the text has no effect.
         return f"GeoJSON:{path}"
-    if data.startswith(b"\0\0\x27\x0a"):
-        _require_own_parts(path, (path.with_suffix(end) for s in SHAPEFILE_PARTS for end in (s, s.upper())))
+    if data.startswith(SHAPEFILE):
+        parts = [path.with_suffix(end) for s in SHAPEFILE_PARTS for end in (s, s.upper())]
+        _require_own_parts(path, parts)
+        for part in (path, *parts):
+            _require_complete(part)
     elif data.startswith(SQLITE):
         path = _complete(path, data)
         is_geopackage = data[68:72] in GEOPACKAGES
@@ -100,6 +107,25 @@ def vector_name(path: Path) -> str:
     ):
         raise Refused(UNKNOWN + archive_note(data))
     return str(path)
+
+
+def _require_complete(part: Path) -> None:
+    """Raise an error if a part of a Shapefile is cut off or zeroed: GDAL would read it without values.
+
+    The headers are those of ESRI's white paper of 1998 (``.shp``, ``.shx``) and of dBASE (``.dbf``).
+    """
+    kind = part.suffix.lower()
+    if kind not in (".shp", ".shx", ".dbf") or not part.exists():
+        return
+    data, size = head(part), part.stat().st_size
+    if kind == ".dbf":
+        records, start, length = struct.unpack("<IHH", data[4:12].ljust(8, b"\0"))
+        whole = data[:1] != b"\0" and start > DBF_HEADER_BYTES and start + records * length <= size
+    else:
+        stated = 2 * int.from_bytes(data[24:28], "big")
+        whole = data.startswith(SHAPEFILE) and SHAPEFILE_HEADER_BYTES <= stated <= size
+    if not whole:
+        raise Refused(f"is damaged: {part.name} is shorter than its header says, or has none; restore it")
 
 
 def _objects(path: Path, condition: str) -> list[tuple[str, str]]:

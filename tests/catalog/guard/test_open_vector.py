@@ -45,6 +45,23 @@ def test_formats_are_read(tmp_path, suffix):
     assert opened(path, None).extents
 
 
+@pytest.mark.parametrize("part", ["shp", "shx", "dbf"])
+@pytest.mark.parametrize("damage", ["zeroed", "cut off", "empty"])
+def test_damaged_part_of_shapefile_is_refused(tmp_path, part, damage):
+    """GDAL reads features without geometries, or without attributes, and no error."""
+    path = tmp_path / "roads.shp"
+    lines = [LineString([(k, 0), (9, 9)]) for k in range(20)]
+    geopandas.GeoDataFrame({"w": 20 * [4.0]}, geometry=lines, crs=UTM).to_file(path)
+    file = path.with_suffix(f".{part}")
+    data = file.read_bytes()
+    left = {"zeroed": data[:8] + bytes(len(data) - 8), "cut off": data[:-40], "empty": b""}[damage]
+    file.write_bytes(left)
+    with pytest.raises(Refused, match=f"roads.{part} is shorter than its header says|is not a vector file"):
+        vector_name(path)
+    file.write_bytes(data)
+    assert len(pyogrio.read_dataframe(vector_name(path))) == 20
+
+
 def test_osm_is_read(tmp_path):
     path = tmp_path / "roads.osm"
     path.write_text(OSM)

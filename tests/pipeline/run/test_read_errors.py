@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
+import geopandas
 import numpy as np
 import pandas as pd
 import pytest
@@ -272,6 +273,19 @@ def test_roads_unreadable_for_one_night_leave_no_trace(survey, tmp_path):
         summary, failures = night(tmp_path / "run", catalog, "production_vector")
     assert summary.failed == 4
     assert {failure.file for failure in failures} == {str(path)}
+    assert night(tmp_path / "run", catalog, "production_vector")[0].exit_code == 0
+    assert_equal(tmp_path / "run", tmp_path / "scratch")
+
+
+@pytest.mark.parametrize("part", [".shp", ".shx", ".dbf"])
+def test_part_of_shapefile_zeroed_for_one_night_leaves_no_trace(survey, tmp_path, part):
+    """GDAL would read the roads without geometries, or without the attributes that give their widths."""
+    path = survey / "roads.shp"
+    geopandas.read_file(survey / "roads.gpkg").to_file(path)
+    catalog = catalog_of(survey, "roads.json", roads="roads.shp")
+    assert night(tmp_path / "scratch", catalog, "production_vector")[0].exit_code == 0
+    with zeroed(path.with_suffix(part)):
+        assert night(tmp_path / "run", catalog, "production_vector")[0].failed == 4
     assert night(tmp_path / "run", catalog, "production_vector")[0].exit_code == 0
     assert_equal(tmp_path / "run", tmp_path / "scratch")
 
