@@ -1,4 +1,4 @@
-"""Processing of many tiles: configuration, graph, store, execution, report, command line."""
+"""Processing of many tiles: configuration, graph, store, execution, command line."""
 
 import atexit
 import os

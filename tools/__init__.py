@@ -1,1 +1,1 @@
-"""Tools before and after a run: each folder has one, with its command."""
+"""What comes before and after a run: one folder per tool. No module of the core imports them."""

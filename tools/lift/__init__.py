@@ -1,5 +1,6 @@
-"""Heights of a run for road networks and features of other programs; one file per format.
+"""``flexroad lift``: heights of a run for road networks and features of other programs.
 
-Each format is a module with the functions ``frame``, the coordinate system that a file names, and ``lift``,
-which copies a file with heights (`tools.lift.types`).
+For users of OpenDRIVE, SUMO, OSM and map features. Start at `driver.lift`. Each format is a module with the
+functions ``frame``, the coordinate system that a file names, and ``lift``, which copies a file with heights
+(`tools.lift.types`).
 """

@@ -1,4 +1,7 @@
-"""Reports on a run as Markdown, CSV, or one HTML page with a map and pictures."""
+"""``flexroad report``: a run as Markdown, CSV, or one HTML page with a map and pictures.
+
+For who has to know whether a run can be delivered. Start at `write_report` below, then `content.gather`.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,5 @@
-"""The paper's tables, claims and figures, with a run's results beside them."""
+"""``flexroad tables`` and ``figures``: the paper's tables, claims and figures beside a run's results.
+
+For researchers. Start at `tables.write_comparison` and `figures.write_figures`; `claims.py` has the rule by
+which a claim holds. ``make reproduce`` makes the runs and calls both.
+"""

@@ -1,1 +1,5 @@
-"""The results of a run in Python and in tables; fit of one surface in memory."""
+"""Results in Python and as tables: `flexroad.fit`, `open_run`, `Surface`, and ``flexroad query``.
+
+For who asks for heights and normals of the road. Start at `run.RunView` and `surface.fit`; the command calls
+`query.at_points` and `query.along_lines`.
+"""

@@ -1,4 +1,8 @@
-"""Synthetic scenes with known truth: streets, houses, trees and cars, functions of seed and coordinates."""
+"""``flexroad catalog synthetic``: scenes with known truth, as functions of seed and coordinates.
+
+For tests, benchmarks and a first try. Start at `scenes.write_scenes`, then `scene.make_scene`: streets,
+houses, trees and cars of one tile.
+"""
 
 from flexroad.tools.synthetic.layout import block
 from flexroad.tools.synthetic.options import SceneOptions
