@@ -1,7 +1,6 @@
-"""The script of docs/operations, night after night: exit codes, log, mails, and what `status` says."""
+"""The script and cron's line of docs/operations, night after night: exit codes, log, mails, and `status`."""
 
 import fcntl
-import os
 import shutil
 import subprocess
 import sys
@@ -11,9 +10,13 @@ import pytest
 
 from flexroad.pipeline.run.summary import read_summary
 
-SCRIPT = Path(__file__).parent.parent / "docs" / "operations" / "flexroad-nightly.sh"
+OPERATIONS = Path(__file__).parent.parent / "docs" / "operations"
+SCRIPT = OPERATIONS / "flexroad-nightly.sh"
+CRON = OPERATIONS / "flexroad.cron"
+INSTALLED = "/usr/local/bin/flexroad-nightly"
+CALLED = '"{0}/nightly"; code=$?; echo $code > "{0}/code"; exit $code'
+"""What the line for cron calls: the script, with a note of its exit code."""
 COMMAND = 'exec "{}" -c "from flexroad.pipeline.cli.main import main; main()" "$@"'
-MAIL = '{{ echo "$2"; cat; }} > {}/mail'
 WORDS = {"--roads 'roads/*.gpkg'": "--road-mask 'road_mask/*.tif' --tile-size 60"}
 LOST = "2 files skipped by the catalog, 1 tile lost"
 SKIPPED = "(dsm): not a raster that GDAL can read"
@@ -36,13 +39,17 @@ class Machine:
         self.kept = shutil.copytree(self.dsm, folder / "kept")
         (folder / "bin").mkdir()
         program(folder / "bin" / "flexroad", COMMAND.format(sys.executable))
-        program(folder / "bin" / "mail", MAIL.format(folder))
         text = SCRIPT.read_text()
         edits = {"/srv/flexroad": str(folder), "/opt/flexroad/bin": str(folder / "bin"), **WORDS}
         for place, edited in edits.items():
             assert place in text
             text = text.replace(place, edited)
         program(folder / "nightly", text.removeprefix("#!/bin/bash\n"))
+        program(folder / "called", CALLED.format(folder))
+        *_, line = CRON.read_text().splitlines()
+        command = line.split(maxsplit=6)[6]
+        assert INSTALLED in command
+        self.command = command.replace(INSTALLED, f"'{folder}/called'").replace("/srv/flexroad", str(folder))
 
     def repair(self, name: str) -> None:
         shutil.copy2(self.kept / name, self.dsm / name)
@@ -52,15 +59,12 @@ class Machine:
 
     def night(self) -> tuple[int, str, str]:
         """The exit code of a night, what it adds to the log, and its mail."""
-        (self.folder / "mail").unlink(missing_ok=True)
         log = self.folder / "runs" / "city.log"
         before = log.read_text() if log.exists() else ""
-        environment = os.environ | {"PATH": f"{self.folder / 'bin'}:{os.environ['PATH']}"}
-        done = subprocess.run([self.folder / "nightly"], env=environment, capture_output=True, check=False)
         # What it prints, cron would mail.
-        assert done.stdout + done.stderr == b""
-        mail = self.folder / "mail"
-        return done.returncode, log.read_text()[len(before) :], mail.read_text() if mail.exists() else ""
+        done = subprocess.run(["sh", "-c", self.command], capture_output=True, check=False, text=True)
+        code = int((self.folder / "code").read_text())
+        return code, log.read_text()[len(before) :], done.stdout + done.stderr
 
     def status(self) -> str:
         words = [self.folder / "bin" / "flexroad", "status", self.run]
@@ -95,7 +99,6 @@ def test_nights_with_new_damaged_and_repaired_files_say_what_happened(machine):
     assert first in log
     assert f"warning: {told}\n" in log
     assert f"the catalog lacks 2 files; next: {REPAIR}\n" in log
-    assert mail.startswith("FlexRoad: the night is not complete\n")
     assert first in mail
     status = machine.status()
     assert status.startswith(first)
@@ -136,12 +139,11 @@ def test_night_that_cannot_start_ends_with_2_and_a_mail(machine):
         code, log, mail = machine.night()
     assert code == 2
     assert "the command of an earlier night is still at work" in log
-    assert mail.startswith(
-        "FlexRoad: no run this night\nthe command of an earlier night is still at work; see "
-    )
+    assert mail.endswith("the command of an earlier night is still at work\n")
     (machine.folder / "survey").rename(machine.folder / "unmounted")
     code, log, mail = machine.night()
     assert code == 2
     assert "error: " in log
-    assert mail.startswith("FlexRoad: no run this night\nthe catalog could not be made; see ")
+    assert "error: " in mail
+    assert mail.endswith("the catalog could not be made\n")
     assert not machine.run.exists()

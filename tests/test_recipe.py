@@ -17,7 +17,6 @@ CONDA = {
     "laspy[lazrs]": ("laspy", "lazrs-python"),
     "matplotlib": ("matplotlib-base",),
     "opencv-python-headless": ("py-opencv",),
-    "prometheus-client": ("prometheus_client",),
     "torch": ("pytorch",),
     "universal-pathlib": ("universal_pathlib",),
 }

@@ -1,5 +1,6 @@
 """Units in docs/operations: valid for systemd, cron, Kubernetes and SLURM, with valid flexroad commands."""
 
+import os
 import re
 import shlex
 import shutil
@@ -15,6 +16,10 @@ from flexroad.pipeline.cli.main import app
 SCRIPT = "flexroad-nightly.sh"
 INSTALLED = "/usr/local/bin/flexroad-nightly"
 """Where the script is copied to."""
+FAILED = "flexroad-failed@flexroad.service.service"
+"""The unit that flexroad.service starts when it fails."""
+TAIL = "tail -n 20 /srv/flexroad/runs/city.log"
+"""What is mailed after a night that failed."""
 UNITS = Path(__file__).parent.parent / "docs" / "operations"
 JOB = yaml.safe_load((UNITS / "cronjob.yaml").read_text())
 POD = JOB["spec"]["jobTemplate"]["spec"]["template"]["spec"]
@@ -51,8 +56,9 @@ def test_units_of_a_run_alone_do_not_use_flock():
 def test_systemd_accepts_service_and_timer(tmp_path):
     program = shutil.which("true")
     (tmp_path / "flexroad.service").write_text(text("flexroad.service").replace(INSTALLED, program))
-    (tmp_path / "flexroad.timer").write_text(text("flexroad.timer"))
-    units = [tmp_path / "flexroad.service", tmp_path / "flexroad.timer"]
+    for name in ("flexroad.timer", "flexroad-failed@.service"):
+        (tmp_path / name).write_text(text(name))
+    units = [tmp_path / "flexroad.service", tmp_path / "flexroad.timer", tmp_path / FAILED]
     done = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True, check=False)
     # The output may also have complaints about units of the machine.
     complaints = [line for line in done.stderr.splitlines() if "flexroad" in line]
@@ -64,20 +70,39 @@ def test_systemd_accepts_service_and_timer(tmp_path):
 
 def test_service_and_timer_have_required_settings():
     service = text("flexroad.service")
-    assert f"\nExecStart={INSTALLED} --prometheus " in service
+    assert f"\nExecStart={INSTALLED}\n" in service
+    assert "\nOnFailure=flexroad-failed@%n.service\n" in service
     assert "Type=oneshot" in service
     assert "KillMode=mixed" in service
     assert "Restart=" not in service
     assert "Persistent=true" in text("flexroad.timer")
 
 
+def test_failed_unit_mails_the_end_of_the_log(tmp_path):
+    (line,) = re.findall(r"^ExecStart=(.*)$", text("flexroad-failed@.service"), flags=re.MULTILINE)
+    mail = tmp_path / "mail"
+    mail.write_text(f'#!/bin/sh\nprintf "%s\\n" "$@" > {tmp_path}/words\ncat > {tmp_path}/body\n')
+    mail.chmod(0o755)
+    log = tmp_path / "runs" / "city.log"
+    log.parent.mkdir()
+    log.write_text("".join(f"line {number}\n" for number in range(30)))
+    for place, value in (("%i", "flexroad.service"), ("%H", "host"), ("/srv/flexroad", str(tmp_path))):
+        line = line.replace(place, value)
+    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    subprocess.run(shlex.split(line), env=environment, check=True)
+    assert (tmp_path / "words").read_text() == "-s\nflexroad.service failed on host\noperator\n"
+    body = (tmp_path / "body").read_text().splitlines()
+    assert body == [f"line {number}" for number in range(10, 30)]
+
+
 def test_cron_line_is_valid():
     (line,) = [line for line in text("flexroad.cron").splitlines() if re.match(r"[\d*]", line)]
-    *schedule, user, shell_command = line.split(maxsplit=6)[:7]
+    *schedule, user, shell_command = line.split(maxsplit=6)
     assert user == "flexroad"
     for field, maximum in zip(schedule, (59, 23, 31, 12, 7), strict=True):
         assert field == "*" or 0 <= int(field) <= maximum
-    assert shell_command == INSTALLED
+    assert shell_command == f"{INSTALLED} || {TAIL}"
+    assert TAIL in text("flexroad-failed@.service")
 
 
 def test_cronjob_runs_alone_with_deadline():

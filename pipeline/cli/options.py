@@ -11,10 +11,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 
-from flexroad.pipeline.config.options import ALARMS, INPUTS, OUTPUTS, TILES, WORK
-
-ON_FAILURE = "FLEXROAD_ON_FAILURE"
-"""Environment variable for `--on-failure`: options are visible in the list of processes, it is not."""
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES, WORK
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run, or its address (s3://...).")]
 OutputFolder = Annotated[
@@ -87,23 +84,6 @@ Verify = Annotated[
         "--verify",
         help="Compare the checksums of all products, not only their sizes.",
         rich_help_panel=OUTPUTS,
-    ),
-]
-OnFailure = Annotated[
-    str | None,
-    typer.Option(
-        metavar="CMD|URL",
-        envvar=ON_FAILURE,
-        help="Shell command or web address (POST) that gets a summary if the exit code is not 0.",
-        rich_help_panel=ALARMS,
-    ),
-]
-Prometheus = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Text file for Prometheus (.prom), updated during the run.",
-        rich_help_panel=ALARMS,
     ),
 ]
 Settings = Annotated[

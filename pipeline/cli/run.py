@@ -22,7 +22,7 @@ from flexroad.pipeline.check.reasons import why_pending
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.dry_run import Verdict, plan
-from flexroad.pipeline.cli.lifecycle import Outcome, RunCommand, format_summary, report_outcome, warn
+from flexroad.pipeline.cli.lifecycle import Outcome, format_summary, interruptible, warn
 from flexroad.pipeline.cli.limits import remedy
 from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
 from flexroad.pipeline.config.loading import load_config
@@ -72,7 +72,7 @@ MOST_PENDING = 100
 StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export"]
 
 
-@app.command(cls=RunCommand)
+@app.command(cls=Command)
 @ignore_write_errors()
 def run(
     catalog: Annotated[
@@ -121,8 +121,6 @@ def run(
     workers: options.MostWorkers = None,
     scheduler: Scheduler = None,
     dashboard: options.Dashboard = False,
-    on_failure: options.OnFailure = None,
-    prometheus: options.Prometheus = None,
     dry_run: Annotated[
         bool,
         typer.Option("--dry-run", help="Print why each tile would be computed, and what would fail."),
@@ -145,7 +143,7 @@ def run(
         for line in plan(planned, selected.tiles, verdict, verbose, workers):
             echo(line)
         raise typer.Exit(verdict.exit_code)
-    with report_outcome(path, on_failure, prometheus) as outcome:
+    with interruptible() as outcome:
         chosen = load_config(config, settings or ())
         selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
         shown = Shown(outcome)
@@ -164,7 +162,7 @@ def run(
     _exit(outcome)
 
 
-@app.command(cls=RunCommand)
+@app.command(cls=Command)
 @ignore_write_errors()
 def rerun(
     path: options.Run,
@@ -190,15 +188,13 @@ def rerun(
     workers: options.MostWorkers = None,
     scheduler: Scheduler = None,
     dashboard: options.Dashboard = False,
-    on_failure: options.OnFailure = None,
-    prometheus: options.Prometheus = None,
 ) -> None:
     """Bring tiles of a run up to date again.
 
     For changes of source files or of RUN/config.yaml, and for failed tiles.
     """
     location = parse_location(path)
-    with report_outcome(location, on_failure, prometheus) as outcome:
+    with interruptible() as outcome:
         shown = Shown(outcome)
         with reopened(
             location,
@@ -215,7 +211,7 @@ def rerun(
 
 
 class Shown(Observer):
-    """Shows the events of a run on standard error, and writes them for Prometheus; a context manager."""
+    """Shows the events of a run on standard error; a context manager."""
 
     def __init__(self, outcome: Outcome) -> None:
         self.outcome = outcome
@@ -254,8 +250,6 @@ class Shown(Observer):
     def start(self, tiles: int, selected: int) -> None:
         """Show the progress."""
         self.display = self._stack.enter_context(ProgressDisplay(selected, Console(stderr=True)))
-        if self.outcome.textfile is not None:
-            self.outcome.textfile.total = tiles
 
     def line(self, text: str) -> None:
         """Print a line above the progress."""
@@ -263,13 +257,11 @@ class Shown(Observer):
             self.display.say(text)
 
     def tile(self, result: TileResult) -> None:
-        """Add a tile to the progress and to the file for Prometheus."""
+        """Add a tile to the progress."""
         self.offsets += filter(is_offset, result.notes)
         self.rows += filter(road_is_off, result.rows)
         if self.display:
             self.display(result)
-        if self.outcome.textfile is not None:
-            self.outcome.textfile(result)
 
 
 def _process(prepared: Prepared, verify: bool, shown: Shown) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 INPUTS, OUTPUTS, TILES = "Inputs", "Outputs", "Tiles"
 METHOD, VALIDATION = "Method", "Split into training and validation"
 GROUND, RASTERS, RECONSTRUCTION = "Ground", "Rasters", "Reconstruction"
-WORK, ALARMS = "Parallel work", "Alarms and monitoring"
+WORK = "Parallel work"
 HEADINGS = (
     INPUTS,
     METHOD,
@@ -19,7 +19,6 @@ HEADINGS = (
     TILES,
     OUTPUTS,
     WORK,
-    ALARMS,
 )
 """In the order of a help page."""
 MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."

@@ -53,11 +53,10 @@ def test_address_with_credentials_is_refused_without_them(take, monkeypatch):
 
 
 @pytest.mark.parametrize("place", ["--catalog", "--out", "--store", "--scheduler"])
-def test_commands_and_notifications_show_no_credentials(flexroad, survey, tmp_path, place):
-    words = {"--catalog": survey, "--out": tmp_path / "run", "--on-failure": f"cat > {tmp_path}/said"}
+def test_commands_show_no_credentials(flexroad, survey, tmp_path, place):
+    words = {"--catalog": survey, "--out": tmp_path / "run"}
     words[place] = f"s3://AKIA:{SECRET}@bucket/x"
     said = flexroad("run", *(word for option in words.items() for word in option))
     assert said.code == 2
-    written = "".join(path.read_text() for path in tmp_path.rglob("said"))
     assert "***@" in said.err
-    assert "wJalr" not in said.out + said.err + written
+    assert "wJalr" not in said.out + said.err

@@ -100,7 +100,7 @@ def test_help_lists_options_under_headings():
     command = COMMANDS["run",]
     page = command.get_help(command.make_context("run", [], resilient_parsing=True))
     headings = re.findall(r"^(\w.*):$", page, re.MULTILINE)
-    assert headings == ["Inputs", "Tiles", "Outputs", "Parallel work", "Alarms and monitoring", "Options"]
+    assert headings == ["Inputs", "Tiles", "Outputs", "Parallel work", "Options"]
     assert page.index("Parallel work:") < page.index("--executor <auto|dask|serial>")
 
 

@@ -1,4 +1,4 @@
-"""Nightly operation: repeated runs, notifications of failures, clean."""
+"""Nightly operation: repeated runs, exit codes of failures, clean."""
 
 import errno
 import json
@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from prometheus_client.parser import text_string_to_metric_families
 
 from flexroad.catalog import Catalog, Layer
 from flexroad.catalog.storage import paths
@@ -50,31 +49,14 @@ def nightly(survey, tmp_path) -> list:
     return ["run", "--config", config, "--catalog", survey, "--out", tmp_path / "run", "--executor", "serial"]
 
 
-@pytest.fixture
-def notification(tmp_path):
-    """A notification command that stores what it receives; ``received`` returns and removes it."""
-
-    class Notification:
-        words = ("--on-failure", f"cat > {tmp_path}/received.json")
-
-        @property
-        def received(self):
-            path = tmp_path / "received.json"
-            summary = json.loads(path.read_text()) if path.exists() else None
-            path.unlink(missing_ok=True)
-            return summary
-
-    return Notification()
-
-
-def test_run_repeated_counts_new_changed_and_vanished(flexroad, nightly, survey, notification, tmp_path):
+def test_run_repeated_counts_new_changed_and_vanished(flexroad, nightly, survey, tmp_path):
     whole = Catalog.read(survey)
     Catalog(whole.tiles[:3]).write(survey)
-    said = flexroad(*nightly, *notification.words)
+    said = flexroad(*nightly)
     assert "3 tiles: 3 done (0 cached), 0 failed, 0 pending; 3 new, 0 changed, 0 vanished; " in said
     Catalog(whole.tiles[1:]).write(survey)
     os.utime(whole.tiles[1].paths(whole.tiles[1].layer("dsm"))[0], (1, 1))
-    said = flexroad(*nightly, *notification.words)
+    said = flexroad(*nightly)
     assert "3 tiles: 3 done (1 cached), 0 failed, 0 pending; 1 new, 1 changed, 1 vanished; " in said
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["exit_code"], summary["new"], summary["cached"]) == (0, 1, 1)
@@ -85,58 +67,46 @@ def test_run_repeated_counts_new_changed_and_vanished(flexroad, nightly, survey,
     product.write_bytes(data)
     assert "3 done (3 cached)" in flexroad(*nightly)
     assert "3 done (2 cached)" in flexroad(*nightly, "--verify")
-    assert notification.received is None
     states = json.loads((tmp_path / "run" / "tiles.geojson").read_text())["features"]
     assert [state["properties"]["state"] for state in states] == ["cached", "done", "cached"]
 
 
-def test_run_with_failed_tile_notifies_and_shows_it_on_the_map(
-    flexroad, nightly, survey, notification, tmp_path
-):
+def test_run_with_failed_tile_ends_with_1_and_shows_it_on_the_map(flexroad, nightly, survey, tmp_path):
     tiles = Catalog.read(survey).tiles[:2]
     Catalog(tiles).write(survey)
     tiles[1].paths(tiles[1].layer("dtm"))[0].unlink()
-    flexroad(*nightly, *notification.words, "--prometheus", tmp_path / "run.prom", expect=1)
-    received = notification.received
-    assert (received["exit_code"], received["failed"], received["interrupted"]) == (1, 1, False)
-    assert received["failures"][0]["tile_id"] == tiles[1].id
-    assert "2 tiles: 1 done (0 cached), 1 failed" in received["text"]
+    said = flexroad(*nightly, expect=1)
+    assert "2 tiles: 1 done (0 cached), 1 failed" in said
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["exit_code"], summary["failed"], summary["interrupted"]) == (1, 1, False)
+    assert summary["failures"][0]["tile_id"] == tiles[1].id
     flexroad("status", tmp_path / "run", "--geojson", tmp_path / "map.geojson")
     states = json.loads((tmp_path / "map.geojson").read_text())["features"]
     assert [state["properties"]["state"] for state in states] == ["done", "failed"]
-    families = text_string_to_metric_families((tmp_path / "run.prom").read_text())
-    values = {sample.name: sample.value for family in families for sample in family.samples}
-    assert (values["flexroad_run_exit_code"], values["flexroad_run_running"]) == (1, 0)
 
 
-def test_run_with_pipe_as_output_is_refused_at_the_start(flexroad, nightly, tmp_path):
-    pipe = tmp_path / "run.prom"
+def test_status_with_pipe_as_output_is_refused(flexroad, nightly, survey, tmp_path):
+    Catalog(Catalog.read(survey).tiles[:1]).write(survey)
+    flexroad(*nightly)
+    pipe = tmp_path / "map.geojson"
     os.mkfifo(pipe)
-    said = flexroad(*nightly, "--prometheus", pipe, expect=2)
-    assert f"cannot write --prometheus {pipe}: is a device, pipe or socket and is not replaced" in said
+    said = flexroad("status", tmp_path / "run", "--geojson", pipe, expect=2)
+    assert f"is a device, pipe or socket and is not replaced: '{pipe}'" in said
     assert pipe.is_fifo()
-    assert not (tmp_path / "run" / "tiles").exists()
 
 
-def test_run_that_cannot_start_notifies(flexroad, nightly, survey, notification, tmp_path, monkeypatch):
-    said = flexroad(*nightly, *notification.words, "--store", survey, expect=2)
-    received = notification.received
-    assert received["exit_code"] == 2
-    assert "could not start: cannot write the run" in received["text"]
+def test_run_that_cannot_start_ends_with_2_and_one_line(flexroad, nightly, survey, tmp_path):
+    said = flexroad(*nightly, "--store", survey, expect=2)
+    assert said.startswith("error: cannot write the run")
     assert "choose another --out or --store" in said
+    assert said.count("\n") == 1
     # There is no summary of this run.
-    assert "tiles" not in received
+    assert not (tmp_path / "run").exists()
     (tmp_path / "run").mkdir()
     with run_lock(tmp_path / "run"):
-        flexroad(*nightly, *notification.words, expect=2)
-    assert f"is in use by pid {os.getpid()}" in notification.received["text"]
-    flexroad(*nightly, "--wrokers", 2, *notification.words, expect=2)
-    assert "the command line could not be read" in notification.received["text"]
-    monkeypatch.setenv("FLEXROAD_ON_FAILURE", notification.words[1])
-    flexroad("rerun", tmp_path / "nowhere", expect=2)
-    assert "is no run" in notification.received["text"]
-    flexroad("status", tmp_path / "nowhere", "--wach", expect=2)
-    assert notification.received is None
+        assert f"is in use by pid {os.getpid()}" in flexroad(*nightly, expect=2)
+    assert "No such option" in flexroad(*nightly, "--wrokers", 2, expect=2)
+    assert "is no run" in flexroad("rerun", tmp_path / "nowhere", expect=2)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +121,6 @@ def test_run_that_cannot_start_notifies(flexroad, nightly, survey, notification,
         ),
         (["--catalog", "nowhere.json"], "nowhere.json does not exist"),
         (["--store", "CATALOG"], "cannot write the run"),
-        (["--prometheus", "/"], "cannot write --prometheus"),
         (["--tile", "x"], "no tile 'x'"),
         (["--wrokers", "2"], "No such option"),
     ],
@@ -178,14 +147,13 @@ def test_refused_run_leaves_folders_as_they_were(flexroad, nightly, survey, tmp_
     assert not (tmp_path / "new").exists()
 
 
-def test_run_into_folder_with_other_files_changes_nothing(flexroad, nightly, survey, notification):
+def test_run_into_folder_with_other_files_changes_nothing(flexroad, nightly, survey):
     before = paths.listing(survey.parent)
     message = (
         f"{survey.parent} has other files, such as catalog.parquet, and is no run; choose an empty or new"
     )
-    for words in (["--dry-run"], notification.words):
+    for words in (["--dry-run"], []):
         assert message in flexroad(*nightly, "--out", survey.parent, *words, expect=2)
-    assert message in notification.received["text"]
     assert paths.listing(survey.parent) == before
 
 
@@ -213,18 +181,13 @@ def test_run_into_empty_disk_is_accepted(flexroad, nightly, tmp_path):
     assert "4 done" in flexroad(*nightly)
 
 
-def test_run_interrupted_notifies_and_failed_notification_only_warns(
-    flexroad, nightly, notification, monkeypatch
-):
+def test_run_interrupted_ends_with_130_and_one_line(flexroad, nightly, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("flexroad.pipeline.run.conductor.run_tiles", interrupted)
-    said = flexroad(*nightly, *notification.words, expect=130)
-    assert "interrupted; the same command goes on from here" in said
-    assert notification.received["exit_code"] == 130
-    said = flexroad(*nightly, "--on-failure", "exit 9", expect=130)
-    assert "warning: --on-failure: `exit ...` ended with exit code 9" in said
+    said = flexroad(*nightly, expect=130)
+    assert said.endswith("interrupted; the same command goes on from here\n")
 
 
 def test_run_source_outside_catalog_folder_needs_allow(flexroad, nightly, survey, tmp_path):

@@ -103,8 +103,7 @@ def test_command_counts_tiles_without_roads_apart(half, flexroad, tmp_path):
     words = ["run", "--config", config, "--catalog", where, "--out", out, "--executor", "serial"]
     alone = flexroad(*words, "--tile", half.tiles[BARE[0]].id).expected(0)
     assert "warning: no tile of this run has a road that the filter keeps; if there are roads" in alone.err
-    prometheus = tmp_path / "run.prom"
-    said = flexroad(*words, "--prometheus", prometheus).expected(0)
+    said = flexroad(*words).expected(0)
     line = "4 tiles: 4 done (1 cached, 2 without roads), 0 failed, 0 pending"
     assert line in said.out
     assert "warning" not in said.err
@@ -112,7 +111,6 @@ def test_command_counts_tiles_without_roads_apart(half, flexroad, tmp_path):
     assert json.loads(flexroad("status", out, "--json").out)["without_roads"] == 2
     written = json.loads((out / "summary.json").read_text())
     assert (written["without_roads"], written["exit_code"]) == (2, 0)
-    assert "flexroad_tiles_without_roads{" in prometheus.read_text()
     states = json.loads((out / "tiles.geojson").read_text())["features"]
     assert [state["properties"]["flags"] == NO_ROAD for state in states] == [
         number in BARE for number in range(4)
