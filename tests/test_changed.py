@@ -51,7 +51,7 @@ def test_unknown_commit_makes_all_due(tmp_path, commit):
         "pyproject.toml",
         "constraints.txt",
         "tests/faulty_files.py",
-        "tests/pipeline/conftest.py",
+        "tests/tools/conftest.py",
         TEST,
     ],
 )

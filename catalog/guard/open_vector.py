@@ -125,7 +125,7 @@ def _require_complete(part: Path) -> None:
         stated = 2 * int.from_bytes(data[24:28], "big")
         whole = data.startswith(SHAPEFILE) and SHAPEFILE_HEADER_BYTES <= stated <= size
     if not whole:
-        raise Refused(f"is damaged: {part.name} is shorter than its header says, or has none; restore it")
+        raise Refused(f"is a damaged Shapefile: {part.name} is shorter than its header says; restore it")
 
 
 def _objects(path: Path, condition: str) -> list[tuple[str, str]]:
