@@ -6,6 +6,7 @@ cannot pass it on. It is therefore raised again until it is being handled.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import select
@@ -14,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from types import FrameType
 from typing import Any
 
 INTERRUPTED = 130
@@ -106,7 +108,25 @@ class _Signals:
         if not issubclass(lost.exc_type, KeyboardInterrupt):
             self.hooks[0](lost)
         elif self.raising:
-            signal.setitimer(signal.ITIMER_REAL, SOON_S, AGAIN_S)
+            # The hook is called inside the callback, below the frame that has called the C library.
+            self._raise_in(sys._getframe(1))
+
+    def _raise_in(self, frame: FrameType | None) -> None:
+        """Raise the interrupt in a frame as soon as it goes on: its call of a C library has then returned.
+
+        A timer alone may meet the library at work each time, and so be lost in its next callback.
+        """
+        before = sys.gettrace()
+
+        def go_on(traced: FrameType, *_: object) -> None:
+            traced.f_trace = None
+            sys.settrace(before)
+            if self.raising:
+                self._again()
+
+        if frame is not None:
+            frame.f_trace = go_on
+            sys.settrace(before or (lambda *_: None))
 
     def _show(self, kind: type[BaseException], *error: Any) -> None:
         """Print an error, but for a lost interrupt, whose traceback Cython prints."""
@@ -116,6 +136,17 @@ class _Signals:
     def _late(self, number: int, _: object) -> None:
         if self.first_s is not None and time.monotonic() > self.first_s + ONE_S:
             _end(number)
+
+
+@atexit.register
+def _ignore_late() -> None:
+    """Ignore further signals of an interrupted program: Python's own end would make them kill it.
+
+    Registered on import, it is called after the other functions of `atexit`, which may wait.
+    """
+    for number in NUMBERS:
+        if isinstance(getattr(signal.getsignal(number), "__self__", None), _Signals):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _watch(received: int) -> None:
