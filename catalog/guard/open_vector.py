@@ -21,14 +21,13 @@ from contextlib import closing
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import quote
 from weakref import finalize
 from xml.parsers import expat
 
 from flexroad.catalog.gdal_options import settle_vectors
 from flexroad.catalog.guard.refused import Refused, archive_note, head, require_beside
 from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, source_stat
-from flexroad.catalog.guard.sqlite_contents import require_sound_contents
+from flexroad.catalog.guard.sqlite_contents import opened, require_sound_contents
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.storage.scratch import ScratchFolder
@@ -131,7 +130,7 @@ def _require_complete(part: Path) -> None:
 def _objects(path: Path, condition: str) -> list[tuple[str, str]]:
     """Return names and statements of tables and views of an SQLite file; none if it is damaged."""
     try:
-        with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as file:
+        with opened(path) as file:
             return file.execute(f"SELECT name, sql FROM sqlite_master WHERE {condition}").fetchall()
     except sqlite3.Error:
         # GDAL reports what is wrong.

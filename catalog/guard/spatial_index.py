@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
 from flexroad.catalog.grid import Bounds, union
+from flexroad.catalog.guard.sqlite_contents import opened, quoted
 from flexroad.catalog.lazy import lazy
 
 pyogrio = lazy("pyogrio")
@@ -65,13 +64,12 @@ def has_complete_index(file: str, info: Mapping[str, Any]) -> bool:
 def _boxes(path: Path, layer: str) -> np.ndarray[Any, Any]:
     """Return the boxes of the R-tree of a table and column; none if there is no such one."""
     names = f"rtree_{layer}".lower(), f"idx_{layer}".lower()
-    with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as data:
+    with opened(path) as data:
         try:
             tables = data.execute(
                 "SELECT name FROM sqlite_master WHERE lower(name) IN (?, ?)", names
             ).fetchall()
-            table = tables[0][0].replace('"', '""')
-            return np.fromiter(data.execute(f'SELECT * FROM "{table}"'), BOXES)
+            return np.fromiter(data.execute(f"SELECT * FROM {quoted(tables[0][0])}"), BOXES)
         except (sqlite3.Error, IndexError, ValueError):
             return np.empty(0, BOXES)
 

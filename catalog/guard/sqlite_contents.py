@@ -49,6 +49,16 @@ VIRTUAL_COLUMN = 2
 """Mark of columns that are computed when they are read, in SQLite's table of columns."""
 
 
+def opened(path: Path) -> closing[sqlite3.Connection]:
+    """Return a connection that only reads a file, for a ``with`` block."""
+    return closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True))
+
+
+def quoted(name: str) -> str:
+    """Return a name as a statement has it."""
+    return '"' + name.replace('"', '""') + '"'
+
+
 def require_sound_contents(path: Path, state: FileStat) -> None:
     """Raise an error if an SQLite file may need endless time or memory, or hides features.
 
@@ -73,7 +83,7 @@ def require_sound_contents(path: Path, state: FileStat) -> None:
 def _fault(path: Path, state: FileStat) -> str:
     """Return what is wrong, to follow the name of the file; empty if nothing is."""
     try:
-        with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as file:
+        with opened(path) as file:
             names = file.execute(
                 "SELECT type, name FROM sqlite_master WHERE type IN ('table', 'view')"
             ).fetchall()
@@ -112,7 +122,7 @@ def _of_counts(file: sqlite3.Connection, tables: set[str], path: Path) -> str:
         for table, features in stated:
             if str(table).lower() not in tables:
                 continue
-            ((rows,),) = file.execute(f"SELECT count(*) FROM {_quoted(table)}").fetchall()
+            ((rows,),) = file.execute(f"SELECT count(*) FROM {quoted(table)}").fetchall()
             if rows > features:
                 remedy = f"have them counted again: {_command(path, statement)}"
                 return f"states {features:,} features of {table!r}, which has {rows:,}; {remedy}"
@@ -142,7 +152,7 @@ def _trial(file: sqlite3.Connection, view: str, most_steps: int) -> str:
     file.set_authorizer(authorize)
     file.set_progress_handler(lambda: next(looks) * STRIDE > most_steps, STRIDE)
     try:
-        for _ in file.execute(f"SELECT * FROM {_quoted(view)}"):
+        for _ in file.execute(f"SELECT * FROM {quoted(view)}"):
             pass
     except sqlite3.Error as error:
         if others:
@@ -156,12 +166,8 @@ def _trial(file: sqlite3.Connection, view: str, most_steps: int) -> str:
     return ""
 
 
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"'
-
-
 def _bracketed(name: str) -> str:
-    return _quoted(name) if "]" in name else f"[{name}]"
+    return quoted(name) if "]" in name else f"[{name}]"
 
 
 def _command(path: Path, statement: str) -> str:

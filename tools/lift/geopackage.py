@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog.guard.open_vector import GEOPACKAGES, SQLITE, vector_name
+from flexroad.catalog.guard.sqlite_contents import quoted
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift.features import (
     BATCH_BYTES,
@@ -96,10 +97,6 @@ def _opened(path: Path) -> closing[sqlite3.Connection]:
     return closing(file)
 
 
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"'
-
-
 def _layers(file: sqlite3.Connection) -> list[_Layer]:
     """Return the tables with geometries; views show those of their tables."""
     try:
@@ -109,7 +106,7 @@ def _layers(file: sqlite3.Connection) -> list[_Layer]:
         ).fetchall()
         layers = []
         for table, column, srs in found:
-            info = file.execute(f"PRAGMA table_info({_quoted(table)})").fetchall()
+            info = file.execute(f"PRAGMA table_info({quoted(table)})").fetchall()
             keys = [row[1] for row in info if row[5] == 1 and row[2].upper() == "INTEGER"]
             names = tuple(row[1] for row in info)
             layers.append(
@@ -138,7 +135,7 @@ def _lift_layer(
     file: sqlite3.Connection, layer: _Layer, run: RunSurface, options: Options, several: bool
 ) -> Iterator[Lifted]:
     run = run.in_crs(layer.crs, layer.table)
-    table, key, geometry = _quoted(layer.table), _quoted(layer.key), _quoted(layer.column)
+    table, key, geometry = quoted(layer.table), quoted(layer.key), quoted(layer.column)
     with _without_triggers(file, layer.table):
         added = _add_columns(file, layer) if options.columns else ""
         flat = False
@@ -166,7 +163,7 @@ def _without_triggers(file: sqlite3.Connection, table: str) -> Iterator[None]:
     found = "SELECT name, sql FROM sqlite_master WHERE type = 'trigger' AND lower(tbl_name) = lower(?)"
     triggers = file.execute(found, (table,)).fetchall()
     for name, _ in triggers:
-        file.execute(f"DROP TRIGGER {_quoted(name)}")
+        file.execute(f"DROP TRIGGER {quoted(name)}")
     yield
     for _, statement in triggers:
         file.execute(statement)
@@ -177,8 +174,8 @@ def _add_columns(file: sqlite3.Connection, layer: _Layer) -> str:
     known = {name.lower(): name for name in layer.columns}
     for name in COLUMNS:
         if name not in known:
-            file.execute(f"ALTER TABLE {_quoted(layer.table)} ADD COLUMN {name} REAL")
-    return "".join(f", {_quoted(known.get(name, name))} = ?" for name in COLUMNS)
+            file.execute(f"ALTER TABLE {quoted(layer.table)} ADD COLUMN {name} REAL")
+    return "".join(f", {quoted(known.get(name, name))} = ?" for name in COLUMNS)
 
 
 def _batches(
@@ -186,8 +183,8 @@ def _batches(
 ) -> Iterator[tuple[list[tuple[Any, ...]], list[Feature]]]:
     """Yield rows in the order of their keys, with their features."""
     levels = level_columns(layer.columns)
-    names = ", ".join(map(_quoted, (layer.key, layer.column, *levels)))
-    key, table = _quoted(layer.key), _quoted(layer.table)
+    names = ", ".join(map(quoted, (layer.key, layer.column, *levels)))
+    key, table = quoted(layer.key), quoted(layer.table)
     after = -(2**63)
     while True:
         rows, size = list[tuple[Any, ...]](), 0
