@@ -19,6 +19,7 @@ from flexroad.tasks.levels.seen import hidden, level_data, off_ground, with_appr
 from flexroad.tasks.quality.support import Support, support
 from flexroad.tasks.roads.distances import distances, filled
 from flexroad.tasks.roads.dtm_validity import AGREE_M, ground_to_fit, rise
+from flexroad.tasks.roads.flat_patches import CLIMB
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, Surface, TileData
@@ -33,9 +34,8 @@ MIN_SHARE = 0.2
 """Smallest share of cells with a residual in a square that counts."""
 SCATTER_M = 5.0
 """Side of the square over which the scatter of the DSM is taken (m); smaller than a tree crown."""
-CLIMB, CLIMB_M = 0.15, 3.0
-"""Steepest road off the ground (m per m), and least width of what is steeper (m): ramps are built with up to
-15%, objects rise by more, and the edge of a deck is narrower."""
+CLIMB_M = 3.0
+"""Least width of what is steeper than `CLIMB` (m): objects are wider, and the edge of a deck is narrower."""
 
 
 def error_estimate(
