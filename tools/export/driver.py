@@ -46,8 +46,6 @@ DATUM_REMEDY = (
     "which: --vertical EPSG:N (PROJ needs its grid), --geoid FILE (.gtx or .tif), or --height-offset METRES"
 )
 MANIFEST = "export.json"
-ALONG_ROADS = ("crg", "xodr", "lines")
-"""Formats that name the roads on tiles that do not meet."""
 BEGUN = ".flexroad-export"
 """File with the formats of the folder: written first, so that an interrupted export is known, too."""
 
@@ -88,7 +86,7 @@ def export(
         if kind.check:
             kind.check(source, options)
     apart = not has_borders(source.run.config.chains[source.variant]["fit"])
-    others = ", ".join(name for name in chosen if name not in ALONG_ROADS)
+    others = ", ".join(name for name in chosen if not FORMATS[name].of_roads)
     if apart and others and len(source.tiles) > 1:
         notify(f"{others}: the tiles of this run do not meet, and heights have steps there; {REMEDY}")
     with held(out, source.run, chosen, notify):

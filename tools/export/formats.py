@@ -22,10 +22,19 @@ from flexroad.tasks.roads.extent import covered
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tools.export import along_roads, cityjson, landxml, mosaic, obj, opencrg, opendrive, step
-from flexroad.tools.export import lines as road_lines
-from flexroad.tools.export import road_lines as line_file
-from flexroad.tools.export import tileset as tiles3d
+from flexroad.tools.export import (
+    along_roads,
+    cityjson,
+    landxml,
+    lines,
+    mosaic,
+    obj,
+    opencrg,
+    opendrive,
+    road_lines,
+    step,
+    tileset,
+)
 from flexroad.tools.export.georeference import Georeference
 from flexroad.tools.export.network import network
 from flexroad.tools.export.pieces import Encode, Piece, Row, figures, part_name, write_joined, write_pieces
@@ -153,6 +162,8 @@ class Format:
     """Raises an error, before anything is written, if the format cannot be."""
     of_meshes: bool = False
     """Whether it has the run's meshes; the manifest then says how far they are from their surfaces."""
+    of_roads: bool = False
+    """Whether its files are roads; it then names those on tiles that do not meet."""
 
 
 def write_landxml(
@@ -214,12 +225,12 @@ def _write_each(
 
 
 def _along_roads(title: str, version: int, write: Write) -> Format:
-    return Format(title, write, version, None, check=network)
+    return Format(title, write, version, None, check=network, of_roads=True)
 
 
 FORMATS = {
     "3dtiles": Format(
-        "3D Tiles 1.1, for globes", tiles3d.write_tilesets, tiles3d.VERSION, 0.002, True, of_meshes=True
+        "3D Tiles 1.1, for globes", tileset.write_tilesets, tileset.VERSION, 0.002, True, of_meshes=True
     ),
     "landxml": Format(
         "LandXML 1.2, for civil engineering", write_landxml, landxml.VERSION, 0.0001, of_meshes=True
@@ -232,6 +243,6 @@ FORMATS = {
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
     "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
     "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),
-    "lines": _along_roads("Road lines as GeoPackage, for GIS", line_file.VERSION, road_lines.write_lines),
+    "lines": _along_roads("Road lines as GeoPackage, for GIS", road_lines.VERSION, lines.write_lines),
 }
 """By the name on the command line."""

@@ -23,10 +23,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.tasks.errors import TaskError
-from flexroad.tools.prepare import from_mesh as mesh
-from flexroad.tools.prepare import from_odm as odm
-from flexroad.tools.prepare import from_photos as photos
-from flexroad.tools.prepare import from_points as points
+from flexroad.tools.prepare import from_mesh, from_odm, from_photos, from_points
 from flexroad.tools.prepare.options import PrepareOptions
 from flexroad.tools.prepare.output import check_replaced, disk_errors
 from flexroad.tools.prepare.photos import mvs_cpu, mvs_gpu, sfm
@@ -175,7 +172,7 @@ def prepare_points(
     )
     _run(
         output,
-        lambda: points.prepare_points(files, output, common, options, _executor(workers), _log, ground),
+        lambda: from_points.prepare_points(files, output, common, options, _executor(workers), _log, ground),
     )
 
 
@@ -186,7 +183,7 @@ def prepare_mesh(
         Path, typer.Argument(metavar="MESH", help="OBJ, PLY or glTF with textures or coloured vertices.")
     ],
     output: options.OutputFolder,
-    mesh_options: mesh.MeshOptions,
+    mesh_options: from_mesh.MeshOptions,
     rasters: _RasterOptions,
     *,
     workers: options.Workers = None,
@@ -199,7 +196,7 @@ def prepare_mesh(
     options = rasters.of(ground="filter")
     _run(
         output,
-        lambda: mesh.prepare_mesh(file, output, common, mesh_options, options, _executor(workers), _log),
+        lambda: from_mesh.prepare_mesh(file, output, common, mesh_options, options, _executor(workers), _log),
     )
 
 
@@ -208,7 +205,7 @@ def prepare_mesh(
 def prepare_odm(
     project: Annotated[Path, typer.Argument(metavar="PROJECT", help="Project folder of OpenDroneMap.")],
     output: options.OutputFolder,
-    mesh_options: Annotated[mesh.MeshOptions, "density", "seed"],
+    mesh_options: Annotated[from_mesh.MeshOptions, "density", "seed"],
     rasters: _RasterOptions,
     *,
     workers: options.Workers = None,
@@ -221,7 +218,9 @@ def prepare_odm(
     options = rasters.of(ground="filter")
     _run(
         output,
-        lambda: odm.prepare_odm(project, output, common, mesh_options, options, _executor(workers), _log),
+        lambda: from_odm.prepare_odm(
+            project, output, common, mesh_options, options, _executor(workers), _log
+        ),
     )
 
 
@@ -233,7 +232,7 @@ def prepare_photos(
         typer.Argument(metavar="IMAGE", help="Overlapping photographs with GNSS tags, or folders."),
     ],
     output: options.OutputFolder,
-    photos_options: photos.PhotosOptions,
+    photos_options: from_photos.PhotosOptions,
     rasters: _RasterOptions,
     *,
     image_size: Annotated[
@@ -274,7 +273,7 @@ def prepare_photos(
     options = rasters.of(ground="filter")
     _run(
         output,
-        lambda: photos.prepare_photos(
+        lambda: from_photos.prepare_photos(
             images, output, common, photos_options, options, _executor(workers), _log
         ),
     )

@@ -32,7 +32,7 @@ from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.roads.mask_metrics import Quality, judge, together
 from flexroad.tasks.segment.dinov2 import segment as segmenter
 from flexroad.tasks.types import Bools, RoadMask, TileData
-from flexroad.tools.train import fit_head as head
+from flexroad.tools.train import fit_head
 from flexroad.tools.train.fit_head import Epoch, Sample, Trained
 from flexroad.tools.train.spatial_split import Block, Split, inside, split, split_tile
 
@@ -239,7 +239,7 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> 
     def progress(done: int, of: int, last: Epoch) -> None:
         log(f"epoch {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
 
-    trained = head.train(samples, validation, settings, progress)
+    trained = fit_head.train(samples, validation, settings, progress)
     with ScratchFolder() as folder:
         model = Path(folder, f"model{trained.suffix}")
         model.write_bytes(trained.model)
@@ -323,15 +323,15 @@ def _check_labels(pieces: Sequence[Block], options: TrainOptions) -> None:
         )
 
 
-def _settings(options: TrainOptions) -> head.Options:
+def _settings(options: TrainOptions) -> fit_head.Options:
     try:
-        return head.Options(**{"seed": options.seed, **(options.settings or {})})
+        return fit_head.Options(**{"seed": options.seed, **(options.settings or {})})
     except ValidationError as error:
         fault = error.errors()[0]
         name = printable(".".join(str(part) for part in fault["loc"]))
         raise ConfigError(
             f"--set {name}: {fault['msg'].lower()}, not {shown(fault['input'])}; "
-            f"the training has {', '.join(head.Options.model_fields)}"
+            f"the training has {', '.join(fit_head.Options.model_fields)}"
         ) from error
 
 

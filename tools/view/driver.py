@@ -45,11 +45,11 @@ from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats
 from flexroad.tools.export.pieces import Piece, write_pieces
 from flexroad.tools.export.source import TileItem, layer_state
-from flexroad.tools.view import encoding as viewer
+from flexroad.tools.view import encoding
 
 shapely = lazy("shapely")
 
-VERSION = 100 * viewer.VERSION + glb.VERSION
+VERSION = 100 * encoding.VERSION + glb.VERSION
 PAGE = "index.html"
 MARK = b'<meta name="generator" content="FlexRoad viewer">'
 """Text of a page that this program has written."""
@@ -135,8 +135,8 @@ def write_viewer(
     index["tiles"]["places"] = [places.get(tile.id, {}) for tile in tiles]
     found = {row["tile"]: row["picture"] for row in rows if row["picture"]}
     pictures = {tile.id: found[tile.id] for tile in done if tile.id in found}
-    write(out / viewer.NAME_PICTURES, viewer.encode_pictures(pictures))
-    write(out / viewer.NAME_RUN, viewer.encode_run(index | {"pictures": bool(pictures)}))
+    write(out / encoding.NAME_PICTURES, encoding.encode_pictures(pictures))
+    write(out / encoding.NAME_RUN, encoding.encode_run(index | {"pictures": bool(pictures)}))
     write(out / PAGE, (_built() / PAGE).read_bytes())
     notes = tuple(f"tile {row['tile']}: {note}" for row in rows for note in row["notes"])
     return Written(out / PAGE, len(done), len(tiles) - len(done), notes)
@@ -354,9 +354,9 @@ def piece(item: TileItem, look: Look) -> Piece:
         height[tile.road.outside[window]] = np.nan
         road = tile.road.mask[window] if top is None else tile.road.mask[window] | (top > 0)
         places = {flag: list(place) for flag, place in tile.flag_places.items()}
-        small = viewer.picture(height, road, data.core.cell)
+        small = encoding.picture(height, road, data.core.cell)
         seen = base64.b64encode(small).decode("ascii")
-    scene = viewer.TileScene(
+    scene = encoding.TileScene(
         tile.id,
         glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
@@ -369,9 +369,9 @@ def piece(item: TileItem, look: Look) -> Piece:
         None if top is None else top_of(surface).lattice(core.eastings, core.northings),
         _lines(source, look.roads, notes),
     )
-    name = f"tiles/{safe_name(tile.id)}{viewer.NAME_TILE}"
+    name = f"tiles/{safe_name(tile.id)}{encoding.NAME_TILE}"
     return Piece(
-        {name: viewer.encode_tile(scene)},
+        {name: encoding.encode_tile(scene)},
         {"tile": tile.id, "notes": notes, "picture": seen, "places": places},
     )
 
