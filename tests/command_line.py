@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,7 +19,7 @@ from flexroad.pipeline.cli.main import main
 
 PROCESS = (sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()")
 """Command of a new process; the words of a command line follow."""
-FORKED_S = 300
+FORKED_S = 120
 """Longest time of a function in a copy of this process (s)."""
 RAISED = 99
 """Exit code of a copy of this process in which the function raised an error."""
@@ -86,14 +87,21 @@ def process(*words) -> Said:
     return Said(done.returncode, done.stdout, done.stderr)
 
 
-def forked(function: Callable[[], int]) -> int:
-    """Call a function in a copy of this process; return the exit code that it gives, or minus a signal."""
+def forked(function: Callable[[], int], attempts: int = 2) -> int:
+    """Call a function in a copy of this process; return the exit code that it gives, or minus a signal.
+
+    A copy stands for ever at a lock that another thread had when the copy was made. It then ends after
+    `FORKED_S`, and another copy is made.
+    """
     sys.stderr.flush()
+    start = time.monotonic()
     if child := os.fork():
-        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        stood = time.monotonic() - start >= FORKED_S
+        return forked(function, attempts - 1) if stood and attempts > 1 else code
     code = RAISED
     try:
-        # Says where the copy stands, for example at a lock that another thread had when the copy was made.
+        # Says where the copy stands.
         faulthandler.dump_traceback_later(FORKED_S, exit=True, file=sys.__stderr__)
         code = int(function())
     except BaseException:
