@@ -23,15 +23,7 @@ def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
 
     `Tile.paths` and `open_raster` raise the same error, but only when the file is needed.
 
-    Parameters
-    ----------
-    layers : collection of str
-        The layers that will be read; other layers are not checked.
-
-    Raises
-    ------
-    CatalogError
-        Names the first such tile, its layer and file, and the options that allow all such files.
+    - `layers`: the layers that will be read; other layers are not checked.
     """
     checked = set[str]()
     for tile, layer in _chosen(catalog, layers):

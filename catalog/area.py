@@ -42,17 +42,8 @@ class Area:
     def read(cls, path: Path, layer: str | None = None) -> Area:
         """Read the polygons of a vector file.
 
-        Parameters
-        ----------
-        path : Path
-            GeoPackage, GeoJSON, FlatGeobuf or Shapefile.
-        layer : str, optional
-            Layer of a file with several.
-
-        Raises
-        ------
-        CatalogError
-            If the file cannot be read, has no CRS, no such layer or several, or no polygons.
+        - `path`: GeoPackage, GeoJSON, FlatGeobuf or Shapefile.
+        - `layer`: layer of a file with several.
         """
         try:
             name = vector_name(path)

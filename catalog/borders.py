@@ -74,10 +74,7 @@ class Border:
     def along(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the values of the cells on both sides of an edge, ``(2, n)``, ordered from its start.
 
-        Parameters
-        ----------
-        values : ndarray, (H, W)
-            The values of all cells of `grid`.
+        - `values` ``(H, W)``: the values of all cells of `grid`.
         """
         order = slice(None, None, 1 if self.kind == "east" else -1)
         return np.stack([values[side].ravel()[order] for side in self.sides])
@@ -86,12 +83,8 @@ class Border:
 def border_of(tile: Grid, reach_m: float) -> tuple[Border, ...]:
     """Return the border of a tile, in the order of `places_of`.
 
-    Parameters
-    ----------
-    tile : Grid
-        The tile, without halo.
-    reach_m : float
-        Distance from the corner or edge up to which its grid reaches (m).
+    - `tile`: the tile, without halo.
+    - `reach_m`: distance from the corner or edge up to which its grid reaches (m).
     """
     size = tile.width, tile.height
     return tuple(

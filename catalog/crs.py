@@ -38,13 +38,7 @@ def _parts(text: str) -> tuple[CRS, CRS | None]:
 
 @lru_cache(maxsize=256)
 def in_plan(text: str) -> str:
-    """Return the horizontal CRS, without heights: ``EPSG:25832``, or WKT where there is no code.
-
-    Raises
-    ------
-    CatalogError
-        If ``text`` is not a CRS.
-    """
+    """Return the horizontal CRS, without heights: ``EPSG:25832``, or WKT where there is no code."""
     plan, _ = _parts(text)
     code = plan.to_epsg()
     return f"EPSG:{code}" if code else plan.to_wkt()
@@ -159,13 +153,9 @@ def utm_of(degrees: Bounds) -> str:
 def metric_twin(text: str, easting: float, northing: float) -> str:
     """Return the same projection in metres: its code in the EPSG register if it has one, else WKT.
 
-    Parameters
-    ----------
-    text : str
-        A projected CRS in any unit.
-    easting, northing : float
-        Any point of the data, in units of ``text``; only CRSs of the register that are valid at this point
-        are considered.
+    - `text`: a projected CRS in any unit.
+    - `easting`, `northing`: any point of the data, in units of ``text``; only CRSs of the register that are
+      valid at this point are considered.
     """
     plan = _parts(text)[0].to_2d()
     if plan.to_epsg() and plan.axis_info[0].unit_conversion_factor == 1:
@@ -203,12 +193,8 @@ def degrees(text: str, easting: float, northing: float) -> tuple[float, float]:
 def scales(source: str, target: str, x: float, y: float) -> tuple[float, float]:
     """Return how far one unit of a CRS reaches along the two axes of another one, in units of the latter.
 
-    Parameters
-    ----------
-    source, target : str
-        The two CRSs.
-    x, y : float
-        A point, in ``source``.
+    - `source`, `target`: the two CRSs.
+    - `x`, `y`: a point, in ``source``.
     """
     step = 1e-5 if is_geographic(source) else 1.0
     xs, ys = transformer(source, target).transform([x - step, x + step, x, x], [y, y, y - step, y + step])

@@ -38,12 +38,8 @@ def may_be_in(crs: str, bounds: Bounds) -> bool:
 def crs_of(declared: str | None, given: str | None, bounds: Bounds) -> str | None:
     """Return the CRS of a file: the one it declares, or the given one if it has none or that cannot be.
 
-    Parameters
-    ----------
-    declared, given : str, optional
-        The CRS of the file, and the one for files without a CRS.
-    bounds : Bounds
-        Those of the file, in its CRS; NaN if they are unknown.
+    - `declared`, `given`: the CRS of the file, and the one for files without a CRS.
+    - `bounds`: those of the file, in its CRS; NaN if they are unknown.
     """
     if declared and (given is None or not np.isfinite(bounds).all() or may_be_in(declared, bounds)):
         return declared
@@ -67,21 +63,10 @@ def angle_fault(crs: str, bounds: Bounds) -> str | None:
 def require_scale(title: str, crs: str, bounds: Bounds, remedy: str) -> None:
     """Check that a metre of a CRS is one on the ground, within `MAX_SCALE_ERROR`.
 
-    Parameters
-    ----------
-    title : str
-        What is in the CRS, for the message.
-    crs : str
-        A CRS in metres; one that is not projected is not checked.
-    bounds : Bounds
-        Those of the data, in the CRS; the scale at their centre counts.
-    remedy : str
-        What to do, for the message; ``{zone}`` is replaced by the code of the UTM zone.
-
-    Raises
-    ------
-    CatalogError
-        If it is not, or the centre is no place on the Earth.
+    - `title`: what is in the CRS, for the message.
+    - `crs`: a CRS in metres; one that is not projected is not checked.
+    - `bounds`: those of the data, in the CRS; the scale at their centre counts.
+    - `remedy`: what to do, for the message; ``{zone}`` is replaced by the code of the UTM zone.
     """
     if not is_projected(crs):
         return
@@ -119,16 +104,10 @@ def _to_degrees(crs: str) -> tuple[Transformer, Geod]:
 def elsewhere(crs: str, bounds: Bounds, target: str, ground: Bounds, reach_m: float) -> str:
     """Return where a layer lies that does not reach the tiles, and where these lie, to follow its name.
 
-    Parameters
-    ----------
-    crs : str
-        CRS of the layer.
-    bounds : Bounds
-        Its bounds, in that CRS.
-    target, ground : str, Bounds
-        CRS and bounds of the tiles.
-    reach_m : float
-        Distance up to which a layer reaches a tile (m).
+    - `crs`: CRS of the layer.
+    - `bounds`: its bounds, in that CRS.
+    - `target`, `ground`: CRS and bounds of the tiles.
+    - `reach_m`: distance up to which a layer reaches a tile (m).
     """
     text = f"lies at {edges(bounds)} in {short(crs)}, the tiles at {edges(ground)} in {short(target)}"
     for why, source, moved in _mistakes(crs, bounds, target, ground):

@@ -55,17 +55,9 @@ def is_current(source: Path, target: Path) -> bool:
 def rasters_of_points(source: Path, corner: tuple[float, float]) -> tuple[dict[str, Floats], Affine]:
     """Return the values of points on a lattice as rasters, by the name of their array, and their transform.
 
-    Parameters
-    ----------
-    source : Path
-        NumPy archive with the arrays x and y (m) and others of their shape, or of the shape ``(y, x)``.
-    corner : tuple of float
-        Added to coordinates that are all below 1000 m: they count from the corner of the tile.
-
-    Raises
-    ------
-    CatalogError
-        If the file cannot be read, has no such arrays, or its points do not lie on a lattice.
+    - `source`: NumPy archive with the arrays x and y (m) and others of their shape, or of the shape ``(y,
+      x)``.
+    - `corner`: added to coordinates that are all below 1000 m: they count from the corner of the tile.
     """
     arrays = _arrays(source)
     try:

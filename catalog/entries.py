@@ -79,13 +79,7 @@ class TileReader:
         self._names = _Names()
 
     def tiles(self, entries: Iterable[Any]) -> tuple[Tile, ...]:
-        """Return a tile for each entry; those of unusable entries have a fault.
-
-        Raises
-        ------
-        CatalogError
-            If more than `MAX_FAULTS` entries have one.
-        """
+        """Return a tile for each entry; those of unusable entries have a fault."""
         tiles, faults = [], 0
         for number, entry in enumerate(entries, 1):
             tiles.append(self._tile(entry, number))

@@ -173,10 +173,7 @@ def use_own_values(variables: MutableMapping[str, str] = os.environ) -> str:
     Call it before GDAL and PROJ are loaded. Folders of the environment that Python runs in stay if rasterio
     has no data of its own: conda sets them.
 
-    Returns
-    -------
-    str
-        A line on what is ignored, empty if nothing is.
+    - result: a line on what is ignored, empty if nothing is.
     """
     own = None if _has_own_data() else Path(sys.prefix).resolve()
     foreign = {name: variables[name] for name in (*DEFAULTS, *WITHOUT_DEFAULT) if name in variables}

@@ -53,11 +53,6 @@ def entries(data: bytes) -> tuple[Iterator[Item], Any]:
     """Return the fields of each item that make a tile, and the entries of skipped files.
 
     Reading complete items is many times slower.
-
-    Raises
-    ------
-    Exception
-        Any error of pyarrow, if the data are not a table.
     """
     file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False, page_checksum_verification=True)
     _check_size(file.metadata)
@@ -155,12 +150,7 @@ def table_bytes(items: Iterable[Item], schema: Any, skipped: Sequence[Item] = ()
 
     To import that takes an eighth of a run with nothing to do, and its conversion is many times slower.
 
-    Parameters
-    ----------
-    schema : pyarrow.Schema
-        Of `schema_of`.
-    skipped : sequence of dict
-        Entries of skipped files, which its metadata have.
+    - `skipped`: entries of skipped files, which its metadata have.
     """
     column = {"encoding": "WKB", "geometry_types": [], "crs": _crs(), "edges": "planar"}
     column["covering"] = {"bbox": {name: ["bbox", name] for name in EDGES}}

@@ -31,13 +31,7 @@ def problem(tile_id: object) -> str:
 
 
 def check(ids: Sequence[str]) -> None:
-    """Check the ids of a catalog.
-
-    Raises
-    ------
-    CatalogError
-        If one is not valid, or two are equal, in Unicode's normal form (NFC) or as file names.
-    """
+    """Check the ids of a catalog."""
     unsafe = [tile_id for tile_id in ids if not (SAFE.fullmatch(tile_id) and len(tile_id) <= MAX_BYTES)]
     for tile_id in unsafe:
         if reason := problem(tile_id):

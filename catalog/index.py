@@ -239,12 +239,9 @@ def _to_wgs84(crs: str) -> Transformer:
 def item(tile: Tile, root: str = "") -> Item:
     """Return the tile as a STAC item.
 
-    Parameters
-    ----------
-    tile : Tile
-        File names are written as they are in its layers.
-    root : str
-        Folder that file names are relative to; empty: the folder of the file that the item is written to.
+    - `tile`: file names are written as they are in its layers.
+    - `root`: folder that file names are relative to; empty: the folder of the file that the item is written
+      to.
     """
     properties: Item = {
         "datetime": datetime_text(tile.datetime),

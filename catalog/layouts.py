@@ -80,10 +80,7 @@ class Found:
 def find(root: Path) -> tuple[list[Found], list[str]]:
     """Return the files of the dataset below a folder, by path, and notes on what was not understood.
 
-    Parameters
-    ----------
-    root : Path
-        The folder; its own name means nothing.
+    - `root`: the folder; its own name means nothing.
     """
     names = list(_names(root))
     of_tile, notes = _strata(root, [name for name in names if name.lower().endswith(TABLES)])

@@ -71,14 +71,6 @@ def _imported(name: str) -> ModuleType:
 def lazy(name: str) -> Any:
     """Return a library that is imported when one of its names is first asked for.
 
-    Parameters
-    ----------
-    name : str
-        Name of the library or of a module in it, as ``rasterio`` or ``matplotlib.figure``.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        At its first use, if the library is not installed.
+    - `name`: name of the library or of a module in it, as ``rasterio`` or ``matplotlib.figure``.
     """
     return LazyModule(name)

@@ -48,13 +48,8 @@ class Skipped:
 def lost(before: Sequence[Tile], tiles: Collection[str], skipped: Sequence[Skipped]) -> tuple[Skipped, ...]:
     """Return skipped files with the tiles of an earlier catalog that are missing without them.
 
-    Parameters
-    ----------
-    before : sequence of Tile
-        Tiles of the earlier catalog.
-    tiles : collection of str
-        Ids of the tiles of the catalog that skipped the files.
-    skipped : sequence of Skipped
+    - `before`: tiles of the earlier catalog.
+    - `tiles`: ids of the tiles of the catalog that skipped the files.
     """
     gone: dict[str, list[str]] = defaultdict(list)
     for tile in (tile for tile in before if tile.id not in tiles):
@@ -98,13 +93,7 @@ def to_fields(skipped: Skipped) -> dict[str, Any]:
 
 
 def from_fields(entries: Any, folder: str) -> tuple[Skipped, ...]:
-    """Return what `to_fields` wrote for each file; names without a root start from ``folder``.
-
-    Raises
-    ------
-    CatalogError
-        If an entry is none.
-    """
+    """Return what `to_fields` wrote for each file; names without a root start from ``folder``."""
     if not isinstance(entries, list) or not all(map(_is_entry, entries)):
         raise CatalogError("its list of skipped files cannot be read")
     return tuple(

@@ -70,10 +70,7 @@ class Layer:
 
         A layer of unknown extents is returned unchanged.
 
-        Parameters
-        ----------
-        bounds : Bounds
-            West, south, east, north (m, in the tile's CRS).
+        - `bounds`: west, south, east, north (m, in the tile's CRS).
         """
         numbers = self._overlapping(bounds)
         if len(numbers) == len(self.files):
@@ -251,14 +248,9 @@ class Tile:
 def files_around(layers: Iterable[Layer], bounds: Bounds, reach: Bounds) -> list[tuple[Layer, Sequence[int]]]:
     """Return the layers with files that reach other ground, and the numbers of these files (`Tile.around`).
 
-    Parameters
-    ----------
-    layers : iterable of Layer
-        Those of a tile (`Tile.layers_around`).
-    bounds : Bounds
-        The ground: files of rasters reach it.
-    reach : Bounds
-        Photo and roads reach this area.
+    - `layers`: those of a tile (`Tile.layers_around`).
+    - `bounds`: the ground: files of rasters reach it.
+    - `reach`: photo and roads reach this area.
     """
     found = ((layer, layer.in_common_order(bounds if layer.name in LOADED else reach)) for layer in layers)
     return [(layer, numbers) for layer, numbers in found if numbers]

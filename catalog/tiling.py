@@ -147,34 +147,17 @@ def cut(
 ) -> TilingResult:
     """Cut the area that the DSM files cover into tiles.
 
-    Parameters
-    ----------
-    root : Path
-        The folder that the files' names are relative to, resolved.
-    layer_files : Mapping[str, Sequence[RasterFile]]
-        Files by layer name (see `catalog.LAYERS`), at least one each; ``dsm`` is required. Where files
-        overlap, the first one with a value is used.
-    road_values : tuple of int
-        Cell values that mean road in the masks; empty: every value but 0 and nodata.
-    tile_size_m : float
-        Edge of a tile (m); tiles lie on multiples of it in the DSM's CRS.
-    date : datetime, optional
-        Date of the survey; overrides the files' dates.
-    crs : str, optional
-        CRS of files without one.
-    min_cover : float
-        Tiles with a DSM height in less than this share (0 to 1) of their cells are left out, as
-        `load.min_valid` would fail on them. 0 keeps all that files touch, and reads no heights.
-    dataset : str
-        Name of the data in reports.
-    conversion : Conversion
-        Whether and where to files in other CRSs are reprojected.
-
-    Raises
-    ------
-    CatalogError
-        If the CRS is not in metres, no file of a layer has a place, the tile size does not fit the cells, or
-        no tile is left.
+    - `root`: the folder that the files' names are relative to, resolved.
+    - `layer_files`: files by layer name (see `catalog.LAYERS`), at least one each; ``dsm`` is required. Where
+      files overlap, the first one with a value is used.
+    - `road_values`: cell values that mean road in the masks; empty: every value but 0 and nodata.
+    - `tile_size_m`: edge of a tile (m); tiles lie on multiples of it in the DSM's CRS.
+    - `date`: date of the survey; overrides the files' dates.
+    - `crs`: CRS of files without one.
+    - `min_cover`: tiles with a DSM height in less than this share (0 to 1) of their cells are left out, as
+      `load.min_valid` would fail on them. 0 keeps all that files touch, and reads no heights.
+    - `dataset`: name of the data in reports.
+    - `conversion`: whether and where to files in other CRSs are reprojected.
     """
     dsm = layer_files["dsm"]
     grid_crs = Counter(file.crs for file in dsm).most_common(1)[0][0]

@@ -58,22 +58,11 @@ class MetricTransform:
     ) -> MetricTransform:
         """Return the conversion from a CRS to metres.
 
-        Parameters
-        ----------
-        source : str
-            CRS of the coordinates: projected in any unit, or geographic.
-        place : tuple[float, float]
-            Easting and northing (or longitude and latitude) of any point of the data.
-        to_crs : str, optional
-            Projected target CRS in metres; by default the same projection in metres or, for a geographic
-            CRS, the UTM zone of the point.
-        unit : str, optional
-            Unit of heights, one of `HEIGHT_UNITS`, if the CRS does not define it.
-
-        Raises
-        ------
-        CatalogError
-            If a CRS cannot be used, or the unit is unknown or contradicts the CRS.
+        - `source`: CRS of the coordinates: projected in any unit, or geographic.
+        - `place`: easting and northing (or longitude and latitude) of any point of the data.
+        - `to_crs`: projected target CRS in metres; by default the same projection in metres or, for a
+          geographic CRS, the UTM zone of the point.
+        - `unit`: unit of heights, one of `HEIGHT_UNITS`, if the CRS does not define it.
         """
         if not (is_projected(source) or is_geographic(source)):
             raise CatalogError(f"{short(source)} is neither projected nor geographic; reproject the source")
@@ -89,13 +78,7 @@ class MetricTransform:
         return vertical(self.source)
 
     def metres(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return eastings, northings and heights in metres, ``(n,)`` each.
-
-        Raises
-        ------
-        CatalogError
-            If a point has no coordinates in the target CRS.
-        """
+        """Return eastings, northings and heights in metres, ``(n,)`` each."""
         height = z * self.height_m
         if self.plan_m is not None:
             return x * self.plan_m, y * self.plan_m, height
@@ -114,18 +97,8 @@ class MetricTransform:
 def agreed(files: Sequence[tuple[str, str | None]], option: str | None) -> str:
     """Return the common CRS of a set of files.
 
-    Parameters
-    ----------
-    files : Sequence[tuple[str, str or None]]
-        Name and CRS of each file, at least one.
-    option : str, optional
-        CRS given with --crs, for files without one.
-
-    Raises
-    ------
-    CatalogError
-        If a file has no CRS and ``option`` is None, or two files, or a file and ``option``, differ
-        horizontally or in the unit of heights.
+    - `files`: name and CRS of each file, at least one.
+    - `option`: CRS given with --crs, for files without one.
     """
     crs_of = [(name, crs) for name, crs in files if crs]
     bare = next((name for name, crs in files if not crs), None)

@@ -49,24 +49,16 @@ class AllowedFolders:
     def permits(self, name: str) -> bool:
         """Return whether a file may be read.
 
-        Parameters
-        ----------
-        name : str
-            Full path or address.
+        - `name`: full path or address.
         """
         return _permitted(name, self.folders)
 
     def refusal(self, subject: str, name: str, folders: Sequence[str] = ()) -> CatalogError:
         """Return the error that a file may not be read, with the options that allow it.
 
-        Parameters
-        ----------
-        subject : str
-            What names the file: ``tile 1: dsm``.
-        name : str
-            Full path or address.
-        folders : sequence of str
-            The folders to allow; by default that of the file.
+        - `subject`: what names the file: ``tile 1: dsm``.
+        - `name`: full path or address.
+        - `folders`: the folders to allow; by default that of the file.
         """
         if len(name) > LONGEST_SHOWN:
             return CatalogError(

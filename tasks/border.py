@@ -78,10 +78,7 @@ class BorderStages:
     def part(self, border: Border, data: TileData, ends: Sequence[Corner]) -> Corner | Edge:
         """Return the control points of a corner, or of an edge between its two ends.
 
-        Parameters
-        ----------
-        data : TileData
-            The rasters around it, from `load_border`.
+        - `data`: the rasters around it, from `load_border`.
         """
         road = self._segmented(data)
         module: Any = stage_module(self.fit)

@@ -63,13 +63,11 @@ def compiled(
 ) -> Callable[[Callable[P, R]], Compiled[P, R]]:
     """Return a decorator that compiles a function with numba when it is first called.
 
-    Parameters
-    ----------
-    error_model : str
-        ``python``: dividing by zero raises an error; ``numpy``: it gives inf or NaN, and loops are faster.
-    fused : bool
-        Whether products and sums may be fused and sums reordered, so that loops use vector instructions. The
-        order is fixed when the function is compiled: equal arguments give equal bits in every call.
+    - `error_model`: ``python``: dividing by zero raises an error; ``numpy``: it gives inf or NaN, and loops
+      are faster.
+    - `fused`: whether products and sums may be fused and sums reordered, so that loops use vector
+      instructions. The order is fixed when the function is compiled: equal arguments give equal bits in every
+      call.
     """
 
     def decorate(function: Callable[P, R]) -> Compiled[P, R]:

@@ -134,19 +134,9 @@ def load_border(ground: Tile, core: Grid, options: Options | None = None) -> Til
 
     Files that cannot be used (`Unusable`) are left out: they fail the tiles that they lie on.
 
-    Parameters
-    ----------
-    ground : Tile
-        The ground, with the files that reach it (`Tile.around`).
-    core : Grid
-        The tile that the files are of: the position of a file without georeference.
-    options : Options, optional
-        The heights that roads are fitted to; None: the DSM's. The halo does not count.
-
-    Raises
-    ------
-    TaskError
-        If the layers differ in their unit of height.
+    - `ground`: the ground, with the files that reach it (`Tile.around`).
+    - `core`: the tile that the files are of: the position of a file without georeference.
+    - `options`: the heights that roads are fitted to; None: the DSM's. The halo does not count.
     """
     grid, chosen = ground.grid, options or Options()
     with quiet():

@@ -24,10 +24,7 @@ def group_limits(mount: Path = MOUNT, own: Path = OWN) -> list[int]:
     These are the limits of a container, of a systemd unit (``MemoryMax=``) or of a SLURM job; empty if there
     are none.
 
-    Parameters
-    ----------
-    mount, own : Path
-        Where the control groups are, and the file with the name of the process's own one.
+    - `mount`, `own`: where the control groups are, and the file with the name of the process's own one.
     """
     limits: list[int] = []
     with contextlib.suppress(OSError, ValueError):
@@ -58,17 +55,8 @@ def limit() -> int:
 def check(needed: float, what: str, remedy: str, file: str = "") -> None:
     """Check that something fits in memory.
 
-    Parameters
-    ----------
-    needed : float
-        Estimated size (bytes).
-    what : str
-        What needs it, with the file and its size: the beginning of the message.
-
-    Raises
-    ------
-    TaskError
-        If it needs more than `limit`.
+    - `needed`: estimated size (bytes).
+    - `what`: what needs it, with the file and its size: the beginning of the message.
     """
     if needed > limit():
         raise TaskError(

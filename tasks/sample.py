@@ -216,10 +216,8 @@ def _other_level(
 ) -> tuple[Floats, Faces]:
     """Return points and faces of a deck or tube, which ends at its outline and with the survey.
 
-    Parameters
-    ----------
-    ground : ndarray, (n, 3)
-        The vertices of level 0: on joints at the border of the tile, the level has the same ones.
+    - `ground` ``(n, 3)``: the vertices of level 0: on joints at the border of the tile, the level has the
+      same ones.
     """
     limit, lines, area = _limit(road, local, frame), [outline.lines], outline.area
     if limit:
@@ -251,10 +249,7 @@ def _dynamic(
 ) -> Mesh:
     """Return the mesh of road, terrain and border points, with the limit of the survey and roads as edges.
 
-    Parameters
-    ----------
-    others : sequence of LevelOutline
-        The other levels: their joints are edges, too.
+    - `others`: the other levels: their joints are edges, too.
     """
     fine = _lattice(surface, road, mask, local, options.road_m)
     coarse = _lattice(surface, road, ~mask, local, options.terrain_m)

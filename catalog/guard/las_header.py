@@ -61,17 +61,8 @@ class _Span(NamedTuple):
 def check(path: Path) -> int:
     """Check a header.
 
-    Returns
-    -------
-    int
-        Size of the largest chunk of a compressed file, unpacked (bytes); 0 if the file is not compressed.
-
-    Raises
-    ------
-    ValueError
-        If a number of the header contradicts the size of the file or is no coordinate.
-    OSError
-        If the file cannot be read.
+    - result: size of the largest chunk of a compressed file, unpacked (bytes); 0 if the file is not
+      compressed.
     """
     size = path.stat().st_size
     with path.open("rb") as file:

@@ -89,18 +89,7 @@ ONLY_MOSAICS = (
 def open_raster(path: Location, allowed: AllowedFolders | None = None) -> Iterator[Any]:
     """Open a source raster with rasterio.
 
-    Parameters
-    ----------
-    path : Location
-    allowed : AllowedFolders, optional
-        Where the files that a VRT names may lie; None: anywhere on disk.
-
-    Raises
-    ------
-    Refused
-        If the file is of another format, is not a regular file, or names files that may not be read.
-    RasterioError, OSError, UnicodeDecodeError
-        If it cannot be read.
+    - `allowed`: where the files that a VRT names may lie; None: anywhere on disk.
     """
     if not isinstance(path, Path):
         with _remote(path) as dataset:
@@ -118,11 +107,6 @@ def open_alone(path: Path) -> Any | None:
     """Open a source raster on disk that needs no other file, None if it has side-car files or is a VRT.
 
     The dataset can be kept open, as it needs none of GDAL's options when it is read.
-
-    Raises
-    ------
-    Refused, RasterioError, OSError, UnicodeDecodeError
-        As of `open_raster`.
     """
     driver = _driver(path)
     if driver == "VRT" or _side_cars(path):
@@ -219,13 +203,7 @@ def _require_plain(path: Path, driver: str) -> None:
 
 
 def vrt_sources(path: Path) -> tuple[str, ...]:
-    """Return the full names of the files that a VRT names.
-
-    Raises
-    ------
-    Refused
-        If the VRT is anything but a plain mosaic of files.
-    """
+    """Return the full names of the files that a VRT names."""
     stats = path.stat()
     if stats.st_size > MAX_VRT_BYTES:
         raise Refused(f"is a VRT of {stats.st_size:,} bytes, more than {MAX_VRT_BYTES:,}; divide it")

@@ -67,15 +67,7 @@ T = TypeVar("T")
 
 
 def vector_name(path: Path) -> str:
-    """Return the name by which GDAL opens a vector file, and no other file.
-
-    Raises
-    ------
-    Refused
-        If the file is of another format, is not a regular file, or names other files.
-    OSError
-        If it does not exist or cannot be read.
-    """
+    """Return the name by which GDAL opens a vector file, and no other file."""
     settle_vectors()
     path = path.absolute()
     data = head(path)
@@ -174,10 +166,7 @@ def in_its_encoding(read: Callable[..., T]) -> tuple[T, str]:
     Text that is not in the declared encoding, mostly UTF-8, is taken for cp1252, else for latin1, which has
     all bytes.
 
-    Parameters
-    ----------
-    read : callable
-        Takes the option ``encoding`` of pyogrio.
+    - `read`: takes the option ``encoding`` of pyogrio.
     """
     try:
         return read(), ""

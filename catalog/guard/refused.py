@@ -17,15 +17,7 @@ class Refused(OSError):
 
 
 def head(path: Path) -> bytes:
-    """Return the first bytes of a regular file; links are followed.
-
-    Raises
-    ------
-    Refused
-        If it is a folder, a pipe, a socket or a device: to open one may wait forever.
-    OSError
-        If it does not exist or cannot be read.
-    """
+    """Return the first bytes of a regular file; links are followed."""
     require_regular(path)
     # Opening a pipe would wait for a writer, if one has just taken the file's place.
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as file:
@@ -39,15 +31,7 @@ def archive_note(data: bytes) -> str:
 
 
 def read_through(path: Path) -> None:
-    """Read all bytes of a regular file.
-
-    Raises
-    ------
-    Refused
-        As of `head`.
-    OSError
-        If the system does not give all of them.
-    """
+    """Read all bytes of a regular file."""
     require_regular(path)
     with path.open("rb", buffering=0) as file:
         while file.read(CHUNK_BYTES):
@@ -55,29 +39,13 @@ def read_through(path: Path) -> None:
 
 
 def require_beside(side: Path, path: Path) -> None:
-    """Raise an error if a file that a library opens with another one is not a regular file of its folder.
-
-    Raises
-    ------
-    Refused
-        If it is no regular file, or a link to another folder than that of the other file.
-    OSError
-        If it does not exist, or cannot be read: the library would go on without it.
-    """
+    """Raise an error if a file that a library opens with another one is not a regular file of its folder."""
     if side.is_symlink() and side.resolve().parent not in (path.resolve().parent, path.parent.resolve()):
         raise Refused("is a link to another folder; replace it by the file")
     head(side)
 
 
 def require_regular(path: Path) -> None:
-    """Raise an error if a path is not a regular file.
-
-    Raises
-    ------
-    Refused
-        If it is a folder, a pipe, a socket or a device.
-    OSError
-        If it does not exist.
-    """
+    """Raise an error if a path is not a regular file."""
     if not stat.S_ISREG(path.stat().st_mode):
         raise Refused("is not a regular file; replace it by one")

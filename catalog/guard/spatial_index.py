@@ -32,17 +32,10 @@ BOXES = np.dtype(
 def has_complete_index(file: str, info: Mapping[str, Any]) -> bool:
     """Return whether each feature of a layer is in its index, within its box there.
 
-    Parameters
-    ----------
-    file : str
-        GDAL's name of the file.
-    info : Mapping[str, Any]
-        What pyogrio knows of the layer.
-
-    Returns
-    -------
-    bool
-        Also False of a view, whose index is the table's, and of a Shapefile: its index is not read here.
+    - `file`: GDAL's name of the file.
+    - `info`: what pyogrio knows of the layer.
+    - result: also False of a view, whose index is the table's, and of a Shapefile: its index is not read
+      here.
     """
     if not info["capabilities"]["fast_spatial_filter"] or info["driver"] not in SQLITE:
         return bool(info["capabilities"]["fast_spatial_filter"]) and info["driver"] not in EDITED

@@ -62,18 +62,8 @@ def quoted(name: str) -> str:
 def require_sound_contents(path: Path, state: FileStat) -> None:
     """Raise an error if an SQLite file may need endless time or memory, or hides features.
 
-    Parameters
-    ----------
-    path : Path
-        A file that has all changes.
-    state : FileStat
-        Its state, by which the answer is kept.
-
-    Raises
-    ------
-    Refused
-        If a view does not end within the limits or calls another function than `FUNCTIONS`, if a table has
-        columns that are computed, or more features than the file states.
+    - `path`: a file that has all changes.
+    - `state`: its state, by which the answer is kept.
     """
     if fault := _fault(path, state):
         raise Refused(fault)

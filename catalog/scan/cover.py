@@ -37,20 +37,10 @@ def height_share(
 ) -> float | None:
     """Return the share (0 to 1) of a grid's cells whose centre has a height in one of the rasters.
 
-    Parameters
-    ----------
-    grid : Grid
-    paths : iterable of Location
-        Rasters of heights, north up.
-    allowed : AllowedFolders, optional
-        Where the files that a VRT names may lie; None: anywhere on disk.
-    crs : str, optional
-        CRS of rasters without one; None: the grid's.
-
-    Returns
-    -------
-    float or None
-        None if a raster cannot be read, or not in parts, or has far finer cells than the grid.
+    - `paths`: rasters of heights, north up.
+    - `allowed`: where the files that a VRT names may lie; None: anywhere on disk.
+    - `crs`: CRS of rasters without one; None: the grid's.
+    - result: none if a raster cannot be read, or not in parts, or has far finer cells than the grid.
     """
     known = np.zeros(grid.shape, np.bool_)
     for path in paths:

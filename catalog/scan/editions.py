@@ -65,18 +65,8 @@ def newest_first(root: Path, layer: str, files: Sequence[RasterFile]) -> tuple[l
     The age is that of the dates in which the two names differ, else of the dates in the files' tags, else of
     their times, if these are a day apart. Files without another of the same ground keep their places.
 
-    Parameters
-    ----------
-    root : Path
-        Folder that the names are relative to.
-    layer : str
-        Name of the layer.
-    files : sequence of RasterFile
-
-    Raises
-    ------
-    CatalogError
-        If no rule tells which of two files is newer, and their heights differ.
+    - `root`: folder that the names are relative to.
+    - `layer`: name of the layer.
     """
     pairs = [_aged(files, one, other) for one, other in _same_ground(files)]
     if not pairs:

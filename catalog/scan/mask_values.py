@@ -30,16 +30,10 @@ def mask_notes(root: Path, layer: str, names: Sequence[str], road_values: Sequen
 
     Parts of some files are read, so that the time does not depend on the size of the survey.
 
-    Parameters
-    ----------
-    root : Path
-        Folder that the names are relative to.
-    layer : str
-        Name of the layer, for messages.
-    names : sequence of str
-        The mask's files; what a VRT names was checked before.
-    road_values : sequence of int
-        Values that mean road; empty: every value but 0 and nodata.
+    - `root`: folder that the names are relative to.
+    - `layer`: name of the layer, for messages.
+    - `names`: the mask's files; what a VRT names was checked before.
+    - `road_values`: values that mean road; empty: every value but 0 and nodata.
     """
     step = -(-len(names) // MOST_FILES)
     values, has_nodata, read = set[float](), False, list[str]()
@@ -60,16 +54,10 @@ def mask_notes(root: Path, layer: str, names: Sequence[str], road_values: Sequen
 def values_note(values: set[float], road_values: Sequence[int], has_nodata: bool, option: str) -> str:
     """Return how the values of a mask do not fit those that mean road; empty if they may.
 
-    Parameters
-    ----------
-    values : set of float
-        Values of its cells, at least one; nodata is none of them.
-    road_values : sequence of int
-        Values that mean road; empty: every value but 0 and nodata.
-    has_nodata : bool
-        Whether cells are nodata.
-    option : str
-        Name of the option that has ``road_values``.
+    - `values`: values of its cells, at least one; nodata is none of them.
+    - `road_values`: values that mean road; empty: every value but 0 and nodata.
+    - `has_nodata`: whether cells are nodata.
+    - `option`: name of the option that has ``road_values``.
     """
     ordered = sorted(values)
     listed = ", ".join(f"{value:g}" for value in ordered[:MOST_SHOWN])

@@ -36,14 +36,9 @@ def plateau_notes(
 
     Parts of some files are read, so that the time does not depend on the size of the survey.
 
-    Parameters
-    ----------
-    layer : str
-        Name of the layer, for messages.
-    files : Mapping[str, Location]
-        The layer's files by name.
-    allowed : AllowedFolders, optional
-        Where the files that a VRT names may lie; None: anywhere on disk.
+    - `layer`: name of the layer, for messages.
+    - `files`: the layer's files by name.
+    - `allowed`: where the files that a VRT names may lie; None: anywhere on disk.
     """
     step = -(-len(files) // MOST_FILES) or 1
     by_value: dict[tuple[float, float], list[str]] = defaultdict(list)

@@ -87,13 +87,7 @@ class Chunk:
 
 
 def find(inputs: Collection[Path]) -> tuple[Path, ...]:
-    """Return the clouds among files and folders, each once, ordered by path.
-
-    Raises
-    ------
-    CatalogError
-        If a folder has no cloud, or a file or folder does not exist.
-    """
+    """Return the clouds among files and folders, each once, ordered by path."""
     clouds: dict[Path, Path] = {}
     for path in inputs:
         files = [path]
@@ -108,13 +102,7 @@ def find(inputs: Collection[Path]) -> tuple[Path, ...]:
 
 
 def inspect(path: Path) -> Cloud:
-    """Read the header of a cloud.
-
-    Raises
-    ------
-    CatalogError
-        If the file is missing, not LAS or LAZ, truncated, or without points.
-    """
+    """Read the header of a cloud."""
     largest = _checked(path)
     with _opened(path) as reader:
         cloud = _attempt(path, lambda: _cloud(path, reader.header, largest))
@@ -157,11 +145,8 @@ def _has_dates(header: Any) -> bool:
 def survey_dates(gps: Floats) -> tuple[datetime, datetime] | None:
     """Return the dates of the first and the last point, or None if no time can be one of a survey.
 
-    Parameters
-    ----------
-    gps : (n,) array
-        See `Chunk.gps`. Times of a week (0 to 604,800 s) are left out, as some files have them although
-        their header declares standard times; so are times before 1990 and in the future.
+    - `gps`: see `Chunk.gps`. Times of a week (0 to 604,800 s) are left out, as some files have them although
+      their header declares standard times; so are times before 1990 and in the future.
     """
     latest = (datetime.now(UTC) - GPS_EPOCH).total_seconds()
     times = gps[np.isfinite(gps) & ((gps < 0) | (gps > WEEK_S)) & (gps > FIRST_GPS) & (gps < latest)]
@@ -176,22 +161,10 @@ def chunks(
 ) -> Iterator[Chunk]:
     """Yield the points of a cloud, decoded once; withheld points are left out.
 
-    Parameters
-    ----------
-    path : Path
-        LAS, LAZ or COPC file.
-    size : int
-        Points decoded at a time, at most.
-    drop : Collection[int]
-        Classes to leave out.
-    points : range, optional
-        Points to decode, in the order of the file; None: all.
-
-    Raises
-    ------
-    CatalogError
-        If the file is missing, unreadable, truncated or damaged. LAZ has no checksum: a file is taken as
-        damaged if points lie beyond the header's bounds.
+    - `path`: LAS, LAZ or COPC file.
+    - `size`: points decoded at a time, at most.
+    - `drop`: classes to leave out.
+    - `points`: points to decode, in the order of the file; None: all.
     """
     _checked(path)
     with _opened(path, fields=USED) as reader:

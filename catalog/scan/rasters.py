@@ -127,30 +127,13 @@ def scan(
 ) -> tuple[list[RasterFile], list[Skipped]]:
     """Open each file of a layer once.
 
-    Parameters
-    ----------
-    root : Path
-        The folder, resolved.
-    layer : str
-        Name of the layer, for messages.
-    pattern : str
-        Glob pattern: see `matching`.
-    crs : str, optional
-        CRS of files without one.
-    allow : sequence of str
-        Folders besides ``root`` that the files named by a VRT may lie below.
-
-    Returns
-    -------
-    files : list of RasterFile
-        Ordered by name.
-    skipped : list of Skipped
-        Files and folders that are left out.
-
-    Raises
-    ------
-    CatalogError
-        If no file matches or can be used.
+    - `root`: the folder, resolved.
+    - `layer`: name of the layer, for messages.
+    - `pattern`: glob pattern: see `matching`.
+    - `crs`: CRS of files without one.
+    - `allow`: folders besides ``root`` that the files named by a VRT may lie below.
+    - `files`: ordered by name.
+    - `skipped`: files and folders that are left out.
     """
     paths, unlisted = matching(root, layer, pattern)
     files, skipped = opened(root, layer, paths, crs, allow)
@@ -165,13 +148,7 @@ def scan(
 def opened(
     root: Path, layer: str, paths: Iterable[Path], crs: str | None, allow: Sequence[str] = ()
 ) -> tuple[list[RasterFile], list[Skipped]]:
-    """Open files of a layer, each once; return the usable ones, and the others with the reason.
-
-    Raises
-    ------
-    CatalogError
-        If a file has no CRS and ``crs`` is not one.
-    """
+    """Open files of a layer, each once; return the usable ones, and the others with the reason."""
     files: list[RasterFile] = []
     allowed = AllowedFolders.of(root, allow)
     skipped: list[Skipped] = []
@@ -193,19 +170,9 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[Ski
 
     If the pattern's last part has a dot, it names files, and a folder that matches is in place of one.
 
-    Parameters
-    ----------
-    root : Path
-        The folder that relative patterns start from, resolved.
-    layer : str
-        Name of the layer, for messages.
-    pattern : str
-        Relative to ``root``; absolute, or with ``..``, it names files outside.
-
-    Raises
-    ------
-    CatalogError
-        If no file matches; the message shows which files exist.
+    - `root`: the folder that relative patterns start from, resolved.
+    - `layer`: name of the layer, for messages.
+    - `pattern`: relative to ``root``; absolute, or with ``..``, it names files outside.
     """
     folder, relative = _start(root, pattern)
     try:
@@ -224,23 +191,10 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[Ski
 def glob(folder: Path, pattern: str) -> tuple[list[Path], list[tuple[Path, OSError]]]:
     """Return all that matches a glob pattern, and the folders that may hold more.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder that the pattern is relative to.
-    pattern : str
-
-    Returns
-    -------
-    paths : list of Path
-        Files, folders, and links to nothing, by name.
-    unlisted : list of (Path, OSError)
-        Folders on the pattern's way that cannot be listed, each with the error; `Path.glob` ignores them.
-
-    Raises
-    ------
-    ValueError, NotImplementedError
-        If the pattern is invalid.
+    - `folder`: folder that the pattern is relative to.
+    - `paths`: files, folders, and links to nothing, by name.
+    - `unlisted`: folders on the pattern's way that cannot be listed, each with the error; `Path.glob` ignores
+      them.
     """
     paths = sorted(folder.glob(pattern))
     return paths, list(_unlisted(folder, pattern))
@@ -368,10 +322,8 @@ def _cell(transform: Affine) -> float:
 def date_of(tags: Mapping[str, str]) -> datetime | None:
     """Return the date in a raster's tags, None if there is none.
 
-    Parameters
-    ----------
-    tags : Mapping[str, str]
-        Those of the file and of GDAL's domain IMAGERY; the acquisition goes before the writing of the image.
+    - `tags`: those of the file and of GDAL's domain IMAGERY; the acquisition goes before the writing of the
+      image.
     """
     for tag in DATE_TAGS:
         text = tags.get(tag, "").strip()
@@ -391,16 +343,7 @@ def zoned(date: datetime) -> datetime:
 def require_metric(file: RasterFile, option: str = "") -> None:
     """Check that a file's horizontal CRS is in metres, which are metres on the ground.
 
-    Parameters
-    ----------
-    file : RasterFile
-    option : str
-        Option of the command that reprojects files, for the message; empty if it has none.
-
-    Raises
-    ------
-    CatalogError
-        If it is not; the message names the command that reprojects the file.
+    - `option`: option of the command that reprojects files, for the message; empty if it has none.
     """
     unit, metres = plan_unit(file.crs)
     instead = f", or use {option} --to-crs {{zone}}" if option else ""

@@ -35,11 +35,7 @@ def alpha_band(dataset: Any) -> int | None:
 def read_valid(dataset: Any, **how: Any) -> Any:
     """Return the first band of an open raster as a masked array; cells without a value are masked.
 
-    Parameters
-    ----------
-    dataset : rasterio.DatasetReader
-    **how
-        Options of its method `read`, such as ``window``.
+    - `how`: options of its method `read`, such as ``window``.
     """
     values = dataset.read(1, masked=True, **how)
     alpha = alpha_band(dataset)

@@ -55,22 +55,10 @@ def find(
 ) -> tuple[list[VectorFile], list[Skipped]]:
     """Open vector files; return the usable ones, and the others.
 
-    Parameters
-    ----------
-    root : Path
-        The folder of the catalog's rasters.
-    given : str
-        A file, or a glob pattern relative to ``root``.
-    crs : str, optional
-        CRS of files without one.
-    sublayer : str, optional
-        Layer of files with several.
-
-    Raises
-    ------
-    CatalogError
-        If there is no such file or none can be used: it is not a vector file or has no CRS, the layer is not
-        in it, or it has several and ``sublayer`` is None.
+    - `root`: the folder of the catalog's rasters.
+    - `given`: a file, or a glob pattern relative to ``root``.
+    - `crs`: CRS of files without one.
+    - `sublayer`: layer of files with several.
     """
     root = root.resolve()
     paths, unlisted = ([Path(given)], []) if Path(given).is_file() else matching(root, "roads", given)
@@ -87,13 +75,7 @@ def find(
 
 
 def layers(path: Path) -> dict[str, str]:
-    """Return the layers with geometries of a vector file, each with its type and number of features.
-
-    Raises
-    ------
-    Refused, or one of `ERRORS`
-        If the file cannot be read as vectors.
-    """
+    """Return the layers with geometries of a vector file, each with its type and number of features."""
     file = vector_name(path)
     kinds = {name: kind for name, kind in pyogrio.list_layers(file) if kind is not None}
     counts = {name: layer_info(file, name)["features"] for name in kinds}
@@ -172,16 +154,7 @@ def with_roads(
 ) -> tuple[tuple[Tile, ...], list[Skipped]]:
     """Return the tiles with a layer ``roads`` of the files within `REACH_M` of each tile.
 
-    Returns
-    -------
-    tiles : tuple of Tile
-    far : list of Skipped
-        The files that reach no tile.
-
-    Raises
-    ------
-    CatalogError
-        If no file reaches a tile.
+    - `far`: the files that reach no tile.
     """
     if not files:
         return tuple(tiles), []

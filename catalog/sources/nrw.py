@@ -231,11 +231,6 @@ def _deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
     """Write the mean height of a cloud's bridge points per cell (float32, NaN elsewhere).
 
     Return whether there are any. A target that is not older than the cloud is kept, unless it is damaged.
-
-    Raises
-    ------
-    CatalogError
-        If the cloud cannot be read; names the file.
     """
     kept = _kept(cloud, target)
     if kept is not None:

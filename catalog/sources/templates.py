@@ -64,13 +64,7 @@ class Layout:
 
     @classmethod
     def of(cls, raw: Mapping[str, Any]) -> Layout:
-        """Return the layout of a configuration's ``dataset`` section.
-
-        Raises
-        ------
-        CatalogError
-            If a key is unknown, a value has the wrong type, or a template is invalid.
-        """
+        """Return the layout of a configuration's ``dataset`` section."""
         kinds = {
             "layers": (dict, "a mapping of layers to templates"),
             "crs": (str, "a CRS such as EPSG:25832"),

@@ -15,15 +15,7 @@ from flexroad.catalog.storage.paths import Location
 
 
 def contained(where: Location, home: Location) -> Location:
-    """Return a location in a folder.
-
-    Raises
-    ------
-    OSError
-        If it is, or lies behind, a link that leads out of the folder; names the location.
-    ValueError
-        If the location has a null byte.
-    """
+    """Return a location in a folder."""
     if isinstance(where, Path) and not _is_direct(str(where), str(home)):
         target = os.path.realpath(where)
         if not _is_below(target, os.path.realpath(str(home))):
@@ -35,10 +27,7 @@ def contained(where: Location, home: Location) -> Location:
 def links_out(folder: Location, below: bool = False) -> Iterator[Path]:
     """Yield the links in a folder that lead out of it; none if it does not exist.
 
-    Parameters
-    ----------
-    below : bool
-        Whether folders inside it are searched, too.
+    - `below`: whether folders inside it are searched, too.
     """
     if isinstance(folder, Path):
         yield from _links_out(folder, os.path.realpath(folder), below)

@@ -60,13 +60,7 @@ class StatCache:
     """Folders of buckets that were listed."""
 
     def __call__(self, where: Location) -> FileStat | None:
-        """Return a file's size and version, or None if it does not exist.
-
-        Raises
-        ------
-        OSError
-            If the storage does not answer.
-        """
+        """Return a file's size and version, or None if it does not exist."""
         if not isinstance(where, Path):
             # UPath's `parent` and `name` would take as long as all the rest.
             folder, _, name = where.path.rpartition("/")

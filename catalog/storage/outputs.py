@@ -16,12 +16,6 @@ def atomic_path(where: Path, flushed: bool = False) -> Iterator[Path]:
     """Yield a temporary file beside ``where``; rename it to ``where`` at the end of the block.
 
     With ``flushed`` the content is on the disk before the file has its name.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written, or ``where`` is no regular file (`output_file`); names ``where``. No
-        temporary file is left.
     """
     target = output_file(where)
     temporary = target.with_name(f".{target.name}.{uuid4().hex}.tmp")
@@ -41,13 +35,7 @@ def atomic_path(where: Path, flushed: bool = False) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def made_folder(where: Path) -> Iterator[None]:
-    """Make a folder and its parents if they do not exist; if the block fails, remove those that are empty.
-
-    Raises
-    ------
-    OSError
-        If it cannot be made, or is a file.
-    """
+    """Make a folder and its parents if they do not exist; if the block fails, remove those that are empty."""
     new = [folder for folder in (where, *where.parents) if not folder.exists()]
     try:
         where.mkdir(parents=True, exist_ok=True)
@@ -60,13 +48,7 @@ def made_folder(where: Path) -> Iterator[None]:
 
 
 def flush_path(path: Path) -> None:
-    """Wait until the content of a file, or the names in a folder, are on the disk.
-
-    Raises
-    ------
-    OSError
-        If the disk does not take them; names the file.
-    """
+    """Wait until the content of a file, or the names in a folder, are on the disk."""
     opened = os.open(path, os.O_RDONLY)
     try:
         os.fsync(opened)
@@ -77,14 +59,7 @@ def flush_path(path: Path) -> None:
 
 
 def output_file(where: Path) -> Path:
-    """Return the file that is written for a name: the name itself, or the file that a link points to.
-
-    Raises
-    ------
-    OSError
-        If something else than a regular file has that name: a rename would replace a device, a pipe or a
-        socket by a file.
-    """
+    """Return the file that is written for a name: the name itself, or the file that a link points to."""
     try:
         target = where.resolve() if where.is_symlink() else where
         mode = target.stat().st_mode

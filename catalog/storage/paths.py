@@ -64,15 +64,7 @@ class FileStat:
 
 
 def parse_location(where: str | Location) -> Location:
-    """Return the location given as text: a path, or s3://BUCKET/NAME.
-
-    Raises
-    ------
-    CatalogError
-        If it is an address of another kind, or in a bucket and a variable ``AWS_...`` is wrong.
-    OSError
-        If it is in a bucket and s3fs is not installed; the message gives the install command.
-    """
+    """Return the location given as text: a path, or s3://BUCKET/NAME."""
     if not isinstance(where, str | Path):
         return where
     text = str(where)
@@ -112,13 +104,7 @@ def join(folder: str, name: str) -> str:
 
 
 def normalise(name: str) -> str:
-    """Return an absolute path or address without ``..``; links are not followed.
-
-    Raises
-    ------
-    CatalogError
-        If it is an address with a user or password: it would be stored, and shown in messages.
-    """
+    """Return an absolute path or address without ``..``; links are not followed."""
     bucket = _BUCKET.match(name)
     if bucket is None:
         return os.path.normpath(name if name.startswith("/") else Path(name).absolute())
@@ -157,11 +143,6 @@ def stat(where: Location) -> FileStat | None:
     """Return a file's size and version, or None if there is no such file.
 
     Links are followed. Folders, pipes, sockets and devices are no files: reading one may never end.
-
-    Raises
-    ------
-    OSError
-        If the storage does not answer. A file on disk that cannot be accessed gives None.
     """
     if isinstance(where, Path):
         return file_stat(where)
@@ -196,11 +177,6 @@ def entries(folder: Location) -> Iterator[tuple[str, FileStat]]:
 
     Links to folders inside it are not followed. In a bucket, files come in the order of their names, in pages
     of a thousand: memory does not grow with their number.
-
-    Raises
-    ------
-    OSError
-        If the storage does not answer.
     """
     return _scan(folder, "") if isinstance(folder, Path) else _pages(folder, {})
 
@@ -235,11 +211,6 @@ def visible_entry(folder: Location, without: Collection[str] = ()) -> str | None
 
     Hidden files (``.DS_Store``), ``lost+found``, which a new disk has, and the names in ``without`` do not
     count. Of a large folder in a bucket only the first page of names is requested.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be read, or the storage does not answer.
     """
     if isinstance(folder, Path):
         try:
@@ -263,11 +234,6 @@ def sidecars(where: UPath) -> set[str]:
     """Return the names of a file in a bucket and of the files with the same stem, by one list request.
 
     Calling this before GDAL opens a file saves a dozen requests for side-car files, which are rare.
-
-    Raises
-    ------
-    OSError
-        If the storage does not answer.
     """
     folder = where.parent
     with named(where):
@@ -283,13 +249,7 @@ def exists(where: Location) -> bool:
 
 
 def read(where: Location) -> bytes:
-    """Return a file's bytes; in a bucket, by one request.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be read, FileNotFoundError if it does not exist; names the file.
-    """
+    """Return a file's bytes; in a bucket, by one request."""
     if isinstance(where, Path):
         if not where.is_file() and not where.is_dir() and where.exists():
             # To open a pipe would wait for a writer.
@@ -301,13 +261,7 @@ def read(where: Location) -> bytes:
 
 
 def fetch(where: UPath, folder: Path) -> Path:
-    """Copy a file of a bucket and its side-car files into a folder; return the path of the copy.
-
-    Raises
-    ------
-    OSError
-        If the file does not exist, or the storage does not answer.
-    """
+    """Copy a file of a bucket and its side-car files into a folder; return the path of the copy."""
     for name in {where.name, *sidecars(where)}:
         source = where.parent / name
         with named(source):
@@ -319,11 +273,6 @@ def write(where: Location, data: bytes, flushed: bool = False) -> None:
     """Write a file atomically: to a temporary file that is then renamed, or in a bucket by one request.
 
     With ``flushed`` the content is on the disk before the file has its name.
-
-    Raises
-    ------
-    OSError
-        If the disk is full or the folder cannot be written; names the file. No temporary file is left.
     """
     if not isinstance(where, Path):
         # A file appears in a bucket only when it is complete.
@@ -336,13 +285,7 @@ def write(where: Location, data: bytes, flushed: bool = False) -> None:
 
 
 def flush(where: Location) -> None:
-    """Wait until the content of a file, or the names in a folder, are on the disk; nothing in a bucket.
-
-    Raises
-    ------
-    OSError
-        If the disk does not take them; names the file.
-    """
+    """Wait until the content of a file, or the names in a folder, are on the disk; nothing in a bucket."""
     if isinstance(where, Path):
         flush_path(where)
 
@@ -373,13 +316,7 @@ def remove(where: Location) -> None:
 
 
 def check_writable(folder: Location) -> None:
-    """Check that files can be written in ``folder``.
-
-    Raises
-    ------
-    OSError
-        If not; with the reason and the path.
-    """
+    """Check that files can be written in ``folder``."""
     probe = folder / f"{PROBE}{uuid4().hex}"
     write(probe, b"")
     remove(probe)

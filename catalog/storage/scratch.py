@@ -96,13 +96,7 @@ def _folders(parent: Path | None = None) -> Iterator[Path]:
 
 
 def _held(folder: Path) -> int | None:
-    """Return the descriptor of the locked file of a new folder, None if there can be none.
-
-    Raises
-    ------
-    FileNotFoundError, BlockingIOError
-        If another process removes the folder, which it may until the lock is held.
-    """
+    """Return the descriptor of the locked file of a new folder, None if there can be none."""
     try:
         opened = os.open(folder / LOCK, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
     except FileNotFoundError:

@@ -19,13 +19,7 @@ _YES = ("YES", "TRUE", "ON", "1")
 
 
 def s3_options() -> dict[str, Any]:
-    """Return the options of s3fs; it reads credentials and region itself, as AWS programs do.
-
-    Raises
-    ------
-    CatalogError
-        If a variable has a value that cannot be used; the message gives the remedy.
-    """
+    """Return the options of s3fs; it reads credentials and region itself, as AWS programs do."""
     config: dict[str, Any] = {
         # The other modes limit the retries per process; a long run would use them up.
         "retries": {"total_max_attempts": _tries(), "mode": os.environ.get("AWS_RETRY_MODE") or "legacy"},

@@ -48,36 +48,18 @@ class StagedFile:
         self._pause = PUT_S
 
     def fetch(self) -> None:
-        """Download the file; do nothing if it does not exist.
-
-        Raises
-        ------
-        OSError
-            If the storage does not answer.
-        """
+        """Download the file; do nothing if it does not exist."""
         if self._folder:
             with contextlib.suppress(FileNotFoundError):
                 self.path.write_bytes(read(self.where))
 
     def sync_if_due(self) -> None:
-        """Upload the file if the last upload is long enough ago.
-
-        Raises
-        ------
-        OSError
-            If the storage does not answer.
-        """
+        """Upload the file if the last upload is long enough ago."""
         if self._folder and time.monotonic() - self._put > self._pause:
             self.put()
 
     def put(self) -> None:
-        """Upload the file.
-
-        Raises
-        ------
-        OSError
-            If the storage does not answer.
-        """
+        """Upload the file."""
         if self.writable and self._folder and self.path.exists():
             start = time.monotonic()
             write(self.where, self.path.read_bytes())
@@ -96,11 +78,6 @@ def atomic_file(where: Location, flushed: bool = False) -> Iterator[Path]:
     """Yield a local file to write; at the end of the block, move or upload it to ``where``.
 
     With ``flushed`` the content is on the disk before the file has its name.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; names ``where``. No temporary file is left.
     """
     if not isinstance(where, Path):
         with ScratchFolder() as folder:

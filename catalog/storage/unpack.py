@@ -28,22 +28,10 @@ def unpack(archive: Path, sha256: str, progress: Progress, told: Callable[[str],
 
     A folder that is there is complete: it gets its name when all files are in it.
 
-    Parameters
-    ----------
-    archive : Path
-        The zip file.
-    sha256 : str
-        Checksum of the published file.
-    progress : callable
-        Shows how far the checksum and the unpacking are.
-    told : callable
-        Takes a line that says how much is unpacked where, or that the folder is there.
-
-    Raises
-    ------
-    CatalogError
-        If the file is no complete zip file, would unpack to an unlikely size or outside the folder, does not
-        fit on the disk, has another checksum, or is damaged.
+    - `archive`: the zip file.
+    - `sha256`: checksum of the published file.
+    - `progress`: shows how far the checksum and the unpacking are.
+    - `told`: takes a line that says how much is unpacked where, or that the folder is there.
     """
     target = archive.with_suffix("")
     if target.is_dir():

@@ -44,12 +44,7 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
     is read. Some tiles, with those of doubtful files first, are read as the run would (`trials`), and their
     DSM and DTM are compared (`height_findings`).
 
-    Parameters
-    ----------
-    tiles : sequence of Tile
-    config : Config
-    layers : collection of str
-        The layers whose files are looked up.
+    - `layers`: the layers whose files are looked up.
     """
     unusable = [tile for tile in tiles if tile.fault]
     for tile in unusable[:MAX_SHOWN]:

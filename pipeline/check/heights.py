@@ -23,10 +23,7 @@ MOST_ROAD = 0.9
 def height_findings(trials: Sequence[Trial]) -> Iterator[Finding]:
     """Yield what DSM and DTM say of each other: a line on units, and one on an offset or a step.
 
-    Parameters
-    ----------
-    trials : sequence of Trial
-        Some tiles of a catalog.
+    - `trials`: some tiles of a catalog.
     """
     converted = sorted({note for tile in trials for note in tile.units})
     yield from (Finding(f"{note}: if they are in metres, correct the unit") for note in converted)
@@ -52,12 +49,8 @@ def road_is_off(row: Mapping[str, Any]) -> bool:
 def road_step(rows: Iterable[Mapping[str, Any]], tiles: int) -> Iterator[str]:
     """Yield a line if the road of some tiles lies above the DTM as a whole, and one if it lies below.
 
-    Parameters
-    ----------
-    rows : iterable of Mapping
-        Metrics of these tiles (`road_is_off`).
-    tiles : int
-        Number of tiles of the run.
+    - `rows`: metrics of these tiles (`road_is_off`).
+    - `tiles`: number of tiles of the run.
     """
     off = [row["off_dtm_m"] for row in rows]
     for side, metres in (("above", [m for m in off if m > 0]), ("below", [-m for m in off if m < 0])):

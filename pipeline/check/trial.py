@@ -52,24 +52,12 @@ def trials(
 ) -> tuple[list[Trial], list[Finding]]:
     """Read some tiles as the stages of a run do, up to the road mask and the splines.
 
-    Parameters
-    ----------
-    tiles : sequence of Tile
-        Usable tiles; some of them are read (`MOST_TILES`).
-    config : Config
-        Configuration of the run.
-    named : collection of str
-        Tiles of which something else was found: they are left out.
-    doubtful : collection of str
-        Tiles with a file that may fail: they come first.
-    absent : collection of str
-        Files that are missing or closed, which have been named.
-
-    Returns
-    -------
-    read : list of Trial
-    faults : list of Finding
-        A line for each error, with the tiles that it would fail.
+    - `tiles`: usable tiles; some of them are read (`MOST_TILES`).
+    - `config`: configuration of the run.
+    - `named`: tiles of which something else was found: they are left out.
+    - `doubtful`: tiles with a file that may fail: they come first.
+    - `absent`: files that are missing or closed, which have been named.
+    - `faults`: a line for each error, with the tiles that it would fail.
     """
     chains = _chains(config)
     read, errors = list[Trial](), defaultdict[str, list[str]](list)
@@ -100,13 +88,7 @@ def _chains(config: Config) -> list[Mapping[str, Any]]:
 
 
 def _trial(tile: Tile, chain: Mapping[str, Any]) -> Trial:
-    """Return what the first stages read of a tile.
-
-    Raises
-    ------
-    TaskError
-        As of these stages.
-    """
+    """Return what the first stages read of a tile."""
     data = load.load(tile, chain["load"])
     road = data.road_mask
     if "roads" in getattr(stage_module(chain["segment"]), "READS", ()):

@@ -67,23 +67,11 @@ def plan(
     the store, else ``to do``. Nodes that are never stored (the rasters that `load` reads) are computed again
     when a later node needs them.
 
-    Parameters
-    ----------
-    run : Run
-        The run, which need not exist yet (`Run.planned`).
-    tiles : collection of Tile
-        The selected tiles.
-    verdict : Verdict
-        Is filled in.
-    verbose : bool
-        Whether each tile also has a line per node.
-    workers : int, optional
-        Largest number of worker processes; by default that of the configuration.
-
-    Raises
-    ------
-    ConfigError
-        As of the run, if each of several tiles lacks a file.
+    - `run`: the run, which need not exist yet (`Run.planned`).
+    - `tiles`: the selected tiles.
+    - `verdict`: is filled in.
+    - `verbose`: whether each tile also has a line per node.
+    - `workers`: largest number of worker processes; by default that of the configuration.
     """
     place, totals, reasons = RunPlace.of(run), Counter[tuple[str, str]](), Counter[Kind]()
     todo: list[Tile] = []

@@ -35,13 +35,7 @@ def raise_open_files() -> None:
 
 
 def check(command: str | None) -> None:
-    """Check that the limits are large enough for a command.
-
-    Raises
-    ------
-    ConfigError
-        If they are not; names the limit, its value and the remedy.
-    """
+    """Check that the limits are large enough for a command."""
     if command not in COMPUTING:
         return
     files, space = _limit(resource.RLIMIT_NOFILE), _limit(resource.RLIMIT_AS)

@@ -17,14 +17,9 @@ from flexroad.pipeline.run.record import check_inputs
 def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] = ()) -> str:
     """Return the command that runs a catalog, ready to be pasted, or what a run lacks.
 
-    Parameters
-    ----------
-    path : Path
-        The catalog's file.
-    config : str, optional
-        The configuration; default: the one for production that fits the catalog's layers.
-    changes : sequence of str
-        Values of ``--set``.
+    - `path`: the catalog's file.
+    - `config`: the configuration; default: the one for production that fits the catalog's layers.
+    - `changes`: values of ``--set``.
     """
     catalog = Catalog.read(path)
     name = config or fitting_config(catalog)

@@ -38,17 +38,8 @@ class Document:
 def parse(data: bytes, name: str) -> Document:
     """Return the content of a YAML file.
 
-    Parameters
-    ----------
-    data : bytes
-        The file's bytes, in UTF-8.
-    name : str
-        The file's name, for messages.
-
-    Raises
-    ------
-    ConfigError
-        If it is not YAML in UTF-8, has equal keys in one mapping, or is above the limits of this module.
+    - `data`: the file's bytes, in UTF-8.
+    - `name`: the file's name, for messages.
     """
     if len(data) > MAX_BYTES:
         raise ConfigError(f"{name}: {len(data)} bytes; a configuration has at most {MAX_BYTES}")

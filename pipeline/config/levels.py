@@ -12,13 +12,7 @@ HALO_M = 40.0
 
 
 def check_levels(chain: Mapping[str, Any], where: str) -> None:
-    """Check that the stages of a variant can compute levels, if its segmentation has them.
-
-    Raises
-    ------
-    ConfigError
-        If one of them cannot; the line says which option helps.
-    """
+    """Check that the stages of a variant can compute levels, if its segmentation has them."""
     if not getattr(chain["segment"], "levels", False):
         return
     load, sample = chain["load"], chain["sample"]

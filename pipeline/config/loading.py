@@ -52,19 +52,9 @@ def load_config(
 ) -> Config:
     """Read a configuration by shipped name or by file name.
 
-    Parameters
-    ----------
-    name : str or Path
-    settings : sequence of str, or mapping
-        Options that replace those of the file: ``["fit.spacing_m=5"]`` or ``{"fit": {"spacing_m": 5}}``. They
-        are a part of the configuration's name, so that no result looks like one of the file alone.
-    base : str
-        What a file without ``extends`` extends.
-
-    Raises
-    ------
-    ConfigError
-        If no such configuration exists, or a key or value is invalid; one line per error.
+    - `settings`: options that replace those of the file: ``["fit.spacing_m=5"]`` or ``{"fit": {"spacing_m":
+      5}}``. They are a part of the configuration's name, so that no result looks like one of the file alone.
+    - `base`: what a file without ``extends`` extends.
     """
     config = compose(_raw(name, base), str(name))
     if not settings:
@@ -75,13 +65,7 @@ def load_config(
 
 
 def compose(raw: Mapping[str, Any], name: str) -> Config:
-    """Validate a configuration that extends no other; ``name`` identifies it in error messages.
-
-    Raises
-    ------
-    ConfigError
-        If a key or value is invalid; one line per error.
-    """
+    """Validate a configuration that extends no other; ``name`` identifies it in error messages."""
     stages = list(stage_models())
     raw = {"extends": ROOT, **raw}
     if raw["extends"] != ROOT:
@@ -125,13 +109,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
 
 
 def read_mapping(data: bytes, name: str) -> dict[str, Any]:
-    """Return the mapping in a configuration file's bytes, with ``extends`` as it is written.
-
-    Raises
-    ------
-    ConfigError
-        If it is not a mapping in YAML.
-    """
+    """Return the mapping in a configuration file's bytes, with ``extends`` as it is written."""
     return _mapping_of(document.parse(data, name), name)
 
 

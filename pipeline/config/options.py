@@ -27,14 +27,10 @@ MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of t
 def option(default: Any, heading: str, help: str, metavar: str | None = None, **more: Any) -> Any:
     """Return a field of a dataclass, of which `pipeline.cli.options.with_options` makes an option.
 
-    Parameters
-    ----------
-    default
-        Of the field; `dataclasses.MISSING` if it is required. A field that is True by default becomes a flag
-        ``--no-...``, whose help says what is left out.
-    heading, help, metavar : str
-        Of the help page: where the option stands, its meaning, and the word for its value.
-    **more
-        Limits, ``min`` and ``max``; ``name``, if it is not that of the field without its unit.
+    - `default`: of the field; `dataclasses.MISSING` if it is required. A field that is True by default
+      becomes a flag ``--no-...``, whose help says what is left out.
+    - `heading`, `help`, `metavar`: of the help page: where the option stands, its meaning, and the word for
+      its value.
+    - `more`: limits, ``min`` and ``max``; ``name``, if it is not that of the field without its unit.
     """
     return field(default=default, metadata={"heading": heading, "help": help, "metavar": metavar, **more})

@@ -27,13 +27,7 @@ class Setting:
 
     @classmethod
     def parse(cls, text: str) -> Setting:
-        """Return the setting in ``KEY=VALUE``; the value is YAML within the limits of `document`.
-
-        Raises
-        ------
-        ConfigError
-            If there is no key or value, or the value cannot be read.
-        """
+        """Return the setting in ``KEY=VALUE``; the value is YAML within the limits of `document`."""
         key, equals, value = text.partition("=")
         keys = tuple(key.split("."))
         if not equals or not all(keys):
@@ -49,13 +43,7 @@ class Setting:
 
 
 def texts(settings: Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Return settings as ``KEY=VALUE``, also those of a mapping.
-
-    Raises
-    ------
-    ConfigError
-        If a value has no text in YAML.
-    """
+    """Return settings as ``KEY=VALUE``, also those of a mapping."""
     if isinstance(settings, str):
         return [settings]
     if not isinstance(settings, Mapping):
@@ -81,11 +69,6 @@ def applied(raw: Mapping[str, Any], settings: Sequence[Setting]) -> dict[str, An
     """Return a configuration with changed options; equal keys take the last value.
 
     Methods are set first: another method starts from its own defaults, in whatever order they are given.
-
-    Raises
-    ------
-    ConfigError
-        If a key leads into an option that has no options of its own.
     """
     changed = dict(raw)
     for setting in sorted(settings, key=lambda setting: not setting.selects_method):
@@ -111,19 +94,9 @@ def _assigned(
 def merge(base: Any, override: Any, tag: str | None, where: str) -> dict[str, Any]:
     """Merge an override into options, also those within options; another method replaces all.
 
-    Parameters
-    ----------
-    base, override : dict, str, bool or None
-        Options, or the method alone.
-    tag : str or None
-        The option that a single word sets, such as ``method``; None if there is none.
-    where : str
-        The place in the configuration, for messages.
-
-    Raises
-    ------
-    ConfigError
-        If one of them is neither.
+    - `base`, `override`: options, or the method alone.
+    - `tag`: the option that a single word sets, such as ``method``; None if there is none.
+    - `where`: the place in the configuration, for messages.
     """
     options, changes = tagged(base, tag, where), tagged(override, tag, where)
     if tag in changes and tag in options and changes[tag] != options[tag]:
@@ -139,13 +112,7 @@ def _merged(base: Any, key: str, value: Any, where: str) -> Any:
 
 
 def tagged(options: Any, tag: str | None, where: str) -> dict[str, Any]:
-    """Return options as a mapping, also if they are only the name of a method.
-
-    Raises
-    ------
-    ConfigError
-        If they are neither.
-    """
+    """Return options as a mapping, also if they are only the name of a method."""
     if options is None:
         return {}
     # YAML reads a bare `off` as false.

@@ -53,14 +53,10 @@ class Jobs(Generic[J]):
 def estimate(times: Sequence[float], known_s: float | None) -> tuple[float | None, bool]:
     """Return the CPU time of one more job (s), None if unknown, and whether `ENOUGH` jobs were measured.
 
-    Parameters
-    ----------
-    times : sequence of float
-        CPU times (s) of the jobs done in this process, in their order. The first job also loads libraries, so
-        it is not counted. A later one may load what the first did not need, so the longest is not counted
-        either: one job alone never decides.
-    known_s : float, optional
-        Median time in an earlier run (s), which holds before jobs were measured.
+    - `times`: CPU times (s) of the jobs done in this process, in their order. The first job also loads
+      libraries, so it is not counted. A later one may load what the first did not need, so the longest is not
+      counted either: one job alone never decides.
+    - `known_s`: median time in an earlier run (s), which holds before jobs were measured.
     """
     measured = sorted(times[1:])
     if len(measured) < 2:

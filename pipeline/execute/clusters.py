@@ -70,11 +70,6 @@ def open_cluster(
     """Connect to, start or request a cluster; on exit, stop it if it was started here.
 
     ``logs`` is the folder for the output of SLURM jobs, and ``say`` prints one line about them.
-
-    Raises
-    ------
-    ConfigError
-        If a package or program is not installed, or the cluster cannot be started.
     """
     if scheduler:
         _check_certificates(scheduler)
@@ -105,13 +100,7 @@ def open_cluster(
 
 
 def _check_certificates(scheduler: str) -> None:
-    """Check that Dask has the certificates for an address.
-
-    Raises
-    ------
-    ConfigError
-        If it has none, or cannot load them.
-    """
+    """Check that Dask has the certificates for an address."""
     names = "distributed.comm.tls.ca-file, distributed.comm.tls.client.cert and .key"
     try:
         missing = Security().get_connection_args("client")["ssl_context"] is None
@@ -131,11 +120,6 @@ def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
     """Open a cluster of single-threaded processes on this machine.
 
     It listens on the loopback interface only.
-
-    Raises
-    ------
-    ConfigError
-        If the processes cannot be started.
     """
     workers = workers_here(cluster)
     with ScratchFolder() as scratch, contextlib.ExitStack() as stack:
@@ -166,13 +150,7 @@ def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def connected(target: ClusterTarget, dashboard: bool, say: Callable[[str], None]) -> Iterator[Client]:
-    """Connect to a cluster and wait for its first worker; say the address of the dashboard if it is wanted.
-
-    Raises
-    ------
-    ConfigError
-        If the scheduler does not answer, or no worker comes.
-    """
+    """Connect to a cluster and wait for its first worker; say the dashboard's address if it is wanted."""
     make = partial(Client, target.target, timeout=ANSWER_S, set_as_default=False)
     with contextlib.ExitStack() as stack:
         try:

@@ -21,13 +21,7 @@ ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?([^\s:/@\[\]]+|\[[^\s/\[\]]+\])
 
 
 def check_address(address: str) -> None:
-    """Check that a text is the address of a scheduler.
-
-    Raises
-    ------
-    ConfigError
-        If it is not.
-    """
+    """Check that a text is the address of a scheduler."""
     if not ADDRESS.fullmatch(address):
         raise ConfigError(
             f"{without_credentials(address)!r} is no address of a Dask scheduler; give its host and port, as "

@@ -127,15 +127,7 @@ class Session(Generic[J, R]):
         """Time for which checks found no workers (s); None if there are workers."""
 
     def results(self) -> Iterator[R]:
-        """Yield results as jobs finish, until nothing is left to do.
-
-        Raises
-        ------
-        ClusterLost
-            If the connection to the scheduler broke, or there was no worker for ``patience_s``.
-        ConfigError
-            If no worker passes its check for ``patience_s``, or all die for memory before a job is done.
-        """
+        """Yield results as jobs finish, until nothing is left to do."""
         while True:
             self._check_cluster()
             self._submit_jobs()
@@ -266,13 +258,7 @@ class Session(Generic[J, R]):
                 yield result
 
     def _result(self, future: Future) -> Any:
-        """Return the result of a finished job.
-
-        Raises
-        ------
-        OSError
-            If its worker died before. Dask would wait for another one, also if no other may run the job.
-        """
+        """Return the result of a finished job."""
         while True:
             try:
                 return future.result(TICK_S)

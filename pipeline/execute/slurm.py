@@ -69,13 +69,7 @@ class SlurmJobs:
         return not self.cluster.worker_spec
 
     def start(self, number: int) -> None:
-        """Submit jobs.
-
-        Raises
-        ------
-        ConfigError
-            If SLURM takes none of them.
-        """
+        """Submit jobs."""
         try:
             start_workers(self.cluster, number)
         except RuntimeError as error:
@@ -141,13 +135,7 @@ class SlurmJobs:
 def slurm(
     cluster: Cluster, dashboard: bool, logs: Path | None, say: Callable[[str], None]
 ) -> Iterator[SlurmJobs]:
-    """Open a cluster of SLURM jobs, whose output is written to the folder ``logs``.
-
-    Raises
-    ------
-    ConfigError
-        If dask-jobqueue or SLURM is not installed, or SLURM takes no job.
-    """
+    """Open a cluster of SLURM jobs, whose output is written to the folder ``logs``."""
     jobqueue = load_jobqueue()
     for program in ("sbatch", "squeue", "scancel"):
         if shutil.which(program) is None:

@@ -99,13 +99,7 @@ def bytes_of_worker(cluster: Cluster) -> int:
 
 
 def load_jobqueue() -> Any:
-    """Return the module dask_jobqueue.
-
-    Raises
-    ------
-    ConfigError
-        If it is not installed.
-    """
+    """Return the module dask_jobqueue."""
     interrupt = signal.getsignal(signal.SIGINT)
     try:
         return importlib.import_module("dask_jobqueue")

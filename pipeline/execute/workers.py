@@ -71,19 +71,10 @@ class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
     def admit(self, packed: bytes, accepted: bool) -> tuple[str, Any]:
         """Check the worker, once, with its first job.
 
-        Parameters
-        ----------
-        packed : bytes
-            The pickled call of `work`.
-        accepted : bool
-            Whether the client has accepted the proof of this worker.
-
-        Returns
-        -------
-        fault : str
-            Why the worker cannot do the jobs, empty if it can.
-        proof : object
-            What the client has to accept before the worker does a job, None if it may do jobs.
+        - `packed`: the pickled call of `work`.
+        - `accepted`: whether the client has accepted the proof of this worker.
+        - `fault`: why the worker cannot do the jobs, empty if it can.
+        - `proof`: what the client has to accept before the worker does a job, None if it may do jobs.
         """
         with self._lock:
             self._accepted = self._accepted or accepted
@@ -239,15 +230,7 @@ class Admission:
 
 
 def check_workers(client: Client, cluster: str, probe: Probe | None) -> str:
-    """Compare the versions that pickling needs, register the plugins; return the name of the `WorkerCheck`.
-
-    Raises
-    ------
-    ConfigError
-        If a process has other versions of these, or cannot load flexroad.
-    ClusterLost
-        If the scheduler no longer answers.
-    """
+    """Compare versions that pickling needs, register plugins; return the name of the `WorkerCheck`."""
     here = versions()
     name = uuid.uuid4().hex[:8]
     try:
@@ -281,13 +264,7 @@ def _register(client: Client, plugin: Any, name: str) -> None:
 
 
 def _compare(client: Client, here: dict[str, str]) -> None:
-    """Compare the versions that Dask reports: with very different ones no plugin could be unpickled.
-
-    Raises
-    ------
-    ConfigError
-        If the versions of the scheduler or of a worker differ from those here.
-    """
+    """Compare the versions that Dask reports: with very different ones no plugin could be unpickled."""
     here = {name: here[name] for name in PICKLING}
     reported = client.get_versions(packages=list(PICKLING[1:]))
     _compare_process("the scheduler", reported["scheduler"], here)

@@ -98,14 +98,7 @@ def _described(
 
 
 def check_tiles(config: Config, catalog: Catalog) -> None:
-    """Check that tiles which meet can have one surface, if a fit joins them.
-
-    Raises
-    ------
-    ConfigError
-        If two of them differ in size, cell or lattice (the message names both), if control points act
-        farther than catalogs list files, or if they are closer than cells.
-    """
+    """Check that tiles which meet can have one surface, if a fit joins them."""
     joined = [chain["fit"] for chain in config.chains.values() if has_borders(chain["fit"])]
     tiles = catalog.usable
     if not joined or not tiles:

@@ -115,10 +115,7 @@ class TileGraph:
     def renamed(self, names: Mapping[str, str]) -> TileGraph:
         """Return the graph of results of which some were computed without a file that could not be used.
 
-        Parameters
-        ----------
-        names : mapping of str
-            The names of these results, by fingerprint here (`Evaluator.renamed`).
+        - `names`: the names of these results, by fingerprint here (`Evaluator.renamed`).
         """
         if not names:
             return self
@@ -228,14 +225,9 @@ class Pattern:
     ) -> TileGraph:
         """Return the graph of one tile.
 
-        Parameters
-        ----------
-        checksum : bool
-            Hash the bytes of the source files instead of size and time.
-        stat_file : callable
-            Returns size and version of a source file, None if it does not exist.
-        recorded : sequence
-            `TileGraph.sources` of an earlier graph, used for files that no longer exist.
+        - `checksum`: hash the bytes of the source files instead of size and time.
+        - `stat_file`: returns size and version of a source file, None if it does not exist.
+        - `recorded`: `TileGraph.sources` of an earlier graph, used for files that no longer exist.
         """
         own = tile.within(tile.grid.buffered(self.halo_m).bounds)
         sources = SourceFiles(tile, stat_file, checksum, recorded)

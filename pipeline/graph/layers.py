@@ -52,14 +52,7 @@ def without_photo(tiles: Sequence[Tile], config: Config) -> list[str]:
 
 
 def check_layers(config: Config, catalog: Catalog) -> None:
-    """Check that the catalog has every layer that the configuration needs, on one tile at least.
-
-    Raises
-    ------
-    ConfigError
-        If no tile has such a layer: then all of them would fail; or if no mesh would have the texture that
-        the configuration wants. The message names the remedies.
-    """
+    """Check that the catalog has every layer that the configuration needs, on one tile at least."""
     tiles = catalog.usable
     for layer, stage, ids in lacking(tiles, config):
         if len(ids) == len(tiles):

@@ -61,13 +61,7 @@ TYPES = {"float32": "Float32", "uint8": "Byte"}
 
 
 def write_collection(run: Run, done: Sequence[Tile]) -> None:
-    """Write the mosaics and the collection of the done tiles; without any, remove older files.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be written.
-    """
+    """Write the mosaics and the collection of the done tiles; without any, remove older files."""
     mosaics = write_mosaics(run, done)
     if not done:
         remove(run.path / COLLECTION)
@@ -142,11 +136,6 @@ def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
     Their kinds are returned.
 
     Tiles without a common lattice, or without exported rasters, give none; older files are then removed.
-
-    Raises
-    ------
-    OSError
-        If one cannot be written.
     """
     grid = Grid.holding([tile.grid for tile in done]) if "cog" in run.config.export.formats else None
     written = []
@@ -201,11 +190,8 @@ def _write_vrt(
 ) -> None:
     """Write a mosaic of one kind of raster, and on disk its style: in a bucket QGIS would not look for it.
 
-    Parameters
-    ----------
-    own : Mapping of str to str, optional
-        Names of the files of tiles that have one of this kind, by tile; the others have the heights of their
-        highest level. By default all tiles have one.
+    - `own`: names of the files of tiles that have one of this kind, by tile; the others have the heights of
+      their highest level. By default all tiles have one.
     """
     variant, flush = run.config.export.variants[0], run.config.cluster.flush
     with atomic_file(run.path / vrt_name(kind), flush) as local, local.open("w", encoding="utf-8") as file:
@@ -285,11 +271,6 @@ def write_states(run: Run, where: Location) -> None:
     ``error``, the reason of a failure; ``seconds``, the computing time; ``error_estimate_m``, the error
     estimate of the surface exported first (m); ``flags``, its flags, such as ``no-road``; ``finished``, the
     time of completion.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
     """
     variant = run.config.export.variants[0]
     places, flush = shapely.to_geojson(outlines(run.catalog.tiles)), run.config.cluster.flush

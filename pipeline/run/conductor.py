@@ -75,19 +75,8 @@ class Selection:
     ) -> tuple[Catalog, Catalog]:
         """Read a catalog and select tiles for the run at ``path``.
 
-        Returns
-        -------
-        run : Catalog
-            The tiles of the run, also those of earlier partial runs.
-        selected : Catalog
-            The tiles to bring up to date.
-
-        Raises
-        ------
-        CatalogError
-            If the catalog cannot be read, has no such tiles, or names files outside the allowed folders.
-        ConfigError
-            If no tile is selected.
+        - `run`: the tiles of the run, also those of earlier partial runs.
+        - `selected`: the tiles to bring up to date.
         """
         whole = Catalog.read(catalog, allow)
         check_allowed(whole, layers_read(config))
@@ -130,28 +119,12 @@ def created(
 ) -> Iterator[Prepared]:
     """Hold a new or an existing run of a catalog while its tiles are brought up to date.
 
-    Parameters
-    ----------
-    path : Location
-        The run's folder: new, empty, or of a run, which is resumed.
-    catalog : Location
-        The catalog's file.
-    selection : Selection
-        Its tiles to process.
-    store : Location, optional
-        Folder of stage results that several runs share; by default a folder of the run.
-    checksum : bool
-        Whether changed sources are detected by their content, not by size and time.
-    allow : sequence
-        Folders besides the catalog's that its files may lie below.
-
-    Raises
-    ------
-    ConfigError
-        If the folder has other files or cannot be written, another process works on it, or no tile is
-        selected.
-    CatalogError
-        As of `Selection.of`.
+    - `path`: the run's folder: new, empty, or of a run, which is resumed.
+    - `catalog`: the catalog's file.
+    - `selection`: its tiles to process.
+    - `store`: folder of stage results that several runs share; by default a folder of the run.
+    - `checksum`: whether changed sources are detected by their content, not by size and time.
+    - `allow`: folders besides the catalog's that its files may lie below.
     """
     observer = observer or Observer()
     with observer.working(f"reading {catalog}"):
@@ -179,27 +152,13 @@ def reopened(
 ) -> Iterator[Prepared]:
     """Hold an existing run while its tiles are brought up to date.
 
-    Parameters
-    ----------
-    path : Location
-        The run's folder.
-    tiles : sequence of str
-        Ids of the tiles to process; none given: all, or the failed ones.
-    failed : bool
-        Whether the tiles that failed are processed.
-    from_stage : str, optional
-        Stage that is computed again, with all later ones; ``export``: only the products are written again.
-    settings : sequence of str
-        Options of the workers: ``cluster.memory=8 GiB``.
-    allow : sequence
-        Folders besides the run's that its files may lie below.
-
-    Raises
-    ------
-    ConfigError
-        If the folder is no run or another process works on it.
-    CatalogError
-        If its catalog is damaged, has no such tile, or names files outside the allowed folders.
+    - `path`: the run's folder.
+    - `tiles`: ids of the tiles to process; none given: all, or the failed ones.
+    - `failed`: whether the tiles that failed are processed.
+    - `from_stage`: stage that is computed again, with all later ones; ``export``: only the products are
+      written again.
+    - `settings`: options of the workers: ``cluster.memory=8 GiB``.
+    - `allow`: folders besides the run's that its files may lie below.
     """
     observer = observer or Observer()
     with _locked(path, observer) as died:
@@ -215,20 +174,7 @@ def process(prepared: Prepared, verify: bool = False) -> Summary:
 
     A tile that fails is counted, and does not stop the others.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    verify : bool
-        See `run_tiles`.
-
-    Raises
-    ------
-    ConfigError
-        As of `run_tiles`, or if no worker can do the tiles.
-    ClusterLost
-        If the workers are lost; what was done before is kept.
-    OSError
-        If a file of the run cannot be written.
+    - `verify`: see `run_tiles`.
     """
     run, observer = prepared.run, prepared.observer
     observer.start(len(run.catalog.tiles), sum(map(prepared.only, run.catalog.tiles)))
@@ -252,11 +198,6 @@ def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile
     """Return a filter for the tiles of a rerun: the given tiles, the failed ones, both, or all.
 
     With the failed ones go the tiles that were made without a file.
-
-    Raises
-    ------
-    CatalogError
-        If a tile is not in the run's catalog.
     """
     folders = Folders(run.path)
     ids = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
@@ -314,17 +255,7 @@ def with_workers(run: Run, settings: Sequence[str]) -> Run:
     Those of RUN/config.yaml that can start programs (`Cluster.programs`) count only if they are sealed: the
     run may come from anyone.
 
-    Parameters
-    ----------
-    run : Run
-    settings : sequence of str
-        Options of the command line: ``cluster.workers=8``.
-
-    Raises
-    ------
-    ConfigError
-        If a setting is not of the workers or is invalid, or an option that can start programs is neither
-        sealed nor among the settings.
+    - `settings`: options of the command line: ``cluster.workers=8``.
     """
     parsed = [Setting.parse(text) for text in settings]
     for setting in parsed:

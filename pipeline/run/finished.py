@@ -59,15 +59,7 @@ COMPUTED_AGAIN = "it was computed again while it was exported; export again"
 def open_variant(
     path: Location | str, variant: str | None = None, allow: Sequence[str | Path] = ()
 ) -> tuple[Run, str]:
-    """Open a run, and return it with the variant whose results are used; by default the first one exported.
-
-    Raises
-    ------
-    ConfigError
-        If the folder is no run (`Run.open`), or has no such variant.
-    CatalogError
-        If its catalog is damaged.
-    """
+    """Return an opened run with the variant whose results are used; by default the first one exported."""
     run = Run.open(path, allow)
     variant = variant or run.config.export.variants[0]
     if variant not in run.config.chains:
@@ -180,13 +172,7 @@ class RunPlace:
         return (DONE, file.size, file.version) if file else None
 
     def graph(self, tile: Tile, snapshot: Snapshot) -> TileGraph:
-        """Return the graph of a finished tile; sources that no longer exist count as recorded.
-
-        Raises
-        ------
-        ConfigError
-            If the tile has another graph now.
-        """
+        """Return the graph of a finished tile; sources that no longer exist count as recorded."""
         graph = self.pattern.graph(tile, self.checksum)
         if graph.fingerprint != snapshot.fingerprint and (record := self._record(tile.id)):
             if any_file_missing(graph):
@@ -327,23 +313,11 @@ class FinishedTile:
 
     @cached_property
     def graph(self) -> TileGraph:
-        """The graph of the tile, made again from the files that it had when it was finished.
-
-        Raises
-        ------
-        ConfigError
-            If the tile has another graph now.
-        """
+        """The graph of the tile, made again from the files that it had when it was finished."""
         return self.evaluator.graph if self.evaluator else self.place.graph(self.tile, self.snapshot)
 
     def check_unchanged(self) -> None:
-        """Check that the run has not written the tile again since its state was checked.
-
-        Raises
-        ------
-        ConfigError
-            If it has.
-        """
+        """Check that the run has not written the tile again since its state was checked."""
         if self.place.marker(self.id) != self.snapshot.marker:
             raise ConfigError(f"{self.label}: {COMPUTED_AGAIN}")
 

@@ -53,22 +53,10 @@ def exclusive(
 ) -> Iterator[list[Run]]:
     """Lock all other runs of this run's store; a context manager that gives all runs, this one first.
 
-    Parameters
-    ----------
-    run : Run
-        The run; the caller holds its lock.
-    without : sequence of Location
-        Runs to ignore because they no longer exist.
-    notify : callable
-        Receives one line when the lock of a dead process is taken over.
-    allow : sequence of str
-        See `Run.open`.
-
-    Raises
-    ------
-    ConfigError
-        If another run is active or cannot be read, so that its needed files are unknown, or has a link that
-        leads out of it.
+    - `run`: the run; the caller holds its lock.
+    - `without`: runs to ignore because they no longer exist.
+    - `notify`: receives one line when the lock of a dead process is taken over.
+    - `allow`: see `Run.open`.
     """
     with contextlib.ExitStack() as stack:
         runs = [run]
@@ -90,15 +78,7 @@ def exclusive(
 def find_garbage(runs: Sequence[Run]) -> Iterator[Garbage]:
     """Yield the files that are not needed in the store of these runs and in the folder of the first run.
 
-    Parameters
-    ----------
-    runs : sequence of Run
-        All runs of the store.
-
-    Raises
-    ------
-    ConfigError
-        If a model of a run is missing, so that its needed artefacts are unknown.
+    - `runs`: all runs of the store.
     """
     first = runs[0]
     # Before the needed ones are known: other commands may write to the store meanwhile, and that stays.

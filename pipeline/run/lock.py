@@ -120,19 +120,10 @@ def run_lock(
 ) -> Iterator[None]:
     """Hold the lock of a run folder; a context manager.
 
-    Parameters
-    ----------
-    run : Location
-        The run folder; on disk it must exist.
-    notify : callable
-        Receives one line when the lock of a dead process is observed or taken over, or this lock is lost.
-    heartbeat : Heartbeat, optional
-        Timing of renewal.
-
-    Raises
-    ------
-    ConfigError
-        If another process holds the lock, or the folder is not writable.
+    - `run`: the run folder; on disk it must exist.
+    - `notify`: receives one line when the lock of a dead process is observed or taken over, or this lock is
+      lost.
+    - `heartbeat`: timing of renewal.
     """
     lock = _Lock(run, lock_file(run / NAME), Owner.me(), notify, heartbeat or Heartbeat())
     try:

@@ -125,13 +125,7 @@ class Ground:
         allow: Sequence[str | Path] = (),
         earlier: bool = False,
     ) -> Ground:
-        """Open a run.
-
-        Raises
-        ------
-        ConfigError
-            If the folder is no run, has no such variant, or no tile is done.
-        """
+        """Open a run."""
         run, variant = open_variant(path, variant, allow)
         ground = cls(run, variant, earlier)
         if not any(map(ground._finished, peek_statuses(run, run.catalog.tiles))):
@@ -144,11 +138,8 @@ class Ground:
         A point on the edge of two finished tiles belongs to the one first in the catalog. A surface goes on
         beyond the survey, but its heights there are no heights of the ground.
 
-        Parameters
-        ----------
-        level : int, optional
-            The level of roads above roads: 0 is the ground, others are where they have decks or tubes. None:
-            the highest at each point.
+        - `level`: the level of roads above roads: 0 is the ground, others are where they have decks or tubes.
+          None: the highest at each point.
         """
         easting = np.atleast_1d(np.asarray(easting, dtype=np.float64))
         northing = np.atleast_1d(np.asarray(northing, dtype=np.float64))
@@ -188,10 +179,7 @@ class Ground:
 
         Heights are NaN off the finished tiles and beyond the survey.
 
-        Parameters
-        ----------
-        steps : bool
-            Whether level 0 has its steps beside roads; without them it is the spline.
+        - `steps`: whether level 0 has its steps beside roads; without them it is the spline.
         """
         easting, northing = np.asarray(easting, np.float64), np.asarray(northing, np.float64)
         rows, earlier = {0: np.full(easting.shape, np.nan)}, list[str]()
@@ -219,10 +207,7 @@ class Ground:
     def largest_tile_step(self, easting: Floats, northing: Floats, near_m: float) -> float:
         """Return the largest step (m) between the tiles of neighbouring points, ``(n,)``; 0 if there is none.
 
-        Parameters
-        ----------
-        near_m : float
-            Distance up to which a point and the next one belong to one line (m).
+        - `near_m`: distance up to which a point and the next one belong to one line (m).
         """
         if has_borders(self.run.config.chains[self.variant]["fit"]):
             return 0.0
@@ -372,13 +357,7 @@ def crs_of(ground: Ground) -> str | None:
 
 
 def required_crs(ground: Ground) -> str:
-    """Return the CRS of a run.
-
-    Raises
-    ------
-    ConfigError
-        If its tiles have several.
-    """
+    """Return the CRS of a run."""
     crs = crs_of(ground)
     if crs is None:
         raise ConfigError(
@@ -391,12 +370,8 @@ def required_crs(ground: Ground) -> str:
 def to_crs(x: Floats, y: Floats, source: str | None, target: str) -> tuple[Floats, Floats]:
     """Return coordinates in another CRS; NaN where they cannot be transformed.
 
-    Parameters
-    ----------
-    x, y : ndarray, (n,)
-        First east, then north, whatever the order of the axes of the CRS.
-    source : str or None
-        None if they already are in the CRS ``target``.
+    - `x`, `y` ``(n,)``: first east, then north, whatever the order of the axes of the CRS.
+    - `source`: none if they already are in the CRS ``target``.
     """
     if source is None or same(source, target):
         return x, y

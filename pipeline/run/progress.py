@@ -42,10 +42,7 @@ def said_repeatedly(
 ) -> Iterator[None]:
     """Say a line if the block takes longer than ``wait_s``, and then every `PLAIN_EVERY_S`.
 
-    Parameters
-    ----------
-    line : callable
-        Takes the time since the start of the block (s); an empty line is not said.
+    - `line`: takes the time since the start of the block (s); an empty line is not said.
     """
     ended, start = threading.Event(), time.monotonic()
 
@@ -74,13 +71,8 @@ class StepProgress:
     def __call__(self, items: Iterable[T], step: str, total: int) -> Iterator[T]:
         """Yield the items of a step.
 
-        Parameters
-        ----------
-        items : iterable
-        step : str
-            What is done with the items: ``checking tiles``.
-        total : int
-            Number of items.
+        - `step`: what is done with the items: ``checking tiles``.
+        - `total`: number of items.
         """
         if self.console.is_terminal:
             yield from track(items, step, total, console=self.console, transient=True)

@@ -108,11 +108,6 @@ class Run:
 
         The run may read what the catalog may read (`Catalog.read`), or, if the program itself has just made
         the catalog, the folders of its files.
-
-        Raises
-        ------
-        ConfigError
-            If the folder or the store cannot be written, or `planned` raises.
         """
         run = cls.planned(path, config, catalog, store, checksum)
         try:
@@ -135,14 +130,7 @@ class Run:
         store: Location | None = None,
         checksum: bool = False,
     ) -> Run:
-        """Return the run that `create` would make or update; nothing is written.
-
-        Raises
-        ------
-        ConfigError
-            If the folder has other files (`check_folder`), no tile can be used, its store was not given
-            by this user, or `check_inputs` raises.
-        """
+        """Return the run that `create` would make or update; nothing is written."""
         check_folder(path)
         if not catalog.usable:
             raise ConfigError(f"no tile can be used: {catalog.tiles[0].fault}")
@@ -160,20 +148,8 @@ class Run:
     def open(cls, path: Location | str, allow: Sequence[str | Path] = ()) -> Run:
         """Open an existing run with its current configuration and catalog.
 
-        Parameters
-        ----------
-        path : Location or str
-        allow : sequence of str or Path
-            Folders and addresses that sources and the store may lie below, besides the run's own folder and
-            those that the user gave when the run was made (`flexroad.pipeline.run.seal`).
-
-        Raises
-        ------
-        ConfigError
-            If the folder is no run, its configuration is invalid, its store lies outside and is neither
-            sealed nor in ``allow``, or `check_links` raises.
-        CatalogError
-            If its catalog is damaged.
+        - `allow`: folders and addresses that sources and the store may lie below, besides the run's own
+          folder and those that the user gave when the run was made (`flexroad.pipeline.run.seal`).
         """
         path = parse_location(path)
         check_links(path)
@@ -258,17 +234,8 @@ def check_links(path: Location, below: bool = False) -> None:
     A run may come from anyone, and what is read, written or deleted behind such a link would not be the
     run's. Tiles and artefacts are checked when they are used (`contained`).
 
-    Parameters
-    ----------
-    path : Location
-        The run's folder, or a folder in it; itself it may be a link.
-    below : bool
-        Whether folders inside it are searched, too.
-
-    Raises
-    ------
-    ConfigError
-        If there is one, or the folder cannot be read.
+    - `path`: the run's folder, or a folder in it; itself it may be a link.
+    - `below`: whether folders inside it are searched, too.
     """
     try:
         link = next(links_out(path, below), None)
@@ -282,13 +249,7 @@ def check_links(path: Location, below: bool = False) -> None:
 
 
 def check_folder(path: Location) -> None:
-    """Check that a run may be written to a folder, so that no existing files are replaced.
-
-    Raises
-    ------
-    ConfigError
-        If the folder has other files and is no run, or cannot be read, or `check_links` raises.
-    """
+    """Check that a run may be written to a folder, so that no existing files are replaced."""
     try:
         other = None if exists(path / RECORD) else visible_entry(path, {LOCK, LOG})
         refused = other is not None and not _has_results(path)
@@ -310,27 +271,14 @@ def _has_results(path: Location) -> bool:
 
 
 def check_inputs(config: Config, catalog: Catalog) -> None:
-    """Check, without reading the tiles' files, that a run of a catalog can give results.
-
-    Raises
-    ------
-    ConfigError
-        If a model is missing, no tile has a layer that all need (`check_layers`), or tiles that meet cannot
-        have one surface (`check_tiles`).
-    """
+    """Check, without reading the tiles' files, that a run of a catalog can give results."""
     check_models(config)
     check_layers(config, catalog)
     check_tiles(config, catalog)
 
 
 def check_models(config: Config) -> None:
-    """Check that all models named by a configuration exist.
-
-    Raises
-    ------
-    ConfigError
-        If a file named by the options is missing; the message says how to make one.
-    """
+    """Check that all models named by a configuration exist."""
     for chain in config.chains.values():
         for stage, options in chain.items():
             for path in model_files(options):

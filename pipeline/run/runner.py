@@ -84,24 +84,11 @@ def run_tiles(
 ) -> Summary:
     """Bring the run's tiles up to date, write the tables, mosaics and collection, then summary.json.
 
-    Parameters
-    ----------
-    only : callable
-        Filter of the tiles to process; the tables contain all tiles.
-    force : frozenset of str
-        Stages to compute even if their results are in the store.
-    watch : callable
-        Receives every result when it is available, including those of cached tiles.
-    verify : bool
-        Compare all products with their checksums, process tiles with a difference again, and make the tables
-        from the markers, whatever the database has.
-
-    Raises
-    ------
-    ConfigError
-        If `check_inputs` raises, or each of several tiles lacks a file.
-    OSError
-        If the database, the tables, the mosaics or the collection cannot be written, as on a full disk.
+    - `only`: filter of the tiles to process; the tables contain all tiles.
+    - `force`: stages to compute even if their results are in the store.
+    - `watch`: receives every result when it is available, including those of cached tiles.
+    - `verify`: compare all products with their checksums, process tiles with a difference again, and make the
+      tables from the markers, whatever the database has.
     """
     check_inputs(run.config, run.catalog)
     remove_abandoned()
@@ -134,13 +121,7 @@ def plan_run(
     watch: Callable[[TileResult], None],
     verify: bool,
 ) -> Plan:
-    """Check every tile once, update the database and return the tiles to process.
-
-    Raises
-    ------
-    ConfigError
-        If each of several tiles lacks a file.
-    """
+    """Check every tile once, update the database and return the tiles to process."""
     todo, states, new, changed, times = array("L"), list[TileState](), 0, 0, array("f")
     incomplete, last_incomplete = 0, None
     for position, status in enumerate(tile_statuses(run, database, from_markers=verify)):
@@ -176,17 +157,8 @@ def refuse_incomplete(run: Run, number: int, last: TileGraph | None) -> None:
 
     One error for the run: if each tile failed by itself, all existing results would be lost.
 
-    Parameters
-    ----------
-    number : int
-        Number of tiles that lack a file.
-    last : TileGraph, optional
-        The last of them.
-
-    Raises
-    ------
-    ConfigError
-        If all do.
+    - `number`: number of tiles that lack a file.
+    - `last`: the last of them.
     """
     if last and number == len(run.catalog.usable) > 1:
         raise ConfigError(_all_incomplete(run, last))

@@ -180,13 +180,7 @@ def matches(record: TileRecord | None, graph: TileGraph, files: dict[str, FileSt
 
 
 def has_marker(run: Run, record: TileRecord) -> bool:
-    """Return whether the folder of a tile has the marker of this record.
-
-    Raises
-    ------
-    OSError
-        If the storage does not answer.
-    """
+    """Return whether the folder of a tile has the marker of this record."""
     folder = run.folder(record.tile_id)
     for _ in range(2):
         marker = marker_stat(folder, record.state)
@@ -201,13 +195,7 @@ def has_marker(run: Run, record: TileRecord) -> bool:
 
 
 def open_database(run: Run, write: bool = False) -> RunDatabase:
-    """Open the run's database; entries that it lacks are read from the markers.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
-    """
+    """Open the run's database; entries that it lacks are read from the markers."""
     opened = RunDatabase.open if write else RunDatabase.open_readonly
     return opened(run.path / NAME, partial(_read_marker, run))
 

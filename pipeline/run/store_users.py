@@ -22,13 +22,7 @@ FOLDER = "runs"
 
 
 def register(store: Location, run: Location) -> None:
-    """Register a run with its store; not needed for a store in the run's own folder.
-
-    Raises
-    ------
-    OSError
-        If the store cannot be written.
-    """
+    """Register a run with its store; not needed for a store in the run's own folder."""
     if absolute(store) != absolute(run / "store"):
         path = _entry(store, run)
         if not exists(path):
@@ -36,13 +30,7 @@ def register(store: Location, run: Location) -> None:
 
 
 def runs_using(store: Location) -> Iterator[Location]:
-    """Yield the folders of the runs registered with a store.
-
-    Raises
-    ------
-    OSError, ValueError, KeyError
-        If an entry cannot be read.
-    """
+    """Yield the folders of the runs registered with a store."""
     # A store in a run's folder belongs to that run.
     if exists(store.parent / "run.json"):
         yield absolute(store.parent)

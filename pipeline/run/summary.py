@@ -106,11 +106,6 @@ def write_summary(run: Location, summary: Summary, flushed: bool = False, **abou
     """Write summary.json: the fields of the summary and those in ``about``.
 
     With ``flushed`` its content is on the disk before it replaces the old one.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
     """
     failures = [{key: value for key, value in asdict(f).items() if key != "trace"} for f in summary.failures]
     content = asdict(summary) | {

@@ -30,16 +30,10 @@ def largest_tile_step(
 
     Both surfaces are taken where the line leaves the first tile.
 
-    Parameters
-    ----------
-    start, end : ndarray, (2, n)
-        Eastings and northings of the ends of the lines (m).
-    tile_of_start, tile_of_end : ndarray, (n,)
-        Numbers of their tiles; -1 if there is none.
-    bounds : sequence of Bounds
-        Of each tile.
-    height : callable
-        NaN beyond the survey.
+    - `start`, `end` ``(2, n)``: eastings and northings of the ends of the lines (m).
+    - `tile_of_start`, `tile_of_end` ``(n,)``: numbers of their tiles; -1 if there is none.
+    - `bounds`: of each tile.
+    - `height`: NaN beyond the survey.
     """
     steps = [0.0]
     crossing = (tile_of_start != tile_of_end) & (tile_of_start >= 0) & (tile_of_end >= 0)

@@ -14,24 +14,12 @@ KEY = "flexroad:checksum"
 
 
 def dumps(content: dict[str, Any]) -> bytes:
-    """Return an object as JSON, with its checksum.
-
-    Raises
-    ------
-    ValueError
-        If it has NaN or an infinity, which are no JSON.
-    """
+    """Return an object as JSON, with its checksum."""
     return json.dumps({**content, KEY: _checksum(content)}, indent=1, allow_nan=False).encode()
 
 
 def loads(data: bytes) -> dict[str, Any]:
-    """Return the object that `dumps` has written, without the checksum.
-
-    Raises
-    ------
-    ValueError
-        If it is damaged, or was written by a version without checksums.
-    """
+    """Return the object that `dumps` has written, without the checksum."""
     try:
         content = json.loads(data)
     except RecursionError as error:

@@ -59,13 +59,7 @@ def encode(
 
 
 def decode(data: bytes, fingerprint: str = "") -> Stored:
-    """Return the result, the seconds of each stage and the notes up to it.
-
-    Raises
-    ------
-    ValueError, KeyError, OSError, zipfile.BadZipFile, zlib.error
-        If the bytes are damaged, of an unknown type, or were encoded with another fingerprint.
-    """
+    """Return the result, the seconds of each stage and the notes up to it."""
     payload, checksum = data[:-SHA256_BYTES], data[-SHA256_BYTES:]
     if _checksum(payload, fingerprint) != checksum:
         raise ValueError("the checksum does not match the data and its fingerprint")

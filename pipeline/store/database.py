@@ -91,17 +91,8 @@ class RunDatabase:
     def open(cls, path: Location, recover: Recover = lambda tile_id: None) -> RunDatabase:
         """Open a database for writing; it is created empty if it is missing or damaged.
 
-        Parameters
-        ----------
-        path : Location
-            The file.
-        recover : callable
-            Reads the marker of a tile whose entry is lost or damaged.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
+        - `path`: the file.
+        - `recover`: reads the marker of a tile whose entry is lost or damaged.
         """
         staged = StagedFile(path)
         staged.fetch()
@@ -125,13 +116,7 @@ class RunDatabase:
         self.close()
 
     def close(self) -> None:
-        """Write all pending records and close the file.
-
-        Raises
-        ------
-        OSError
-            If the disk is full or the storage cannot be reached.
-        """
+        """Write all pending records and close the file."""
         try:
             self.flush()
             self._connection.close()
@@ -143,15 +128,7 @@ class RunDatabase:
     def set_states(self, tiles: Iterable[tuple[str, TileState]]) -> int:
         """Replace the list of tiles: the id and state of each, in the catalog's order.
 
-        Returns
-        -------
-        int
-            Number of tiles with a record that are not in the list; their records are deleted.
-
-        Raises
-        ------
-        OSError
-            If the disk is full.
+        - result: number of tiles with a record that are not in the list; their records are deleted.
         """
         states = list(tiles)
         return self._write(lambda: self._set_states(states))
@@ -166,13 +143,7 @@ class RunDatabase:
                 self._staged.sync_if_due()
 
     def flush(self) -> None:
-        """Write all pending records.
-
-        Raises
-        ------
-        OSError
-            If the disk is full.
-        """
+        """Write all pending records."""
         self._flushed = time.monotonic()
         if self._pending:
             self._write(self._write_pending)
@@ -192,14 +163,9 @@ class RunDatabase:
     def listed(self, tiles: Iterable[str], since: str = "", variant: str = "") -> Listed | None:
         """Return the counts over the list of tiles; None if it is damaged or has other tiles.
 
-        Parameters
-        ----------
-        tiles : iterable of str
-            The ids that the list should have, in its order.
-        since : str
-            Count the tiles finished since this time (ISO 8601, UTC).
-        variant : str
-            List the tiles that have flags in this variant.
+        - `tiles`: the ids that the list should have, in its order.
+        - `since`: count the tiles finished since this time (ISO 8601, UTC).
+        - `variant`: list the tiles that have flags in this variant.
         """
         self.flush()
         counts, finished, without_roads, flagged = Counter[TileState](), 0, 0, list[str]()
@@ -227,13 +193,7 @@ class RunDatabase:
         return Listed(counts, finished, without_roads, tuple(flagged)) if total == _bytes(combined) else None
 
     def states(self) -> Iterator[TileState]:
-        """Yield the state of every tile as set by the last run, in the catalog's order.
-
-        Raises
-        ------
-        OSError
-            As `entries`.
-        """
+        """Yield the state of every tile as set by the last run, in the catalog's order."""
         for row in self._asked():
             yield row[2]
 
@@ -241,33 +201,16 @@ class RunDatabase:
         """Yield id, state and record (None if there is none) of every tile, in the catalog's order.
 
         A record that is lost or damaged is read from the tile's marker.
-
-        Raises
-        ------
-        OSError
-            If the list of tiles is damaged, which `listed` tells.
         """
         return self._entries("")
 
     def rows(self) -> Iterator[MetricsRow]:
-        """Yield the metrics rows of all tiles that are not pending, in the catalog's order.
-
-        Raises
-        ------
-        OSError
-            As `entries`.
-        """
+        """Yield the metrics rows of all tiles that are not pending, in the catalog's order."""
         for _, _, record in self._entries("AND standing != 'pending'"):
             yield from record.rows if record else ()
 
     def failures(self) -> Iterator[Failure]:
-        """Yield the failures of all failed tiles, in the catalog's order.
-
-        Raises
-        ------
-        OSError
-            As `entries`.
-        """
+        """Yield the failures of all failed tiles, in the catalog's order."""
         for _, _, record in self._entries("AND standing = 'failed'"):
             yield from record.failures if record else ()
 

@@ -31,13 +31,7 @@ class TileProducts:
         return cls(run / "tiles" / safe_name(tile_id))
 
     def file(self, name: str) -> Location:
-        """Return a file of the folder.
-
-        Raises
-        ------
-        OSError
-            If it lies behind a link that leads out of the run.
-        """
+        """Return a file of the folder."""
         return contained(self.path / name, self.path.parent.parent)
 
     def files(self) -> dict[str, FileStat]:

@@ -101,13 +101,7 @@ def needs_look(flags: object) -> bool:
 
 
 def from_item(item: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
-    """Return the record of a finished tile from its STAC item.
-
-    Raises
-    ------
-    KeyError, TypeError, AttributeError
-        If the item is damaged, for example has no rows.
-    """
+    """Return the record of a finished tile from its STAC item."""
     properties = item["properties"]
     return TileRecord(
         item["id"],
@@ -138,13 +132,7 @@ def to_failed(entry: TileRecord) -> dict[str, Any]:
 
 
 def from_failed(content: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
-    """Return the record of a failed tile from the content of its failed.json.
-
-    Raises
-    ------
-    KeyError, TypeError
-        If it is damaged.
-    """
+    """Return the record of a failed tile from the content of its failed.json."""
     return TileRecord(
         content["tile"],
         "failed",

@@ -62,19 +62,9 @@ def os_error(error: BaseException, path: Location) -> OSError:
 def open_writable(path: Path, tables: tuple[str, ...], version: int) -> sqlite3.Connection:
     """Open a file for writing; it is made anew if it is missing, damaged or of another version.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    tables : tuple of str
-        The statements that create its tables.
-    version : int
-        Version of the tables.
-
-    Raises
-    ------
-    sqlite3.Error, OSError
-        If it cannot be written.
+    - `path`: the file.
+    - `tables`: the statements that create its tables.
+    - `version`: version of the tables.
     """
     if path.exists():
         connection = _connect(path, "rwc")
@@ -102,13 +92,7 @@ def open_readonly(path: Path, tables: tuple[str, ...], version: int) -> sqlite3.
 
 
 def create(path: Path, tables: tuple[str, ...], version: int) -> sqlite3.Connection:
-    """Make an empty file in place of what is there, which may still be open elsewhere.
-
-    Raises
-    ------
-    sqlite3.Error, OSError
-        If it cannot be written.
-    """
+    """Make an empty file in place of what is there, which may still be open elsewhere."""
     # A journal that is left behind would be applied to the new file.
     for end in ("", "-journal", "-wal", "-shm"):
         path.with_name(path.name + end).unlink(missing_ok=True)

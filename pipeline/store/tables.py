@@ -108,11 +108,6 @@ def write_tables(
     """Write metrics.parquet and failures.csv in chunks, and levels.csv if a tile has decks or tubes.
 
     With ``flushed`` their contents are on the disk before they replace the old tables.
-
-    Raises
-    ------
-    OSError
-        If they cannot be written, for example on a full disk.
     """
     schema, of_levels = _schema(), list[dict[str, Any]]()
     with (
@@ -184,16 +179,7 @@ def _chunks(rows: Iterable[MetricsRow]) -> Iterator[list[MetricsRow]]:
 def read_metrics(run: Location, name: str = METRICS) -> pd.DataFrame:
     """Read the rows of a run.
 
-    Parameters
-    ----------
-    run : Location
-    name : str
-        File in the folder of the run.
-
-    Raises
-    ------
-    ConfigError
-        If the table does not exist yet or is damaged.
+    - `name`: file in the folder of the run.
     """
     path = run / name
     if not exists(path):
@@ -211,13 +197,7 @@ def read_metrics(run: Location, name: str = METRICS) -> pd.DataFrame:
 
 
 def frame_of(data: bytes) -> pd.DataFrame:
-    """Return the table in the bytes of a Parquet file.
-
-    Raises
-    ------
-    OSError, ValueError
-        If they are not a Parquet file.
-    """
+    """Return the table in the bytes of a Parquet file."""
     # pandas.read_parquet starts threads; those still running when a short command exits can abort it.
     file = pyarrow.parquet.ParquetFile(
         pyarrow.BufferReader(data), pre_buffer=False, page_checksum_verification=True

@@ -118,13 +118,7 @@ class Evaluator:
     """Errors by fingerprint."""
 
     def __call__(self, fingerprint: str) -> Any:
-        """Return the result of a node.
-
-        Raises
-        ------
-        StageError
-            If the node or one of its inputs fails or has failed before.
-        """
+        """Return the result of a node."""
         if fingerprint in self.errors:
             raise self.errors[fingerprint]
         if fingerprint not in self.results:
@@ -231,13 +225,7 @@ def _refit(data: TileData, clusters: RoadClusters, options: Options, framed: Map
 
 
 def check_unchanged(graph: TileGraph, files: Iterable[Location]) -> None:
-    """Compare files with their state when the tile's graph was made.
-
-    Raises
-    ------
-    SourceChanged
-        If one has changed.
-    """
+    """Compare files with their state when the tile's graph was made."""
     for file in files:
         if source_stat(file) != graph.file_stats[str(file)]:
             raise SourceChanged(str(file))

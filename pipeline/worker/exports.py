@@ -112,16 +112,10 @@ def products(
 ) -> dict[str, Product]:
     """Return the products of the graph's export variants and formats, by file name.
 
-    Parameters
-    ----------
-    graph : TileGraph
-        The tile's graph, with the export options.
-    evaluate : callable
-        Returns the result of a node by its fingerprint.
-    origin : tuple of float
-        Origin of the run: whole-metre (easting, northing) that mesh translations are relative to.
-    texture : Texture, optional
-        The photo on the mesh.
+    - `graph`: the tile's graph, with the export options.
+    - `evaluate`: returns the result of a node by its fingerprint.
+    - `origin`: origin of the run: whole-metre (easting, northing) that mesh translations are relative to.
+    - `texture`: the photo on the mesh.
     """
     vertical = vertical_crs(graph.tile) if "cog" in graph.export.formats else None
     files: dict[str, Product] = {}
@@ -221,10 +215,7 @@ def assets(files: Mapping[str, Product], variants: tuple[str, ...], grid: Grid) 
 def item_assets(variants: tuple[str, ...], formats: Iterable[str], cells: set[float]) -> dict[str, Any]:
     """Return what the assets of all items have in common, for a collection.
 
-    Parameters
-    ----------
-    cells : set of float
-        The cell sizes of the tiles (m).
+    - `cells`: the cell sizes of the tiles (m).
     """
     cell = cells.copy().pop() if len(cells) == 1 else None
     return {

@@ -58,13 +58,7 @@ class SharedFiles:
                         paths.remove(folder / name)
 
     def answer(self, job: TileJob) -> Proof:
-        """Return the proof of this process, a worker, whose first job is ``job``.
-
-        Raises
-        ------
-        OSError
-            If a folder is not that of the client, or cannot be written.
-        """
+        """Return the proof of this process, a worker, whose first job is ``job``."""
         own = f"{self.start}{secrets.token_hex(8)}"
         try:
             for folder in self.folders:
@@ -75,13 +69,7 @@ class SharedFiles:
             raise
 
     def accept(self, proof: Proof) -> None:
-        """Check, in the client, that the files of a worker have arrived, and that it has the same sources.
-
-        Raises
-        ------
-        OSError
-            If not.
-        """
+        """Check, in the client, that the files of a worker have arrived, and that it has the same sources."""
         name, different = proof
         missing = [folder for folder in self.folders if not _arrived(folder, name)]
         self._remove(name)

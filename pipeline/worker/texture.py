@@ -19,19 +19,8 @@ NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"
 def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
     """Return the texture of a tile's meshes: its orthophoto, at its own resolution up to `export.texture_px`.
 
-    Returns
-    -------
-    texture : Texture or None
-        None if the configuration wants none, or the tile has no photo.
-    note : str
-        What the photo lacks, or empty.
-
-    Raises
-    ------
-    TaskError
-        If a file of the photo is missing, broken, or not one of a photo.
-    SourceChanged
-        If a file has changed after the graph was made.
+    - `texture`: none if the configuration wants none, or the tile has no photo.
+    - `note`: what the photo lacks, or empty.
     """
     export, tile = graph.export, graph.tile
     if not export.texture:
@@ -53,17 +42,8 @@ def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
 def tile_photo(tile: Tile, layer: Layer, largest_px: int) -> Orthophoto | None:
     """Return the orthophoto of a tile, None if no pixel of it is known.
 
-    Parameters
-    ----------
-    layer : Layer
-        The tile's orthophoto.
-    largest_px : int
-        Largest width and height (pixels); a finer photo is averaged.
-
-    Raises
-    ------
-    TaskError
-        If a file is missing, broken, or not one of a photo.
+    - `layer`: the tile's orthophoto.
+    - `largest_px`: largest width and height (pixels); a finer photo is averaged.
     """
     source = layer_source(replace(tile, layers=(layer,)), layer.name)
     assert source is not None

@@ -125,10 +125,7 @@ def ecsrc_near(data: TileData, road: RoadMask, options: Options, near: Slices) -
 
     Elsewhere they may be False. Labels are complete: clusters are judged by all their cells.
 
-    Parameters
-    ----------
-    near : tuple of slice
-        (row, col) slices of that part; they have a start and a stop.
+    - `near`: (row, col) slices of that part; they have a start and a stop.
     """
     if road.levels:
 

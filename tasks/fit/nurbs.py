@@ -118,13 +118,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
 
 
 def space_of(data: TileData, options: Options) -> Space:
-    """Return the splines over a tile.
-
-    Raises
-    ------
-    TaskError
-        If the grid has fewer cells than control points.
-    """
+    """Return the splines over a tile."""
     points = options.control_points
     if options.spacing_m is not None:
         points = points_at_spacing(data.grid, options.degree, options.spacing_m)
@@ -132,13 +126,7 @@ def space_of(data: TileData, options: Options) -> Space:
 
 
 def objective_of(data: TileData, road: Bools, space: Space, datum: float, options: Options) -> Objective:
-    """Return the loss function of a tile.
-
-    Raises
-    ------
-    TaskError
-        If there are fewer cells with a height than control points.
-    """
+    """Return the loss function of a tile."""
     heights = np.where(road, data.dsm, data.dtm) - datum
     check_cells(heights, space.points)
     factor = np.where(road, 1.0, options.lambda_terrain if options.terrain else 0.0)

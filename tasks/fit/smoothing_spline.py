@@ -283,10 +283,7 @@ def _along(
 ) -> tuple[Floats, NurbsSurface]:
     """Return the control points of an edge for one level, and the spline around the edge.
 
-    Parameters
-    ----------
-    reach : tuple of int
-        Number of intervals up to which it is fitted, along easting and northing.
+    - `reach`: number of intervals up to which it is fitted, along easting and northing.
     """
     fitted, (k, j) = with_road_heights(data, clusters), reach
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree

@@ -27,11 +27,6 @@ def npz(arrays: Mapping[str, ArrayLike]) -> bytes:
     """Return arrays as a compressed archive that `numpy.load` reads without pickle.
 
     Equal arrays give equal bytes on one kind of processor.
-
-    Raises
-    ------
-    struct.error
-        If an array, or all of them compressed, have 4 GiB or more.
     """
     pieces, directory = list[bytes](), list[bytes]()
     size = 0

@@ -43,10 +43,7 @@ def survey_difference(tile: Tile) -> tuple[str, str]:
 
     Only headers are read. Files that cannot be read are left out, as by `load`.
 
-    Parameters
-    ----------
-    tile : Tile
-        With the files to compare (`Tile.within`).
+    - `tile`: with the files to compare (`Tile.within`).
     """
     declared = {name: _declared(tile, name) for name in ("dsm", "dtm")}
     differs, missing = [], []

@@ -109,12 +109,8 @@ def is_offset(note: str) -> bool:
 def on_tiles(notes: Iterable[str], tiles: int) -> list[str]:
     """Return one line for each cause in notes of tiles by `offset_note`, with the number of tiles.
 
-    Parameters
-    ----------
-    notes : iterable of str
-        One for each tile that has one; of each cause the first is shown.
-    tiles : int
-        Number of tiles looked at.
+    - `notes`: one for each tile that has one; of each cause the first is shown.
+    - `tiles`: number of tiles looked at.
     """
     first: dict[str, str] = {}
     number = Counter[str]()

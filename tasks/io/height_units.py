@@ -80,10 +80,7 @@ def smaller_unit_fault(patch: RasterWindow, declare: str) -> str | None:
 
     None if they vary too little or too much for heights in one of `SMALLER`.
 
-    Parameters
-    ----------
-    declare : str
-        The remedy besides the division, with a comma before it; empty if there is none.
+    - `declare`: the remedy besides the division, with a comma before it; empty if there is none.
     """
     heights = patch.values * _unit(patch)[1]
     most = max(SMALLER.values())

@@ -34,10 +34,7 @@ def recorded() -> Iterator[LeftOut]:
 def leave_out(error: Unusable, cells: Bools | None = None) -> str:
     """Record that a file is left out, or only some cells of what was read of it, ``(rows, cols)``.
 
-    Returns
-    -------
-    str
-        A note on it.
+    - result: a note on it.
     """
     what, part = "a file", ""
     if cells is not None:

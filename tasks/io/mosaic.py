@@ -126,14 +126,10 @@ class Mosaic:
 def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = False) -> Mosaic:
     """Return a layer on a grid; files that cannot be used are left out.
 
-    Parameters
-    ----------
-    tile : Tile
-        With the files to read (`Tile.within`, `Tile.around`).
-    core : Grid
-        The tile that the files are of: the position of a file without georeference and of unknown extent.
-    around : bool
-        Whether the grid is ground around tiles: then it is not checked whether files have moved.
+    - `tile`: with the files to read (`Tile.within`, `Tile.around`).
+    - `core`: the tile that the files are of: the position of a file without georeference and of unknown
+      extent.
+    - `around`: whether the grid is ground around tiles: then it is not checked whether files have moved.
     """
     files = _files(tile, layer)
     read, left_out, absurd_cells = _read(tile, layer, files, grid, core, around)

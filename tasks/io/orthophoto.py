@@ -37,29 +37,12 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None, finest_m:
     A grey photo is returned as three equal bands; of more than three bands (near infrared) the first three
     are used. 16-bit colours are scaled to 8 bits by the depth that the file declares, else by 16.
 
-    Parameters
-    ----------
-    source : Source
-        The photo's files; where files overlap, the first one with a value is used.
-    grid : Grid
-        The area to read; only its bounds and CRS are used.
-    gsd_m : float, optional
-        Ground sampling distance of the result (m); by default that of the first file that reaches the grid.
-    finest_m : float
-        Smallest ground sampling distance (m) if ``gsd_m`` is None: finer photos are averaged.
-
-    Returns
-    -------
-    Orthophoto
-        Its pixels start in the grid's north-west corner and cover the grid.
-
-    Raises
-    ------
-    TaskError
-        If a file that the area needs is missing or broken, is rotated, in another CRS, or its colours are
-        not supported.
-    LayerMissing
-        If no file reaches the grid.
+    - `source`: the photo's files; where files overlap, the first one with a value is used.
+    - `grid`: the area to read; only its bounds and CRS are used.
+    - `gsd_m`: ground sampling distance of the result (m); by default that of the first file that reaches the
+      grid.
+    - `finest_m`: smallest ground sampling distance (m) if ``gsd_m`` is None: finer photos are averaged.
+    - result: its pixels start in the grid's north-west corner and cover the grid.
     """
     photo: Orthophoto | None = None
     unusable: list[Unusable] = []

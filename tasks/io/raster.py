@@ -112,36 +112,16 @@ def read_window(
     where it has them, so that the memory does not depend on the resolution of the file. Of a damaged file
     the cells that cannot be read are left out (`RasterWindow.unreadable`).
 
-    Parameters
-    ----------
-    name : str
-        Name of the file in messages: ``dsm a.tif``.
-    core : Grid
-        Position of a file without georeference, if it has as many cells.
-    crs : str, optional
-        CRS of a file without one.
-    resampling : Resampling
-        How several cells are read as one: ``average`` of heights, ``mode`` of classes.
-    allowed : AllowedFolders, optional
-        Where the files that a VRT names may lie; None: anywhere on disk.
-    heights : bool
-        Whether the file must have heights: one band of real numbers.
-    reproject : bool
-        Whether the file may be in another CRS than the grid; the window is then on its own lattice.
-    missing : frozenset of str, optional
-        See `read_raster`.
-
-    Returns
-    -------
-    RasterWindow or None
-        None if the file does not overlap the grid.
-
-    Raises
-    ------
-    TaskError
-        As of `read_raster`.
-    Unusable
-        If it is rotated, has no heights or no usable position, or is in another CRS than the grid.
+    - `name`: name of the file in messages: ``dsm a.tif``.
+    - `core`: position of a file without georeference, if it has as many cells.
+    - `crs`: CRS of a file without one.
+    - `resampling`: how several cells are read as one: ``average`` of heights, ``mode`` of classes.
+    - `allowed`: where the files that a VRT names may lie; None: anywhere on disk.
+    - `heights`: whether the file must have heights: one band of real numbers.
+    - `reproject`: whether the file may be in another CRS than the grid; the window is then on its own
+      lattice.
+    - `missing`: see `read_raster`.
+    - result: none if the file does not overlap the grid.
     """
 
     def read(src: Any, damaged: bool = False) -> RasterWindow | None:
@@ -193,21 +173,9 @@ def read_raster(
     Only a file whose own bytes are at fault is `Unreadable`, so that it may be left out. What is computed
     while a disk or object storage does not give the file must not be stored as if the file had been read.
 
-    Parameters
-    ----------
-    path, name, allowed
-        As of `read_window`.
-    read : callable
-        Takes the open raster.
-    missing : frozenset of str, optional
-        Full names of the files that are known to be missing; None if that is not known.
-
-    Raises
-    ------
-    Unreadable
-        If the file is damaged: the system reads all of it, and GDAL fails twice; or if it is missing.
-    TaskError
-        If the system or object storage does not give the file, or it is missing but not in ``missing``.
+    - `path`, `name`, `allowed`: as of `read_window`.
+    - `read`: takes the open raster.
+    - `missing`: full names of the files that are known to be missing; None if that is not known.
     """
     try:
         return _attempt(path, name, read, allowed, by, missing)
@@ -439,13 +407,7 @@ def _share(lattice: RasterGrid, step: int) -> Floats | None:
 def all_cells(
     src: Any, lattice: RasterGrid, step: int, slices: Slices, resampling: Resampling
 ) -> tuple[Floats, None]:
-    """Return the cells of a window, ``step`` x ``step`` of them as one, rows from the north; and None.
-
-    Raises
-    ------
-    RasterioError, OSError
-        If any of them cannot be read.
-    """
+    """Return the cells of a window, ``step`` x ``step`` of them as one, rows from the north; and None."""
     return _cells(src, lattice, step, slices, resampling), None
 
 

@@ -81,13 +81,7 @@ def place(
     crs: str | None,
     reproject: bool = False,
 ) -> RasterGrid | None:
-    """Return the lattice of a file, or None if it is in another CRS and outside the grid; see `read_window`.
-
-    Raises
-    ------
-    Unusable
-        If the file is rotated, overlaps the grid in another CRS, or its position is unknown.
-    """
+    """Return a file's lattice, or None if it is in another CRS and outside the grid; see `read_window`."""
     found = header(src)
     if found.fault:
         raise Unusable(f"{name} {found.fault}", str(path))

@@ -146,10 +146,7 @@ def _extended(
 ) -> RasterWindow:
     """Return a sheet with the cells around it, and those without a value, interpolated in other sheets.
 
-    Parameters
-    ----------
-    known : RasterWindow
-        The sheet, with NaN where heights of others are to be preferred.
+    - `known`: the sheet, with NaN where heights of others are to be preferred.
     """
     lattice = sheet.lattice
     across, along = lattice.cell_of(grid)

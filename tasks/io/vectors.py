@@ -97,15 +97,7 @@ class _Layer:
 def read_near(request: Query, bounds: Bounds) -> Any:
     """Return the features whose bounding boxes touch ``bounds`` (m, in ``request.crs``).
 
-    Returns
-    -------
-    GeoDataFrame
-        In ``request.crs``, with those of the columns that exist, named in lower case.
-
-    Raises
-    ------
-    TaskError
-        If the file is missing or cannot be read, has no such layer or column, or has no CRS.
+    - result: in ``request.crs``, with those of the columns that exist, named in lower case.
     """
     try:
         version = source_stat(request.path)

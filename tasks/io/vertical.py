@@ -18,11 +18,6 @@ def vertical_crs(tile: Tile) -> str | None:
 
     It is known if all files of DSM and DTM on the tile declare the same one; only their headers are read.
     Files that cannot be read are left out, as by `load`.
-
-    Raises
-    ------
-    TaskError
-        If a file cannot be read at the moment.
     """
     found: set[str | None] = set()
     tile = tile.within(tile.grid.bounds)

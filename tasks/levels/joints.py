@@ -65,13 +65,9 @@ def levels_of(
 ) -> tuple[tuple[Level, ...], tuple[str, ...]]:
     """Return the levels that the surface of a tile depends on, by ascending number, and notes.
 
-    Parameters
-    ----------
-    areas, shapes, numbers : ndarray, (n,)
-        The roads on and around the tile's grid as polygons, what these were made of (`rasterise.Roads`), and
-        their levels.
-    data : TileData
-        Its heights refuse joints between roads that differ in height.
+    - `areas`, `shapes`, `numbers` ``(n,)``: the roads on and around the tile's grid as polygons, what these
+      were made of (`rasterise.Roads`), and their levels.
+    - `data`: its heights refuse joints between roads that differ in height.
     """
     if not numbers.any():
         return (), ()

@@ -25,11 +25,8 @@ def crossing_notes(areas: Shapes, shapes: Shapes, numbers: NDArray[np.int64], co
     Two roads that cross have a common vertex, as a junction on a deck has. Without one, one of them lies on
     another level in truth, and the surface of both is a compromise.
 
-    Parameters
-    ----------
-    areas, shapes, numbers : ndarray, (n,)
-        Valid polygons of roads, the polygons or lines that they were made of, and their levels. Areas that
-        only close wedges between roads have the shape None.
+    - `areas`, `shapes`, `numbers` ``(n,)``: valid polygons of roads, the polygons or lines that they were
+      made of, and their levels. Areas that only close wedges between roads have the shape None.
     """
     on_core, notes = shapely.box(*core.bounds), list[str]()
     for number in np.unique(numbers[numbers != 0]).tolist():

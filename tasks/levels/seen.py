@@ -39,10 +39,7 @@ Filter = Callable[[TileData, RoadMask, bool], RoadClusters]
 def level_data(data: TileData, clusters: RoadClusters, number: int = 0) -> TileData:
     """Return the heights that a level sees; the data itself if the tile has no levels.
 
-    Parameters
-    ----------
-    clusters : RoadClusters
-        Those of level 0, with the other levels.
+    - `clusters`: those of level 0, with the other levels.
     """
     if not clusters.levels:
         return data
@@ -59,12 +56,9 @@ def level_clusters(
 ) -> RoadClusters:
     """Return the filtered roads of level 0, with those of the other levels.
 
-    Parameters
-    ----------
-    ecsrc : callable
-        The filter of one level.
-    verge_m, beyond_m : float
-        Width of the verge, and distance beyond it, up to which the ground beside roads has steps (m).
+    - `ecsrc`: the filter of one level.
+    - `verge_m`, `beyond_m`: width of the verge, and distance beyond it, up to which the ground beside roads
+      has steps (m).
     """
     grid, levels = data.grid, road.levels
     approach = _any(grid, [_taken(level, grid) for level in levels])

@@ -43,10 +43,7 @@ class Breaklines:
 def breaklines(surface: SteppedSurface, local: Bounds) -> Breaklines:
     """Return the edges of the steps of a surface.
 
-    Parameters
-    ----------
-    local : tuple of float
-        West, south, east and north of the tile, from the origin of its cells (m).
+    - `local`: west, south, east and north of the tile, from the origin of its cells (m).
     """
     cells = surface.cells
     # The median leaves straight edges where they are. Noise of single cells would break lines into pieces.

@@ -59,12 +59,8 @@ class LevelOutline:
     def with_shared(self, border: Floats, ground: Floats, local: Bounds) -> Floats:
         """Return the vertices of the level on the border of a tile, on joints those of level 0.
 
-        Parameters
-        ----------
-        border : ndarray, (n, 3)
-            Vertices along the complete border.
-        ground : ndarray, (m, 3)
-            The vertices of level 0.
+        - `border` ``(n, 3)``: vertices along the complete border.
+        - `ground` ``(m, 3)``: the vertices of level 0.
         """
         shared = ground[on_border(ground, local) & self.has_joint_at(ground)]
         every = np.concatenate([border[~self.has_joint_at(border)], shared])
@@ -85,14 +81,9 @@ class LevelOutline:
 def level_outline(level: Level, core: Grid, local: Bounds, spacing_m: float) -> LevelOutline | None:
     """Return the outline of a level on a tile, None if nothing of it lies there.
 
-    Parameters
-    ----------
-    core : Grid
-        The tile.
-    local : tuple of float
-        West, south, east and north of the tile, from its origin (m).
-    spacing_m : float
-        Largest distance of points (m).
+    - `core`: the tile.
+    - `local`: west, south, east and north of the tile, from its origin (m).
+    - `spacing_m`: largest distance of points (m).
     """
     areas = encoded(np.array([level.areas], object), core)
     if areas is None:

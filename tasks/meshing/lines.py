@@ -27,12 +27,8 @@ def divided(
 ) -> NDArray[np.object_]:
     """Return lines with additional points, as an array of lines.
 
-    Parameters
-    ----------
-    fine_m, coarse_m : float
-        Largest distance of points where ``is_fine``, and elsewhere (m).
-    is_fine : callable
-        Tells for points, ``(n, 2)``, whether lines are fine there, ``(n,)``.
+    - `fine_m`, `coarse_m`: largest distance of points where ``is_fine``, and elsewhere (m).
+    - `is_fine`: tells for points, ``(n, 2)``, whether lines are fine there, ``(n,)``.
     """
     pieces = shapely.linestrings(_segments(shapely.segmentize(lines, coarse_m)))
     dense = shapely.segmentize(pieces, fine_m)
@@ -62,17 +58,11 @@ def points_and_segments(
 ) -> tuple[Floats, NDArray[np.intp]]:
     """Return the points of lines, ``(n, 2)``, and the segments between them, ``(m, 2)``.
 
-    Parameters
-    ----------
-    lines : sequence of ndarray
-        Lines within the tile.
-    border : ndarray, (b, 2)
-        The vertices on the border of the tile. Lines that reach the border end in the nearest one, or before
-        the border if none is near.
-    local : tuple of float
-        West, south, east and north of the tile (m). Segments along this border are left out.
-    same_m : float
-        Largest distance of such a vertex (m).
+    - `lines`: lines within the tile.
+    - `border` ``(b, 2)``: the vertices on the border of the tile. Lines that reach the border end in the
+      nearest one, or before the border if none is near.
+    - `local`: west, south, east and north of the tile (m). Segments along this border are left out.
+    - `same_m`: largest distance of such a vertex (m).
     """
     if not lines:
         return np.empty((0, 2)), np.empty((0, 2), np.intp)

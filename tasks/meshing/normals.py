@@ -24,10 +24,8 @@ def mesh_normals(mesh: Mesh, surface: Surface | None = None) -> Floats:
     Tiles of one surface have equal normals on their common border, so that no line is seen along it. By the
     faces of each tile alone they would differ.
 
-    Parameters
-    ----------
-    surface : Surface, optional
-        That of the mesh. A spline over more than the tile has no border there, and other surfaces have none.
+    - `surface`: that of the mesh. A spline over more than the tile has no border there, and other surfaces
+      have none.
     """
     if mesh.level is not None:
         every = np.empty_like(mesh.vertices)
@@ -50,12 +48,8 @@ def vertex_normals(points: Floats, faces: NDArray[np.int32]) -> Floats:
 
     The weights are those of Thürmer and Wüthrich (1998), Computing vertex normals from polygonal facets.
 
-    Parameters
-    ----------
-    points : ndarray, (V, 3)
-        A vertex without faces, or with lines only, has the normal (0, 0, 1).
-    faces : ndarray of int32, (F, 3)
-        Counter-clockwise seen from the side of their normals.
+    - `points` ``(V, 3)``: a vertex without faces, or with lines only, has the normal (0, 0, 1).
+    - `faces` ``(F, 3)``: counter-clockwise seen from the side of their normals.
     """
     normals = np.zeros((len(points), 3))
     _add(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int32), normals)

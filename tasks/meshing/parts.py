@@ -16,19 +16,10 @@ Indices = NDArray[np.intp]
 def part(mesh: Mesh, faces: Bools) -> tuple[Indices, Indices]:
     """Return the vertices that some faces use, and these faces in numbers of those vertices.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        With ``F`` faces.
-    faces : ndarray of bool, (F,)
-        The faces of the part.
-
-    Returns
-    -------
-    used : ndarray of int, (n,)
-        Indices of vertices of the mesh, ascending.
-    corners : ndarray of int, (k, 3)
-        Indices into ``used``.
+    - `mesh`: with ``F`` faces.
+    - `faces` ``(F,)``: the faces of the part.
+    - `used` ``(n,)``: indices of vertices of the mesh, ascending.
+    - `corners` ``(k, 3)``: indices into ``used``.
     """
     chosen = mesh.faces[faces]
     is_used = np.zeros(len(mesh.vertices), np.bool_)
@@ -40,10 +31,7 @@ def part(mesh: Mesh, faces: Bools) -> tuple[Indices, Indices]:
 def with_levels(meshes: Mapping[int, Mesh]) -> Mesh:
     """Return the meshes of several levels of a tile as one; they share no vertex.
 
-    Parameters
-    ----------
-    meshes : Mapping of int to Mesh
-        By number of the level; level 0 is the first.
+    - `meshes`: by number of the level; level 0 is the first.
     """
     first, *others = meshes.values()
     if not others:
@@ -85,17 +73,9 @@ def middles(points: Floats, faces: NDArray[np.int32]) -> Floats:
 def texture_coordinates(mesh: Mesh, bounds: Bounds) -> Floats:
     """Return the places of a mesh's vertices in an image seen from above, ``(V, 2)``.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        With ``V`` vertices.
-    bounds : tuple of float
-        West, south, east and north of the image's outer edges (m).
-
-    Returns
-    -------
-    ndarray, (V, 2)
-        0 to 1 from west to east, and from south to north.
+    - `mesh`: with ``V`` vertices.
+    - `bounds`: west, south, east and north of the image's outer edges (m).
+    - result ``(V, 2)``: 0 to 1 from west to east, and from south to north.
     """
     west, south, east, north = bounds
     place = mesh.vertices[:, :2] + mesh.origin[:2]

@@ -56,14 +56,9 @@ class Relief:
 def of_mesh(points: Floats, faces: Faces, spacing_m: float) -> Relief:
     """Return the relief of a mesh.
 
-    Parameters
-    ----------
-    points : ndarray, (V, 3)
-        Easting, northing and height (m).
-    faces : ndarray of int32, (F, 3)
-        At least one.
-    spacing_m : float
-        Largest distance of nodes from east to west and from north to south (m).
+    - `points` ``(V, 3)``: easting, northing and height (m).
+    - `faces` ``(F, 3)``: at least one.
+    - `spacing_m`: largest distance of nodes from east to west and from north to south (m).
     """
     west, south = points[:, :2].min(axis=0).tolist()
     east, north = points[:, :2].max(axis=0).tolist()

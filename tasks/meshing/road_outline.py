@@ -44,10 +44,7 @@ class RoadOutline:
 def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
     """Return the union of roads on a grid as WKB, None if no road reaches the grid; gaps are closed.
 
-    Parameters
-    ----------
-    areas : ndarray of polygons
-        In the CRS of the grid.
+    - `areas`: in the CRS of the grid.
     """
     west, south, east, north = core.bounds
     within = shapely.box(west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M)
@@ -65,12 +62,8 @@ def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
 def road_outline(areas: NDArray[np.uint8], local: Bounds, spacing_m: float) -> RoadOutline:
     """Return the outline of roads on a tile, with points at most a distance (m) apart.
 
-    Parameters
-    ----------
-    areas : ndarray
-        The result of `encoded`.
-    local : tuple of float
-        West, south, east and north of the tile (m).
+    - `areas`: the result of `encoded`.
+    - `local`: west, south, east and north of the tile (m).
     """
     united = shapely.from_wkb(areas.tobytes())
     inside = shapely.intersection(shapely.boundary(united), shapely.box(*local))
@@ -82,10 +75,7 @@ def road_outline(areas: NDArray[np.uint8], local: Bounds, spacing_m: float) -> R
 def crossings(areas: NDArray[np.uint8] | None, border: Border) -> Floats:
     """Return where an edge crosses the outline of roads, in metres from its start, ascending, ``(n,)``.
 
-    Parameters
-    ----------
-    areas : ndarray or None
-        The result of `encoded` for ``border.grid``.
+    - `areas`: the result of `encoded` for ``border.grid``.
     """
     if areas is None:
         return np.empty(0)

@@ -40,16 +40,11 @@ class SurveyLimit:
 def survey_limit(outside: Bools, corner: tuple[float, float], cell: float, within: Bounds) -> SurveyLimit:
     """Return the limit of the survey on a tile.
 
-    Parameters
-    ----------
-    outside : ndarray of bool, (H, W)
-        The tile's cells beyond the survey, without halo; row 0 in the north.
-    corner : tuple of float
-        X and y of the north-western corner of the cells (m).
-    cell : float
-        Cell size (m).
-    within : tuple of float
-        West, south, east and north of the area to be meshed (m): the cells or the hull of their centres.
+    - `outside` ``(H, W)``: the tile's cells beyond the survey, without halo; row 0 in the north.
+    - `corner`: X and y of the north-western corner of the cells (m).
+    - `cell`: cell size (m).
+    - `within`: west, south, east and north of the area to be meshed (m): the cells or the hull of their
+      centres.
     """
     if outside.all():
         return SurveyLimit(shapely.MultiLineString(), shapely.MultiPolygon())

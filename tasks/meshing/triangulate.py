@@ -43,12 +43,9 @@ def delaunay(points: Floats, lattices: Sequence[Lattice] = ()) -> Faces:
     Points of a lattice are cocircular. What makes the triangulation unique is the order of insertion (corners
     of the bounding box, then by northing and easting) and, in the squares of the lattices, one diagonal.
 
-    Parameters
-    ----------
-    points : ndarray, (n, 2 or more)
-        No two at the same place in plan.
-    lattices : sequence of Lattice
-        Lattices on which many of the points lie. Their full squares are triangulated without a search.
+    - `points` ``(n, 2 or more)``: no two at the same place in plan.
+    - `lattices`: lattices on which many of the points lie. Their full squares are triangulated without a
+      search.
     """
     filled = [squares(points, *lattice) for lattice in lattices]
     needed = np.ones(len(points), np.bool_)
@@ -79,20 +76,11 @@ def _searched(points: Floats) -> Faces:
 def constrained(points: Floats, segments: Edges, lattices: Sequence[Lattice] = ()) -> Faces:
     """Return the faces of a triangulation in plan that has the segments as edges, ``(F, 3)``.
 
-    Parameters
-    ----------
-    points : ndarray, (n, 2 or more)
-        No two at the same place in plan.
-    segments : ndarray of int, (m, 2)
-        Numbers of the points at their ends. A segment that passes through a point is two edges. One that
-        crosses an earlier segment is left out.
-    lattices : sequence of Lattice
-        Lattices on which many of the points lie.
-
-    Returns
-    -------
-    ndarray of int32, (F, 3)
-        Counter-clockwise; beside the segments the triangulation is Delaunay's.
+    - `points` ``(n, 2 or more)``: no two at the same place in plan.
+    - `segments` ``(m, 2)``: numbers of the points at their ends. A segment that passes through a point is two
+      edges. One that crosses an earlier segment is left out.
+    - `lattices`: lattices on which many of the points lie.
+    - result ``(F, 3)``: counter-clockwise; beside the segments the triangulation is Delaunay's.
     """
     return with_edges(points, delaunay(points, lattices), segments)
 
@@ -331,14 +319,9 @@ class Squares:
 def squares(points: Floats, corner: tuple[float, float], step: float) -> Squares:
     """Return the squares of a lattice that points fill alone.
 
-    Parameters
-    ----------
-    points : ndarray, (n, 2 or more)
-        No two at the same place in plan, none west or south of the corner.
-    corner : tuple of float
-        X and y of the south-western node (m).
-    step : float
-        Distance of the nodes (m).
+    - `points` ``(n, 2 or more)``: no two at the same place in plan, none west or south of the corner.
+    - `corner`: X and y of the south-western node (m).
+    - `step`: distance of the nodes (m).
     """
     place = (points[:, :2] - corner) / step
     nearest = np.rint(place)

@@ -53,13 +53,7 @@ class Fault:
 
 
 def check(mesh: Mesh) -> None:
-    """Check a mesh.
-
-    Raises
-    ------
-    MeshFault
-        With kind, number and first place of the faults.
-    """
+    """Check a mesh."""
     if found := faults(mesh):
         raise MeshFault(
             f"the mesh has {', '.join(map(str, found))}; this is an error of FlexRoad, report it; "

@@ -20,16 +20,9 @@ FIGURES = ("mesh_p95_road_m", "mesh_max_road_m", "mesh_p95_terrain_m", "mesh_max
 def mesh_distances(mesh: Mesh, surface: Surface, road: RoadMask) -> dict[str, float]:
     """Return the vertical distances of a mesh from its surface, steps included, by the names `FIGURES` (m).
 
-    Parameters
-    ----------
-    road : RoadMask
-        Its raw mask classes the places, one in each cell of the core.
-
-    Returns
-    -------
-    dict
-        95th percentile and largest distance per class; NaN for a class without a place on the mesh, and for
-        a surface whose heights are not above their places (`MovingNurbs`).
+    - `road`: its raw mask classes the places, one in each cell of the core.
+    - result: 95th percentile and largest distance per class; NaN for a class without a place on the mesh, and
+      for a surface whose heights are not above their places (`MovingNurbs`).
     """
     if isinstance(surface, MovingNurbs):
         return dict.fromkeys(FIGURES, float("nan"))

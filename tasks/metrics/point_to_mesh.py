@@ -18,15 +18,9 @@ FACES_PER_BIN = 4
 def nearest(vertices: Floats, faces: Indices, points: Floats, at_most: Floats) -> Floats:
     """Return the distance from each point to the nearest point of the mesh, ``(N,)``, m.
 
-    Parameters
-    ----------
-    vertices : ndarray, (V, 3)
-    faces : ndarray of int, (F, 3)
-    points : ndarray, (N, 3)
-        In the coordinates of the vertices.
-    at_most : ndarray, (N,)
-        Upper bound of each distance (m), such as the vertical distance; infinity if there is none. Faces
-        farther away are not searched.
+    - `points` ``(N, 3)``: in the coordinates of the vertices.
+    - `at_most` ``(N,)``: upper bound of each distance (m), such as the vertical distance; infinity if there
+      is none. Faces farther away are not searched.
     """
     plan = vertices[faces][:, :, :2]
     low, high = plan.min(axis=1), plan.max(axis=1)

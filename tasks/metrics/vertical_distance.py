@@ -31,16 +31,10 @@ def drape(mesh: Mesh, grid: Grid) -> Floats:
 def at_nodes(points: Floats, faces: NDArray[np.int32], bounds: Bounds, shape: tuple[int, int]) -> Floats:
     """Return the height of faces at the nodes of a lattice, ``shape``; NaN where no face is below or above.
 
-    Parameters
-    ----------
-    points : ndarray, (V, 3)
-        East, north and height of vertices (m).
-    faces : ndarray of int32, (F, 3)
-        Indices of points.
-    bounds : tuple of float
-        West, south, east and north of the outermost nodes (m); no two may be equal.
-    shape : tuple of int
-        Rows, from north to south, and columns of nodes; 2 of each at least.
+    - `points` ``(V, 3)``: east, north and height of vertices (m).
+    - `faces` ``(F, 3)``: indices of points.
+    - `bounds`: west, south, east and north of the outermost nodes (m); no two may be equal.
+    - `shape`: rows, from north to south, and columns of nodes; 2 of each at least.
     """
     west, south, east, north = bounds
     columns = (points[:, 0] - west) / (east - west) * (shape[1] - 1)

@@ -53,14 +53,9 @@ class Deck:
 def likely_decks(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> list[Deck]:
     """Return the places of road that look like decks.
 
-    Parameters
-    ----------
-    dsm, dtm : (H, W) array
-        Heights (m), NaN where unknown.
-    road : (H, W) array of bool
-        Cells of roads, with those on decks.
-    grid : Grid
-        The grid of all of them.
+    - `dsm`, `dtm`: heights (m), NaN where unknown.
+    - `road`: cells of roads, with those on decks.
+    - `grid`: the grid of all of them.
     """
     points = road & np.isfinite(dsm)
     patches = flat_patches(dsm, points, grid.cell, ROUGHNESS_M, BEND)

@@ -54,22 +54,13 @@ def error_estimate(
     is at least the smaller of the DSM's scatter and the distance to the DTM: a tree crown that the filter
     kept has both, a bridge deck only the second. Where there is no height at all, it is `AGREE_M`.
 
-    Parameters
-    ----------
-    residual : (H, W) array
-        Surface minus the height it was fitted to (m); NaN where none entered the fit.
-    off_dtm : (H, W) array
-        Surface minus DTM (m).
-    scatter : (H, W) array
-        The cells' `scatter` (m).
-    kept : (H, W) array of bool
-        Road cells that the filter kept.
-    road : (H, W) array of bool
-        Road cells.
-    cell : float
-        Size of a cell (m).
-    only_road : bool
-        Leave the cells beside the road NaN; that takes half of the time.
+    - `residual`: surface minus the height it was fitted to (m); NaN where none entered the fit.
+    - `off_dtm`: surface minus DTM (m).
+    - `scatter`: the cells' `scatter` (m).
+    - `kept`: road cells that the filter kept.
+    - `road`: road cells.
+    - `cell`: size of a cell (m).
+    - `only_road`: leave the cells beside the road NaN; that takes half of the time.
     """
     estimate = np.full(residual.shape, np.nan)
     for cells in (road,) if only_road else (road, ~road):
@@ -113,16 +104,10 @@ def climbed(smooth: Floats, dtm: Floats, kept: Bools, cell: float, agree_m: floa
     It is off the DTM there, and steeper than a road, in itself and relative to the DTM: a deck is level above
     a steep bank, and a street in a hill is as steep as the DTM.
 
-    Parameters
-    ----------
-    smooth, dtm : (H, W) array
-        Heights of the surface without steps, and of the terrain (m).
-    kept : (H, W) array of bool
-        Road cells that the filter kept.
-    cell : float
-        Size of a cell (m).
-    agree_m : float
-        Largest difference between two heights of the same ground (m).
+    - `smooth`, `dtm`: heights of the surface without steps, and of the terrain (m).
+    - `kept`: road cells that the filter kept.
+    - `cell`: size of a cell (m).
+    - `agree_m`: largest difference between two heights of the same ground (m).
     """
     steep = kept & (np.abs(smooth - dtm) > agree_m)
     if steep.any():
@@ -214,14 +199,9 @@ def compare(
 ) -> Compared:
     """Compare a surface with DSM and DTM cell by cell; with levels, level 0 with what it sees.
 
-    Parameters
-    ----------
-    data, road, clusters, surface
-        As in `tasks.quality.assess.assess`.
-    agree_m : float
-        Largest difference between two heights of the same ground (m).
-    only_road : bool
-        Leave the estimated error NaN beside the road; that takes less time.
+    - `data`, `road`, `clusters`, `surface`: as in `tasks.quality.assess.assess`.
+    - `agree_m`: largest difference between two heights of the same ground (m).
+    - `only_road`: leave the estimated error NaN beside the road; that takes less time.
     """
     data, clusters = level_data(data, clusters), with_approaches(clusters)
     window = data.grid.window(data.core)

@@ -28,18 +28,11 @@ def flagged_cells(
 ) -> Bits:
     """Return the raised flags of each cell, ``(H, W)``.
 
-    Parameters
-    ----------
-    cells : Compared
-        The surface beside DSM and DTM.
-    cell : float
-        Size of a cell (m).
-    limits : Mapping
-        Threshold of each flag.
-    agree_m : float
-        Largest difference between two heights of the same ground (m).
-    raised : collection of str
-        The flags of the tile.
+    - `cells`: the surface beside DSM and DTM.
+    - `cell`: size of a cell (m).
+    - `limits`: threshold of each flag.
+    - `agree_m`: largest difference between two heights of the same ground (m).
+    - `raised`: the flags of the tile.
     """
     road = cells.on_road
     bits = np.zeros(road.shape, np.uint16)

@@ -49,16 +49,10 @@ def holdout(
 ) -> Holdout:
     """Fit without a share of the road's squares, and compare the surface and its error estimate with them.
 
-    Parameters
-    ----------
-    data, road, clusters
-        As in `tasks.quality.assess.assess`.
-    refit : callable
-        The fit; not needed if ``share`` is 0.
-    agree_m : float
-        Largest difference between two heights of the same ground (m).
-    share : float
-        Share of the squares that are withheld, from 0 to 1.
+    - `data`, `road`, `clusters`: as in `tasks.quality.assess.assess`.
+    - `refit`: the fit; not needed if ``share`` is 0.
+    - `agree_m`: largest difference between two heights of the same ground (m).
+    - `share`: share of the squares that are withheld, from 0 to 1.
     """
     if not share or refit is None:
         return Holdout(np.nan, np.nan, np.nan)

@@ -22,16 +22,9 @@ Place = tuple[float, float]
 def places(cells: Compared, grid: Grid, options: Options) -> dict[str, Place]:
     """Return the place of the worst cell, or of the middle of the largest patch, by flag.
 
-    Parameters
-    ----------
-    cells : Compared
-        The surface beside DSM and DTM, in the cells of ``grid``.
-
-    Returns
-    -------
-    dict of str to tuple
-        Easting and northing (m) by flag, whether it is raised or not. Flags without a place are absent: those
-        of the complete tile (``weights``, ``no-road``) and those of which the tile has no cell.
+    - `cells`: the surface beside DSM and DTM, in the cells of ``grid``.
+    - result: easting and northing (m) by flag, whether it is raised or not. Flags without a place are absent:
+      those of the complete tile (``weights``, ``no-road``) and those of which the tile has no cell.
     """
     road, agree_m = cells.on_road, options.agree_m
     scores = {

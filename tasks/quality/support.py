@@ -36,16 +36,10 @@ def support(
 ) -> NDArray[np.uint8]:
     """Return the `Support` of each cell, ``(H, W)``, for a fit to the DSM on roads and the DTM elsewhere.
 
-    Parameters
-    ----------
-    data : TileData
-        DSM and DTM, m.
-    road : RoadMask
-        Gives the cells beyond the survey.
-    clusters : RoadClusters
-        The road cells fitted to their DSM, and the cells with an invalid DTM.
-    agree_m : float
-        Largest difference between DSM and DTM of the same ground (m).
+    - `data`: DSM and DTM, m.
+    - `road`: gives the cells beyond the survey.
+    - `clusters`: the road cells fitted to their DSM, and the cells with an invalid DTM.
+    - `agree_m`: largest difference between DSM and DTM of the same ground (m).
     """
     has_dtm = np.isfinite(valid_dtm(data, clusters))
     agreed = has_dtm & (np.abs(data.dsm - data.dtm) <= agree_m)
@@ -62,12 +56,8 @@ def of_faces(
 
     Faces at the limit of the survey, and at the outline of a deck, are inferred where the cell lies beyond.
 
-    Parameters
-    ----------
-    classes : ndarray
-        Those of the cells of level 0.
-    others : sequence of (int, Quality)
-        Number and quality of the other levels.
+    - `classes`: those of the cells of level 0.
+    - `others`: number and quality of the other levels.
     """
     cells = road.core.cells(*(middles(mesh.vertices, mesh.faces) + mesh.origin[:2]).T)
     kinds = classes[cells]
@@ -80,12 +70,8 @@ def of_faces(
 def top_support(quality: Quality, top: NDArray[np.int8]) -> NDArray[np.uint8]:
     """Return the `Support` of the highest level in each cell of the core, ``(H, W)``.
 
-    Parameters
-    ----------
-    quality : Quality
-        That of level 0, with the other levels.
-    top : ndarray, (H, W)
-        Number of the highest level in each cell.
+    - `quality`: that of level 0, with the other levels.
+    - `top` ``(H, W)``: number of the highest level in each cell.
     """
     classes = quality.support.copy()
     for number, of_level in quality.levels:

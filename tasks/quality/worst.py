@@ -35,14 +35,9 @@ def worst_piece(estimate: Floats, road: Bools, grid: Grid) -> Worst | None:
 
     Of a tile whose largest connected road is smaller than `PIECE_M2` it is that road.
 
-    Parameters
-    ----------
-    estimate : (H, W) array
-        Estimated error (m), finite on the road.
-    road : (H, W) array of bool
-        Road cells.
-    grid : Grid
-        The grid of both.
+    - `estimate`: estimated error (m), finite on the road.
+    - `road`: road cells.
+    - `grid`: the grid of both.
     """
     parts, number = scipy.ndimage.label(road, EVERY_WAY)
     if not number:

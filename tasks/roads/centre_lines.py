@@ -46,22 +46,11 @@ def read_centre_lines(
 ) -> CentreLines:
     """Return the centre lines whose boxes touch an area.
 
-    Parameters
-    ----------
-    source : Source
-        Vector files; equal lines of several files are one.
-    bounds : Bounds
-        West, south, east and north (m, in ``crs``).
-    crs : str
-        CRS of the result.
-    levels : LevelColumns, optional
-        Columns with the level of a road. Roads below level 0 are then kept, whatever ``options.tunnels``
-        says.
-
-    Raises
-    ------
-    TaskError
-        If a file is missing or cannot be read, or has no such layer or no CRS.
+    - `source`: vector files; equal lines of several files are one.
+    - `bounds`: west, south, east and north (m, in ``crs``).
+    - `crs`: CRS of the result.
+    - `levels`: columns with the level of a road. Roads below level 0 are then kept, whatever
+      ``options.tunnels`` says.
     """
     names = (*columns(options), *NAMES, *DIRECTIONS, JUNCTION)
     names += level_numbers.columns(*levels) if levels else ()

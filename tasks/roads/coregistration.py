@@ -136,12 +136,8 @@ def pair(data: TileData, photo: Orthophoto) -> Pair:
 def shift(pairs: Sequence[Pair], sun: Sun | None = None) -> Shift:
     """Return the common shift and sun that explain the photos of all pairs best.
 
-    Parameters
-    ----------
-    pairs : sequence of Pair
-        Tiles of one flight, at least one, with the same cell.
-    sun : Sun, optional
-        Position of the sun; searched if None.
+    - `pairs`: tiles of one flight, at least one, with the same cell.
+    - `sun`: position of the sun; searched if None.
     """
     cell, n = pairs[0].cell, _reach(pairs[0].cell)
     refinements = CLOSER if sun is None else ()

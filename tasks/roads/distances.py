@@ -18,10 +18,7 @@ from flexroad.tasks.types import Bools, Floats
 def distances(wanted: Bools, mask: Bools) -> Floats:
     """Return the distance from each wanted cell to the nearest cell of the mask, ``(n,)``, in cells.
 
-    Parameters
-    ----------
-    wanted, mask : (H, W) array of bool
-        The result is in row-major order of the wanted cells, and inf if the mask is empty.
+    - `wanted`, `mask`: the result is in row-major order of the wanted cells, and inf if the mask is empty.
     """
     squares, _ = _nearest(np.flatnonzero(wanted), columns_aside(mask))
     return np.asarray(np.sqrt(squares))
@@ -114,16 +111,8 @@ def columns_of(mask: Bools) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
 
     The columns of row ``r`` from ``c`` up to ``d`` are ``columns[before[r * W + c] : before[r * W + d]]``.
 
-    Parameters
-    ----------
-    mask : (H, W) array of bool
-
-    Returns
-    -------
-    columns : (n,) array of int
-        Ascending within a row.
-    before : (H * W + 1,) array of int
-        Number of cells of the mask before each cell.
+    - `columns`: ascending within a row.
+    - `before`: number of cells of the mask before each cell.
     """
     rows, wide = mask.shape
     before, number = np.zeros(mask.size + 1, np.int32), 0

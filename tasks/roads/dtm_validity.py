@@ -40,14 +40,9 @@ def invalid_dtm(data: TileData, road: RoadMask, kept: Bools, near: Slices = EVER
     `AGREE_M`, plus the scatter of those cells, plus the rise of a crest over the distance to the nearest of
     them. Farther than `REACH_M` from all kept cells the DTM is taken as valid.
 
-    Parameters
-    ----------
-    data : TileData
-        DSM and DTM, m.
-    kept : (H, W) array of bool
-        The filtered mask.
-    near : tuple of slice
-        The part of the raster in which the DTM is checked.
+    - `data`: DSM and DTM, m.
+    - `kept`: the filtered mask.
+    - `near`: the part of the raster in which the DTM is checked.
     """
     kept = kept & np.isfinite(data.dsm)
     checked: Bools = np.zeros(kept.shape, np.bool_)
@@ -86,22 +81,12 @@ def extrapolated_plane(
     Moving least squares with Gaussian weights over the given cells up to `REACH_M` away in rows and columns.
     Height and scatter are NaN where there are none, or all of them lie on a line.
 
-    Parameters
-    ----------
-    heights : (H, W) array
-        Heights (m).
-    valid : (H, W) array of bool
-        Cells whose heights are used; at least one.
-    wanted : (H, W) array of bool
-        Cells at which the plane is evaluated; n in number.
-    cell : float
-        Size of a cell (m).
-
-    Returns
-    -------
-    height, scatter, away : (n,) array
-        Height of the plane, scatter of the given cells around it, and distance to the nearest of them (m),
-        which is inf where there are none. In row-major order of the wanted cells.
+    - `heights`: heights (m).
+    - `valid`: cells whose heights are used; at least one.
+    - `wanted`: cells at which the plane is evaluated; n in number.
+    - `cell`: size of a cell (m).
+    - `height`, `scatter`, `away`: height of the plane, scatter of the given cells around it, and distance to
+      the nearest of them (m), which is inf where there are none. In row-major order of the wanted cells.
     """
     datum, n = float(heights[valid].mean()), int(REACH_M / cell)
     bell = np.exp(-0.5 * (np.arange(-n, n + 1) * cell / NEAR_M) ** 2)

@@ -34,12 +34,8 @@ def beyond_extent(data: TileData) -> Bools:
 def covered(road: RoadMask) -> tuple[Bounds, float]:
     """Return the smallest rectangle around all covered cells of a tile, and what of it is beyond the survey.
 
-    Returns
-    -------
-    bounds : tuple of float
-        West, south, east and north (m); those of the core if none of its cells is covered.
-    beyond_m2 : float
-        Area within the bounds that is beyond the survey (m2).
+    - `bounds`: west, south, east and north (m); those of the core if none of its cells is covered.
+    - `beyond_m2`: area within the bounds that is beyond the survey (m2).
     """
     core, inside = road.core, ~road.outside[road.grid.window(road.core)]
     if inside.all() or not inside.any():

@@ -49,23 +49,15 @@ def flat_patches(
     street's slope is the mean over the patches nearby. The second condition excludes patches across a step: a
     plane tilted up to the roof of a car has small residuals.
 
-    Parameters
-    ----------
-    heights : (H, W) array
-        Surface model (m).
-    points : (H, W) array of bool
-        Cells that may belong to a patch; a patch has no other cells.
-    cell : float
-        Size of a cell (m).
-    roughness_m : float
-        Largest root mean square of a patch's residuals (m).
-    bend : float
-        Largest difference of slope (m per m).
-    ground : (H, W) array, optional
-        Terrain model (m), NaN where unknown. A patch with a cell more than ``off_m`` above or below it is
-        left out if its slope, and its slope relative to the terrain's, exceed `CLIMB`: it climbs an object.
-    off_m : float
-        Height difference to the ground (m).
+    - `heights`: surface model (m).
+    - `points`: cells that may belong to a patch; a patch has no other cells.
+    - `cell`: size of a cell (m).
+    - `roughness_m`: largest root mean square of a patch's residuals (m).
+    - `bend`: largest difference of slope (m per m).
+    - `ground`: terrain model (m), NaN where unknown. A patch with a cell more than ``off_m`` above or below
+      it is left out if its slope, and its slope relative to the terrain's, exceed `CLIMB`: it climbs an
+      object.
+    - `off_m`: height difference to the ground (m).
     """
     reach = max(1, math.floor((PATCH_M / cell - 1) / 2 + 1e-9))
     slopes, smooth = _planes(heights, points, reach, roughness_m**2)

@@ -73,10 +73,7 @@ def level_numbers(
     a number in one of ``level_columns``; a word in one of ``structure_columns``. Without any it is on level
     0.
 
-    Parameters
-    ----------
-    table : DataFrame
-        Its columns are named in lower case.
+    - `table`: its columns are named in lower case.
     """
     levels, notes = _osm(table), list[str]()
     for names, read in ((level_columns, _number), (structure_columns, _structure)):

@@ -55,11 +55,6 @@ def clean(mask: Bools, data: TileData, options: Cleanup) -> Bools:
     """Return the cleaned mask, ``(H, W)``; cells beyond the survey are never added.
 
     Gaps are closed before areas are measured, so that a road in fragments counts as one piece.
-
-    Raises
-    ------
-    TaskError
-        If the tile lacks the second source.
     """
     cell = data.grid.cell
     fused = mask if options.fuse == "none" else fuse(mask, _second(data, options), cell, options)

@@ -79,14 +79,9 @@ def judge(
 ) -> Quality:
     """Compare a mask with the truth.
 
-    Parameters
-    ----------
-    mask, truth : Bools
-        Road cells, ``(H, W)``.
-    probability : array, optional
-        Probability of road, ``(H, W)``, 0 to 1.
-    valid : Bools
-        Cells to compare, ``(H, W)``; an edge counts if both its cells are valid.
+    - `mask`, `truth`: road cells, ``(H, W)``.
+    - `probability`: probability of road, ``(H, W)``, 0 to 1.
+    - `valid`: cells to compare, ``(H, W)``; an edge counts if both its cells are valid.
     """
     none = np.zeros(STEPS + 1, np.int64)
     road = ground = none

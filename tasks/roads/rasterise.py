@@ -113,19 +113,10 @@ def cells(areas: NDArray[np.object_], grid: Grid) -> Bools:
 def roads(source: Source | None, grid: Grid, options: Options, levels: LevelColumns | None = None) -> Roads:
     """Return the roads on and around a grid, as polygons.
 
-    Parameters
-    ----------
-    source : Source or None
-        The tile's layer ``roads``.
-    grid : Grid
-        The area to read; roads that touch it are returned whole.
-    levels : LevelColumns, optional
-        Columns with the level of a road. Roads below level 0 are then kept, whatever `Options.tunnels` says.
-
-    Raises
-    ------
-    TaskError
-        If the tile has no such layer, or a file cannot be used.
+    - `source`: the tile's layer ``roads``.
+    - `grid`: the area to read; roads that touch it are returned whole.
+    - `levels`: columns with the level of a road. Roads below level 0 are then kept, whatever
+      `Options.tunnels` says.
     """
     if source is None:
         raise LayerMissing(

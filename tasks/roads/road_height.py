@@ -54,10 +54,7 @@ def dsm_offset(data: TileData, road: Bools) -> Floats:
     Medians are taken at places of a lattice that all tiles share, and interpolated linearly. Without open
     road cells the offset is 0.
 
-    Parameters
-    ----------
-    road : (H, W) array of bool
-        Filtered road cells.
+    - `road`: filtered road cells.
     """
     above = np.where(road, data.dsm - data.dtm, np.nan)
     above[~(np.abs(above) <= OPEN_M)] = np.nan

@@ -79,12 +79,8 @@ def routes(
     The result does not depend on the direction in which lines of two-way roads were drawn, but for its own
     direction, which is that of the first line of a route.
 
-    Parameters
-    ----------
-    max_turn_deg : float
-        Largest turn within a route (degrees), below 90.
-    max_length_m : float
-        Longest route (m); longer ones are divided.
+    - `max_turn_deg`: largest turn within a route (degrees), below 90.
+    - `max_length_m`: longest route (m); longer ones are divided.
     """
     pieces = [
         part

@@ -78,12 +78,8 @@ def largest_of(roots: Roots) -> int:
 def members_of(roots: NDArray[np.int32], cells: int) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     """Return the number of each cell's cluster, in ascending order of roots, and the cells of each cluster.
 
-    Parameters
-    ----------
-    roots : (n,) array of int
-        The root of each cell, a flat index.
-    cells : int
-        Number of cells of the grid.
+    - `roots`: the root of each cell, a flat index.
+    - `cells`: number of cells of the grid.
     """
     member, count = _numbered(roots, cells)
     return member, np.bincount(member, minlength=count)

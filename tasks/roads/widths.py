@@ -104,12 +104,8 @@ class Options(base.Options):
 def metres(text: str, bare_m: float = 1.0) -> float:
     """Return a width in metres, NaN if the text is not a length.
 
-    Parameters
-    ----------
-    text : str
-        As in OSM's tag ``width``: ``7.5``, ``7,5``, ``2 m``, ``24'``, ``24'6"``, ``7 ft``.
-    bare_m : float
-        Metres in the unit of a bare number.
+    - `text`: as in OSM's tag ``width``: ``7.5``, ``7,5``, ``2 m``, ``24'``, ``24'6"``, ``7 ft``.
+    - `bare_m`: metres in the unit of a bare number.
     """
     text = text.strip().lower().translate(PRIMES)
     if both := FEET_INCHES.fullmatch(text):
@@ -123,12 +119,8 @@ def metres(text: str, bare_m: float = 1.0) -> float:
 def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[str, ...]]:
     """Return the width of every row (m), ``(n,)``, and notes on missing or unreadable widths.
 
-    Parameters
-    ----------
-    table : DataFrame
-        Its columns may hold widths and numbers of lanes; names in lower case.
-    classes : sequence of str or None
-        Class of each row.
+    - `table`: its columns may hold widths and numbers of lanes; names in lower case.
+    - `classes`: class of each row.
     """
     bare_m = FOOT_M if options.width_unit == "ft" else 1.0
     width, unreadable = np.full(len(table), np.nan), []

@@ -60,23 +60,12 @@ def minimise(
     The length of a step does not fall with the gradient, so the last step need not be the best: from a start
     that fits exactly, every step raises the loss.
 
-    Parameters
-    ----------
-    objective : callable
-        Returns the loss and its gradient at the variables.
-    start : ndarray
-        Variables to start from; not changed.
-    limit : ndarray
-        Bound on the variables' absolute values, broadcast against ``start``.
-    schedule : Schedule
-        Learning rate and stopping rule.
-
-    Returns
-    -------
-    variables : ndarray
-        Those of the lowest loss, or of the last step with ``schedule.last``.
-    losses : list of float
-        The loss at the start and after each step.
+    - `objective`: returns the loss and its gradient at the variables.
+    - `start`: variables to start from; not changed.
+    - `limit`: bound on the variables' absolute values, broadcast against ``start``.
+    - `schedule`: learning rate and stopping rule.
+    - `variables`: those of the lowest loss, or of the last step with ``schedule.last``.
+    - `losses`: the loss at the start and after each step.
     """
     variables = best = start.copy()
     mean, variance = np.zeros(start.size), np.zeros(start.size)
@@ -104,12 +93,8 @@ def _step(
 ) -> None:  # fmt: skip
     """Take one step in place, all arrays ``(n,)``.
 
-    Parameters
-    ----------
-    rate : float
-        Learning rate over the share of the mean that is known after so many steps.
-    known : float
-        The same share of the variance.
+    - `rate`: learning rate over the share of the mean that is known after so many steps.
+    - `known`: the same share of the variance.
     """
     for i in range(variables.size):
         mean[i] += (1 - BETA_1) * (gradient[i] - mean[i])

@@ -50,19 +50,9 @@ class Banded:
     def solve(self, stencil: Floats, right: Floats, tolerance: float = 0.0, refresh: bool = True) -> Floats:
         """Return the solution for one right-hand side, lines ``(n, width)``; 0 at held control points.
 
-        Parameters
-        ----------
-        stencil : ndarray, (n, p + 1, p + 1, width)
-            The matrix.
-        right : ndarray, (n, width)
-            The right-hand side.
-        tolerance, refresh : float, bool
-            Not used: the solution is exact, and nothing is kept from an earlier one.
-
-        Raises
-        ------
-        TaskError
-            If rounding has made the matrix indefinite.
+        - `stencil` ``(n, p + 1, p + 1, width)``: the matrix.
+        - `right` ``(n, width)``: the right-hand side.
+        - `tolerance`, `refresh`: not used: the solution is exact, and nothing is kept from an earlier one.
         """
         (m, n), p = self.shape, self.degree
         free = np.ones(self.shape) if self.held is None else (~self.held).astype(np.float64)

@@ -115,12 +115,8 @@ class Frame:
     def steps(self, shape: tuple[int, int], beyond_m: float = 0.0) -> tuple[Floats, Floats]:
         """Return the steps of a tile's surface on its border, 0 up to a distance from road cells, m.
 
-        Returns
-        -------
-        south_north : ndarray, (2, W)
-            On the southern and the northern edge, from west to east.
-        west_east : ndarray, (2, H)
-            On the western and the eastern edge, from north to south.
+        - `south_north` ``(2, W)``: on the southern and the northern edge, from west to east.
+        - `west_east` ``(2, H)``: on the western and the eastern edge, from north to south.
         """
         rows, cols = shape
         south_north = [edge.steps_beyond(beyond_m, cols) for edge in (self.south, self.north)]

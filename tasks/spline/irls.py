@@ -122,18 +122,11 @@ class HuberObjective:
     ) -> tuple[Floats, float]:
         """Return the step to the minimum of the quadratic model, as lines, and the loss's slope along it.
 
-        Parameters
-        ----------
-        bend : ndarray, (n, width)
-            Gradient of the bending energy.
-        residuals : ndarray, (H, W)
-            Surface minus targets (m).
-        floor_m : float
-            Smaller differences get the weight of this one (m).
-        share : float
-            Share of the weight of larger differences that enters the matrix.
-        tolerance, refresh : float, bool
-            See `tasks.spline.multigrid.Multigrid.solve`.
+        - `bend` ``(n, width)``: gradient of the bending energy.
+        - `residuals` ``(H, W)``: surface minus targets (m).
+        - `floor_m`: smaller differences get the weight of this one (m).
+        - `share`: share of the weight of larger differences that enters the matrix.
+        - `tolerance`, `refresh`: see `tasks.spline.multigrid.Multigrid.solve`.
         """
         weight, pull = np.empty_like(residuals), np.empty_like(residuals)
         _weigh(residuals, self.objective.factor, floor_m, share, weight, pull)
@@ -157,14 +150,9 @@ class Solution:
 def minimise(loss: HuberObjective, start: Floats, iterations: int, tolerance: float) -> Solution:
     """Minimise the loss: stop when a step lowers it by at most ``tolerance`` of it, or after ``iterations``.
 
-    Parameters
-    ----------
-    start : ndarray, (m, n)
-        Control heights (m); not changed.
-    iterations : int
-        Largest number of steps, at least 1.
-    tolerance : float
-        Relative decrease of the loss at which to stop.
+    - `start` ``(m, n)``: control heights (m); not changed.
+    - `iterations`: largest number of steps, at least 1.
+    - `tolerance`: relative decrease of the loss at which to stop.
     """
     lines = to_lines(start, loss.degree)
     residuals, bend = loss.heights(lines) - loss.objective.target, loss.bend(lines)

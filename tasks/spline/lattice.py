@@ -37,11 +37,6 @@ class Lattice:
         """Return the lattice whose lines are at most the given distance apart (m).
 
         A tile has at least ``degree`` intervals, so that no control point acts on two parallel edges.
-
-        Raises
-        ------
-        TaskError
-            As of `check_spacing`.
         """
         check_spacing(spacing_m, cell)
         n, m = (max(degree, math.ceil(round(count * cell / spacing_m, 6))) for count in cells)
@@ -68,21 +63,12 @@ class Lattice:
     ) -> tuple[Space, tuple[slice, slice]]:
         """Return the splines over a part of the lattice, and the cells whose centres lie in it.
 
-        Parameters
-        ----------
-        shape : tuple of int
-            Rows and columns of the raster.
-        start : tuple of int
-            Rows of the raster to the north and columns to the west of the point from which lines are counted.
-        u, v : Range
-            First and last line along easting and along northing.
-
-        Returns
-        -------
-        space : Space
-            Its parameters are counted in lines.
-        window : tuple of slice
-            (row, col) slices of the raster.
+        - `shape`: rows and columns of the raster.
+        - `start`: rows of the raster to the north and columns to the west of the point from which lines are
+          counted.
+        - `u`, `v`: first and last line along easting and along northing.
+        - `space`: its parameters are counted in lines.
+        - `window`: (row, col) slices of the raster.
         """
         (width, height), (n, m) = self.cells, self.intervals
         # Multiplied before the division, so that equal positions have equal parameters.
@@ -101,13 +87,7 @@ class Lattice:
 
 
 def check_spacing(spacing_m: float, cell: float) -> None:
-    """Check the distance of control points.
-
-    Raises
-    ------
-    TaskError
-        If they would be closer than the cells, which cannot determine them.
-    """
+    """Check the distance of control points."""
     if spacing_m < cell * (1 - 1e-9):
         raise TaskError(f"fit.spacing_m is {spacing_m:g} m, less than a cell of {cell:g} m; raise it")
 

@@ -48,21 +48,13 @@ def border_points(
     Among them are the places where the meshes of the tile or its neighbour end with the survey, and where the
     outline of a road crosses the border.
 
-    Parameters
-    ----------
-    frame : Frame
-        Tells where the border is road.
-    local : Bounds
-        West, south, east and north of the tile (m).
-    cell : float
-        Cell size (m).
-    fine, coarse : sequence of ndarray
-        Distances of possible vertices from the start of an edge, along easting and along northing (m): on the
-        road and elsewhere. Both have the edge's two ends.
-    raw : bool
-        Whether the raw road mask counts, with its outlines, instead of the filtered one.
-    apart_m : float
-        Other vertices are left out within this distance of such a place (m).
+    - `frame`: tells where the border is road.
+    - `local`: west, south, east and north of the tile (m).
+    - `cell`: cell size (m).
+    - `fine`, `coarse`: distances of possible vertices from the start of an edge, along easting and along
+      northing (m): on the road and elsewhere. Both have the edge's two ends.
+    - `raw`: whether the raw road mask counts, with its outlines, instead of the filtered one.
+    - `apart_m`: other vertices are left out within this distance of such a place (m).
     """
     sides = []
     for edge, axis, at in _edges(frame, local):

@@ -78,11 +78,8 @@ class MovingNurbs:
 def moving(surface: NurbsSurface, uniform: bool = False) -> MovingNurbs:
     """Return a surface with the same control heights and weights whose control points stay where they are.
 
-    Parameters
-    ----------
-    uniform : bool
-        Whether the control points have equal distances in plan; else they are at the Greville abscissae,
-        where S(u, v) with unit weights is at the place of (u, v).
+    - `uniform`: whether the control points have equal distances in plan; else they are at the Greville
+      abscissae, where S(u, v) with unit weights is at the place of (u, v).
     """
     west, south, east, north = surface.bounds
     x, y = surface.control_points[..., 0], surface.control_points[..., 1]

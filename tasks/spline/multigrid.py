@@ -59,21 +59,12 @@ class Multigrid:
     def solve(self, stencil: Floats, right: Floats, tolerance: float, refresh: bool) -> Floats:
         """Return the solution for one right-hand side, lines ``(n, width)``; 0 at held control points.
 
-        Parameters
-        ----------
-        stencil : ndarray, (n, p + 1, p + 1, width)
-            The matrix.
-        right : ndarray, (n, width)
-            The right-hand side.
-        tolerance : float
-            Stop when an iteration changes no control height by more than this share of the largest.
-        refresh : bool
-            Whether to compute the coarser matrices and not to use those of an earlier one that is similar.
-
-        Raises
-        ------
-        TaskError
-            If rounding has made the matrix indefinite.
+        - `stencil` ``(n, p + 1, p + 1, width)``: the matrix.
+        - `right` ``(n, width)``: the right-hand side.
+        - `tolerance`: stop when an iteration changes no control height by more than this share of the
+          largest.
+        - `refresh`: whether to compute the coarser matrices and not to use those of an earlier one that is
+          similar.
         """
         stencils, bands, vectors, free = self._buffers
         stencils[: stencil.size] = stencil.ravel()

@@ -80,18 +80,12 @@ def objective(
 ) -> Objective:
     """Prepare the objective for a raster.
 
-    Parameters
-    ----------
-    heights : ndarray, (H, W)
-        Heights above the datum (m); NaN cells are ignored.
-    factor : ndarray, (H, W)
-        Loss per metre of difference in each cell, before the division by the number of cells.
-    space : Space
-        The splines, with the parameters of the raster's columns and rows.
-    lambda_reg : float
-        Weight of the regulariser (1/m).
-    free_weights : bool
-        Whether the weights are variables.
+    - `heights` ``(H, W)``: heights above the datum (m); NaN cells are ignored.
+    - `factor` ``(H, W)``: loss per metre of difference in each cell, before the division by the number of
+      cells.
+    - `space`: the splines, with the parameters of the raster's columns and rows.
+    - `lambda_reg`: weight of the regulariser (1/m).
+    - `free_weights`: whether the weights are variables.
     """
     valid = np.isfinite(heights)
     start_u, along_u = kept_basis(space.knots_u, space.degree[0], space.u)

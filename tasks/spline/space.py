@@ -52,13 +52,7 @@ def points_at_spacing(grid: Grid, degree: int, spacing_m: float) -> tuple[int, i
 
 
 def clamped_space(grid: Grid, degree: int, points: tuple[int, int]) -> Space:
-    """Return the splines over a grid's hull, with clamped uniform knots and parameters from 0 to 1.
-
-    Raises
-    ------
-    TaskError
-        If the grid is a single row or column, or has fewer cells than control points.
-    """
+    """Return the splines over a grid's hull, with clamped uniform knots and parameters from 0 to 1."""
     if min(grid.shape) < 2:
         raise TaskError(f"a surface needs at least 2 x 2 cells, not {grid.width} x {grid.height}")
     # Checked before arrays are allocated: a spacing in the wrong unit would need more memory than there is.
@@ -92,13 +86,7 @@ def surface_on(space: Space, grid: Grid, bounds: Bounds, A: Floats, W: Floats, d
 
 
 def check_cells(heights: Floats, points: tuple[int, int]) -> None:
-    """Raise an error if fewer cells have a height than there are control points.
-
-    Raises
-    ------
-    TaskError
-        With both numbers.
-    """
+    """Raise an error if fewer cells have a height than there are control points."""
     cells = int(np.count_nonzero(np.isfinite(heights)))
     _check_enough(cells, f"{cells} cells with a height", points)
 
@@ -119,11 +107,6 @@ def start_heights(
     With DTM support they are the DTM at the Greville abscissae, else the least-squares plane through the
     road: the start may not depend on the DTM then. Without a road it is the plane through the DTM, since
     there is nothing else.
-
-    Raises
-    ------
-    TaskError
-        If neither the DTM nor the road has a height to start from.
     """
     u, v = greville(space.knots_u, space.degree[0]), greville(space.knots_v, space.degree[1])
     cols = (u - space.u[0]) * ((len(space.u) - 1) / (space.u[-1] - space.u[0]))

@@ -84,16 +84,10 @@ def gram(
 ) -> None:
     """Add the weighted products of basis functions, summed over the cells, to a stencil.
 
-    Parameters
-    ----------
-    weight : ndarray, (H, W)
-        Weight of each cell.
-    start_u, start_v : ndarray of int, (W,) and (H,)
-        First basis function at each column and at each row.
-    along_u, along_v : ndarray, (W, p + 1) and (H, p + 1)
-        Basis functions there, or derivatives of them.
-    stencil : ndarray, (n, p + 1, p + 1, width)
-        Changed in place.
+    - `weight` ``(H, W)``: weight of each cell.
+    - `start_u`, `start_v` ``(W,)``: first basis function at each column and at each row.
+    - `along_u`, `along_v` ``(W, p + 1)``: basis functions there, or derivatives of them.
+    - `stencil` ``(n, p + 1, p + 1, width)``: changed in place.
     """
     rows, cols = weight.shape
     lags = along_v.shape[1]

@@ -186,12 +186,8 @@ def with_steps(beside: Beside, surface: NurbsSurface, core: Grid) -> SteppedSurf
 def _alike(around: Floats, own: Floats) -> Floats:
     """Return the means of steps and of the steps around that are alike, ``(n,)``, m.
 
-    Parameters
-    ----------
-    around : ndarray, (n, 9)
-        Steps of the cell and its neighbours; NaN where the DSM does not show them.
-    own : ndarray, (n,)
-        Those of the cell.
+    - `around` ``(n, 9)``: steps of the cell and its neighbours; NaN where the DSM does not show them.
+    - `own` ``(n,)``: those of the cell.
     """
     weights = np.where(np.isfinite(around), np.exp(-0.5 * ((around - own[:, None]) / ALIKE_M) ** 2), 0.0)
     return np.asarray((weights * np.nan_to_num(around)).sum(axis=1) / weights.sum(axis=1))
@@ -224,12 +220,8 @@ def _walls(around: Floats, smoothed: Floats) -> Floats:
 
     A smoothed step is half as high at the wall as behind it, so that the DTM tells the side of the wall.
 
-    Parameters
-    ----------
-    around : ndarray, (n, 9)
-        Steps of the cell and its neighbours; NaN where hidden.
-    smoothed : ndarray, (n,)
-        The DTM above the spline.
+    - `around` ``(n, 9)``: steps of the cell and its neighbours; NaN where hidden.
+    - `smoothed` ``(n,)``: the DTM above the spline.
     """
     ordered, count = np.sort(around, axis=1), np.isfinite(around).sum(axis=1)
     rows = np.arange(len(around))
@@ -240,12 +232,8 @@ def _walls(around: Floats, smoothed: Floats) -> Floats:
 def between(values: Floats, cells: Bools) -> Floats:
     """Return values with those that are NaN filled: each is the mean of its neighbours among the cells.
 
-    Parameters
-    ----------
-    values : ndarray, (H, W)
-        NaN only in the given cells.
-    cells : ndarray of bool, (H, W)
-        The other cells count as insulated: their values have no effect.
+    - `values` ``(H, W)``: NaN only in the given cells.
+    - `cells` ``(H, W)``: the other cells count as insulated: their values have no effect.
     """
     unknown = cells & np.isnan(values)
     if not unknown.any():
@@ -286,12 +274,8 @@ def border_steps(
     A step is the mean of those of the two cells beside the edge, so that the ground goes on across it. It is
     0 where one of the two has none: the edge of a road is not moved.
 
-    Parameters
-    ----------
-    data, road, clusters : TileData, RoadMask, RoadClusters
-        The cells around the edge, their road mask and the filtered road.
-    spline : NurbsSurface
-        The spline around the edge; NaN if there is no ground.
+    - `data`, `road`, `clusters`: the cells around the edge, their road mask and the filtered road.
+    - `spline`: the spline around the edge; NaN if there is no ground.
     """
     if clusters.beside is None or np.isnan(spline.A).any():
         return {}

@@ -31,13 +31,7 @@ MAX_LOG_WEIGHT = math.log(10)
 
 
 def clamped_knots(points: int, degree: int) -> Floats:
-    """Return uniform knots on [0, 1] with ``degree + 1`` equal ones at each end, ``(points + degree + 1,)``.
-
-    Raises
-    ------
-    ValueError
-        If the number of control points does not exceed the degree.
-    """
+    """Return uniform knots on [0, 1] with ``degree + 1`` equal ones per end, ``(points + degree + 1,)``."""
     if not 1 <= degree < points:
         raise ValueError(f"degree {degree} needs at least {degree + 1} control points, not {points}")
     inner = np.linspace(0.0, 1.0, points - degree + 1)
@@ -67,18 +61,11 @@ def greville(knots: Floats, degree: int) -> Floats:
 def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats]:
     """Evaluate the ``degree + 1`` basis functions that are not zero at each ``u`` (Eq. cox_de_boor).
 
-    Parameters
-    ----------
-    knots : ndarray, (points + degree + 1,)
-    u : ndarray, (N,)
-        Parameters in the domain. A knot belongs to the span on its right, the last to the span on its left.
-
-    Returns
-    -------
-    start : ndarray of int, (N,)
-        Index of the first function that is not zero.
-    values, slopes : ndarray, (N, degree + 1)
-        The functions ``start ... start + degree`` and their first derivatives by u.
+    - `u` ``(N,)``: parameters in the domain. A knot belongs to the span on its right, the last to the span on
+      its left.
+    - `start` ``(N,)``: index of the first function that is not zero.
+    - `values`, `slopes` ``(N, degree + 1)``: the functions ``start ... start + degree`` and their first
+      derivatives by u.
     """
     u = np.asarray(u, dtype=np.float64)[:, None]
     last = len(knots) - degree - 2

@@ -26,17 +26,9 @@ def bending_energy(stiffness: Floats, space: Space) -> Floats:
 
     The energy (m) of control heights z is ``z^T S z / 2``, and ``S z`` is its gradient.
 
-    Parameters
-    ----------
-    stiffness : ndarray, (H, W)
-        Weight of the squared curvature in each cell (m3).
-    space : Space
-        The splines, of degree 2 at least, with the parameters of the raster's columns and rows.
-
-    Returns
-    -------
-    ndarray, (n, p + 1, p + 1, width)
-        See `tasks.spline.stencil`.
+    - `stiffness` ``(H, W)``: weight of the squared curvature in each cell (m3).
+    - `space`: the splines, of degree 2 at least, with the parameters of the raster's columns and rows.
+    - result ``(n, p + 1, p + 1, width)``: see `tasks.spline.stencil`.
     """
     start_u, along_u = _derivatives(space.knots_u, space.degree[0], space.u, space.unit_m[0])
     start_v, along_v = _derivatives(space.knots_v, space.degree[1], space.v, space.unit_m[1])

@@ -32,17 +32,8 @@ MAX_PHOTO_TILES = 12
 def check(catalog: Catalog, config: Config, path: Path, every_deck: bool = False) -> Iterator[Finding]:
     """Yield the contents of a catalog, what would fail in a run with a configuration, and unnamed decks.
 
-    Parameters
-    ----------
-    path : Path
-        File of the catalog: the map of decks is written beside it (`deck_findings`).
-    every_deck : bool
-        Whether to look for decks on all tiles of a large catalog.
-
-    Raises
-    ------
-    CatalogError
-        If a tile names a file that the catalog may not read (`Catalog.read`).
+    - `path`: file of the catalog: the map of decks is written beside it (`deck_findings`).
+    - `every_deck`: whether to look for decks on all tiles of a large catalog.
     """
     check_allowed(catalog)
     tiles = catalog.usable

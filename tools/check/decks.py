@@ -40,16 +40,10 @@ def deck_findings(tiles: Sequence[Tile], config: Config, catalog: Path, every: b
 
     An older map is replaced, or removed if there are none, unless another program has written it since.
 
-    Parameters
-    ----------
-    tiles : sequence of Tile
-        Usable tiles.
-    config : Config
-        Configuration of the run: its first chain has the roads.
-    catalog : Path
-        File of the catalog.
-    every : bool
-        Whether to look at all tiles, not at `MOST_TILES` at most.
+    - `tiles`: usable tiles.
+    - `config`: configuration of the run: its first chain has the roads.
+    - `catalog`: file of the catalog.
+    - `every`: whether to look at all tiles, not at `MOST_TILES` at most.
     """
     chain = next(iter(config.chains.values()))
     tiles = [tile for tile in tiles if tile.layer("road_mask") or tile.layer("roads")]

@@ -96,13 +96,7 @@ class Proposal:
 
 
 def look(folder: Path) -> tuple[list[Download], bool]:
-    """Return the downloads below a folder, by path, and whether the folder has more files than looked at.
-
-    Raises
-    ------
-    CatalogError
-        If the folder does not exist.
-    """
+    """Return the downloads below a folder, by path, and whether the folder has more files than looked at."""
     if not folder.is_dir():
         raise CatalogError(f"folder {folder} does not exist; name the folder of the downloads")
     kinds = {suffix: kind for kind, suffixes in SUFFIXES.items() for suffix in suffixes}

@@ -46,20 +46,12 @@ def of_classes(
 ) -> Aerial:
     """Return an image of a mesh with one colour for road and one for terrain.
 
-    Parameters
-    ----------
-    points : ndarray, (V, 3)
-        Easting, northing and height (m).
-    faces : ndarray of int32, (F, 3)
-        Indices of points.
-    road : ndarray of bool, (F,)
-        The faces that are road.
-    colours : tuple
-        Red, green and blue of road and of terrain, 0 to 255.
-    bounds : tuple of float
-        West, south, east and north of the image (m).
-    pixel_m : float
-        Largest size of a pixel (m).
+    - `points` ``(V, 3)``: easting, northing and height (m).
+    - `faces` ``(F, 3)``: indices of points.
+    - `road` ``(F,)``: the faces that are road.
+    - `colours`: red, green and blue of road and of terrain, 0 to 255.
+    - `bounds`: west, south, east and north of the image (m).
+    - `pixel_m`: largest size of a pixel (m).
     """
     rows, columns = shape(bounds, pixel_m)
     west, south, east, north = bounds

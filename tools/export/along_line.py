@@ -42,16 +42,10 @@ def height_grid(
 
     In narrow bends the margin is smaller, so that the grid does not fold.
 
-    Parameters
-    ----------
-    line : ReferenceLine
-        A part of a line that `reference_line.usable` returns.
-    height : callable
-        The surface in the line's coordinates.
-    v_increment_m : float
-        Distance across, a multiple of 1 mm (m).
-    margin_m : float
-        Width beside the carriageway, on either side (m).
+    - `line`: a part of a line that `reference_line.usable` returns.
+    - `height`: the surface in the line's coordinates.
+    - `v_increment_m`: distance across, a multiple of 1 mm (m).
+    - `margin_m`: width beside the carriageway, on either side (m).
     """
     v = across(line, v_increment_m, margin_m)
     return HeightGrid(line, v, without_gaps(v, height(*line.beside(v))))
@@ -222,12 +216,8 @@ class Stations:
 def stations(line: ReferenceLine, height: HeightAt) -> Stations:
     """Return the segments of a line; what is left of a metre at its end is not one.
 
-    Parameters
-    ----------
-    line : ReferenceLine
-        With points at an even fraction of a metre.
-    height : callable
-        The surface in the line's coordinates; values are NaN where it has none.
+    - `line`: with points at an even fraction of a metre.
+    - `height`: the surface in the line's coordinates; values are NaN where it has none.
     """
     each = round(STEP_M / line.increment / 2)
     middle = np.arange(each, len(line.x) - each, 2 * each)

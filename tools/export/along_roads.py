@@ -119,12 +119,8 @@ class RouteUnit:
     def tile_step(self, line: ReferenceLine, v: Floats, inside: Bools, work: Work) -> float:
         """Return the largest step between the tiles below a road (m); 0 on one tile.
 
-        Parameters
-        ----------
-        v : ndarray, (m,)
-            Distances from the line.
-        inside : ndarray, (n, m)
-            The places beside the line's points that count.
+        - `v` ``(m,)``: distances from the line.
+        - `inside` ``(n, m)``: the places beside the line's points that count.
         """
         x, y = line.beside(v)
         return Ground(self.tiles).largest_tile_step(*work.frame.to_run(x, y), inside, self.levels(x, y))
@@ -317,12 +313,9 @@ def row(
 ) -> Row:
     """Return a road's row of the report.
 
-    Parameters
-    ----------
-    height, step : callable
-        The surface without steps, and how much higher that with steps is, in the line's coordinates.
-    tile_step : float
-        The largest step between the tiles below its carriageway (m).
+    - `height`, `step`: the surface without steps, and how much higher that with steps is, in the line's
+      coordinates.
+    - `tile_step`: the largest step between the tiles below its carriageway (m).
     """
     line = grid.line
     (crg_median, crg_max), (mean, most) = grid_error(grid, height), profile_error(grid, fitted)
@@ -368,13 +361,7 @@ def _metres(length_mm: float | None) -> float | None:
 
 
 def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
-    """Write the report of the roads, if it is new; return the summary for the manifest.
-
-    Raises
-    ------
-    ConfigError
-        If no route has a road.
-    """
+    """Write the report of the roads, if it is new; return the summary for the manifest."""
     every = [road for row in rows for road in row["roads"]]
     if not every:
         raise ConfigError(f"no road could be written: {rows[0]['problem']}, and so on" if rows else NO_ROAD)

@@ -40,23 +40,11 @@ def write(
 ) -> int:
     """Write the meshes of all tiles to one file; return the number of tiles.
 
-    Parameters
-    ----------
-    file : binary file object
-        Open for writing.
-    tiles : iterable of (str, Mesh)
-        Tile ids, which are unique, and meshes; one mesh is in memory at a time.
-    system : str
-        CRS of the meshes.
-    origin : tuple of float
-        Easting, northing and height that the vertices are relative to (m).
-    vertical : str, optional
-        CRS of the heights, if known.
-
-    Raises
-    ------
-    TaskError
-        If the CRS has no EPSG code, or if a mesh has another one.
+    - `file`: open for writing.
+    - `tiles`: tile ids, which are unique, and meshes; one mesh is in memory at a time.
+    - `system`: CRS of the meshes.
+    - `origin`: easting, northing and height that the vertices are relative to (m).
+    - `vertical`: CRS of the heights, if known.
     """
     file.write(header(system, origin, vertical))
     count = 0
@@ -73,11 +61,6 @@ def header(system: str, origin: tuple[float, float, float], vertical: str | None
 
     The CRS is the compound one if the EPSG register has it, else the horizontal one alone: CityJSON has no
     place for two codes. The vertical CRS is then an attribute of the city objects.
-
-    Raises
-    ------
-    TaskError
-        If the CRS has no EPSG code.
     """
     plan = crs.code(system)
     if plan is None:
@@ -107,16 +90,10 @@ def features(
     Vertices that round to the same millimetres are one vertex, and faces that two of them share are left out:
     they have no area.
 
-    Parameters
-    ----------
-    tile_id : str
-        Id of the tile, from which the ids of the city objects are made.
-    mesh : Mesh
-        The mesh of the tile. Faces are counter-clockwise from above.
-    origin : tuple of float
-        That of the header (m).
-    vertical : str, optional
-        CRS of the heights, if known.
+    - `tile_id`: id of the tile, from which the ids of the city objects are made.
+    - `mesh`: the mesh of the tile. Faces are counter-clockwise from above.
+    - `origin`: that of the header (m).
+    - `vertical`: CRS of the heights, if known.
     """
     # The origins are whole metres and are subtracted first: large coordinates would lose digits.
     points = mesh.vertices + np.subtract(mesh.origin, origin)

@@ -25,11 +25,6 @@ def cut(surface: NurbsSurface, bounds: Bounds) -> NurbsSurface:
 
     The part ends with the surface's domain: beyond it the surface is extrapolated, which no spline on the
     same knots can express.
-
-    Raises
-    ------
-    TaskError
-        If the bounds and the domain do not overlap.
     """
     if not overlap(surface.bounds, bounds):
         raise TaskError(
@@ -53,26 +48,10 @@ def cut(surface: NurbsSurface, bounds: Bounds) -> NurbsSurface:
 def patch(surface: NurbsSurface, bounds: Bounds, origin: tuple[float, float]) -> tuple[ExactNurbs, bool]:
     """Return the part of a surface within bounds as a NURBS with control points in space; exact.
 
-    Parameters
-    ----------
-    surface : NurbsSurface
-        The surface.
-    bounds : tuple of float
-        West, south, east and north of the part (m).
-    origin : tuple of float
-        Easting and northing that the control points are relative to (m).
-
-    Returns
-    -------
-    patch : ExactNurbs
-        With the degree of the surface if all weights are equal, which are 1 then; else as by `exact`.
-    rational : bool
-        Whether the weights differ.
-
-    Raises
-    ------
-    TaskError
-        If the bounds and the domain do not overlap.
+    - `bounds`: west, south, east and north of the part (m).
+    - `origin`: easting and northing that the control points are relative to (m).
+    - `patch`: with the degree of the surface if all weights are equal, which are 1 then; else as by `exact`.
+    - `rational`: whether the weights differ.
     """
     part = replace(cut(surface, bounds), origin=origin)
     if np.ptp(surface.W):

@@ -61,22 +61,8 @@ def export(
 ) -> dict[str, Any]:
     """Write the formats, each into a folder of its name, and the manifest last; return the manifest.
 
-    Parameters
-    ----------
-    track : callable
-        Shows the progress: takes the tiles of a format, its name and their number.
-    notify : callable
-        Receives one line about what the user may not expect.
-
-    Raises
-    ------
-    ConfigError
-        If a format is unknown, needs a datum or centre lines, no tile has the photo that is wanted, a tile's
-        results cannot be read, or the folder is in use.
-    ClusterLost
-        If the workers are gone; the same command goes on.
-    OSError
-        If a file cannot be written.
+    - `track`: shows the progress: takes the tiles of a format, its name and their number.
+    - `notify`: receives one line about what the user may not expect.
     """
     chosen = check_formats(formats, options)
     options = replace(options, formats=frozenset(chosen))
@@ -170,13 +156,7 @@ def _earlier(
 
 
 def check_formats(names: Sequence[str], options: Options) -> dict[str, Format]:
-    """Return the formats by name.
-
-    Raises
-    ------
-    ConfigError
-        If a format is unknown, or needs heights above the ellipsoid and no datum is given.
-    """
+    """Return the formats by name."""
     if not names:
         raise ConfigError(f"--format names no format; known are {', '.join(FORMATS)}")
     unknown = [name for name in names if name not in FORMATS]
@@ -195,20 +175,8 @@ def check_formats(names: Sequence[str], options: Options) -> dict[str, Format]:
 def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[str], None]) -> Iterator[None]:
     """Make the folder and hold its lock; a context manager.
 
-    Parameters
-    ----------
-    formats : collection of str
-        The formats to write, each into a folder of its name.
-    notify : callable
-        Receives one line when the lock of a dead process is taken over.
-
-    Raises
-    ------
-    ConfigError
-        If the folder is the run, its store or inside one of them, has existing files that would be replaced,
-        or another process writes there.
-    OSError
-        If it, or its manifest, cannot be written.
+    - `formats`: the formats to write, each into a folder of its name.
+    - `notify`: receives one line when the lock of a dead process is taken over.
     """
     for folder in (run.path, run.store):
         inside = [str(absolute(place)) for place in (out, *out.parents)]
@@ -227,13 +195,7 @@ def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[st
 
 
 def _begun(out: Location, formats: Collection[str]) -> set[str]:
-    """Return the formats of the folder that this or an earlier export has written or begun.
-
-    Raises
-    ------
-    ConfigError
-        If the manifest, or a file in the folder of a format, is not of an earlier export.
-    """
+    """Return the formats of the folder that this or an earlier export has written or begun."""
     own = _formats(out)
     if own is None and exists(out / MANIFEST):
         raise _foreign(out / MANIFEST)
@@ -261,10 +223,7 @@ def _foreign(file: Location) -> ConfigError:
 def remove_unfinished(folder: Location, below: bool = False) -> None:
     """Remove temporary files that an export which was killed has left in a folder; a bucket has none.
 
-    Parameters
-    ----------
-    below : bool
-        Whether folders inside it are searched, too.
+    - `below`: whether folders inside it are searched, too.
     """
     if isinstance(folder, Path):
         for file in folder.rglob(".*") if below else folder.glob(".*"):

@@ -58,13 +58,7 @@ class Ellipsoidal:
     datum: Datum
 
     def geographic(self, easting: Floats, northing: Floats, height: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return longitude and latitude (degrees) and height above the ellipsoid (m), ``(n,)`` each.
-
-        Raises
-        ------
-        CatalogError
-            If PROJ has no exact conversion, as without the grid of the geoid.
-        """
+        """Return longitude and latitude (degrees) and height above the ellipsoid (m), ``(n,)`` each."""
         try:
             if self.datum.kind == "crs":
                 source = compound(self.crs, self.datum.value)

@@ -94,10 +94,7 @@ def _error_m(tile: FinishedTile, unit_m: float) -> float:
     A coordinate that is rounded in plan may be in another cell, with another step. Between the two places the
     surface therefore counts without its steps.
 
-    Parameters
-    ----------
-    unit_m : float
-        Of this unit the coordinates of a file are multiples (m).
+    - `unit_m`: of this unit the coordinates of a file are multiples (m).
     """
     points = tile.mesh.vertices + tile.mesh.origin
     written = np.rint(points / unit_m) * unit_m

@@ -31,12 +31,8 @@ class Georeference:
     def sidecar(self, axes: str, **more: object) -> bytes:
         """Return a JSON document with the place, the meaning of the axes, and other entries.
 
-        Parameters
-        ----------
-        axes : str
-            Directions and units of the file's axes.
-        **more : object
-            Other entries; values that JSON has.
+        - `axes`: directions and units of the file's axes.
+        - `more`: other entries; values that JSON has.
         """
         content = {
             "crs": self.crs,

@@ -51,16 +51,8 @@ class Ground:
 
         NaN off the tiles and beyond the survey. Where tiles meet, the first one with a height counts.
 
-        Parameters
-        ----------
-        levels : PlaceLevels, optional
-            The levels of the points, of which heights are; level 0 where the tile does not have it, but NaN
-            in tubes. None: all of level 0.
-
-        Raises
-        ------
-        ConfigError
-            If a result of a tile cannot be read, or the tile has changed.
+        - `levels`: the levels of the points, of which heights are; level 0 where the tile does not have it,
+          but NaN in tubes. None: all of level 0.
         """
         return self._first(_Patch.height, easting, northing, levels)
 
@@ -73,12 +65,8 @@ class Ground:
     ) -> float:
         """Return the largest step (m) where neighbours of a grid of points lie on two tiles; 0 if none do.
 
-        Parameters
-        ----------
-        easting, northing : ndarray, (n, m)
-            In the run's CRS (m).
-        inside : ndarray, (n, m)
-            The points that count.
+        - `easting`, `northing` ``(n, m)``: in the run's CRS (m).
+        - `inside` ``(n, m)``: the points that count.
         """
         first = np.full(easting.shape, -1)
         for number, tile in reversed(list(enumerate(self.tiles))):

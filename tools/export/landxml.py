@@ -145,12 +145,8 @@ class Part:
 def part(mesh: Mesh, joined: bool = True) -> Part:
     """Return what a mesh gives to a file: all of it but the numbers of its points.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        The mesh of one tile.
-    joined : bool
-        Whether it shares the vertices at its border with its neighbours (`Project.joined`).
+    - `mesh`: the mesh of one tile.
+    - `joined`: whether it shares the vertices at its border with its neighbours (`Project.joined`).
     """
     levels = tuple((number, part(mesh.at(number), joined)) for number in mesh.numbers[1:])
     mesh = mesh.at(0)
@@ -183,10 +179,8 @@ def write(
 ) -> None:
     """Write the meshes of all tiles to one file: `part` of each, then `join`.
 
-    Parameters
-    ----------
-    meshes : iterable of Mesh
-        In any order, all in one CRS; each is read once. Memory is least if neighbours follow each other.
+    - `meshes`: in any order, all in one CRS; each is read once. Memory is least if neighbours follow each
+      other.
     """
     join(file, (part(mesh, project.joined) for mesh in meshes), project, folder, compress)
 
@@ -203,24 +197,13 @@ def join(
     Points are "northing easting height", absolute, in metres, rounded to 0.05 mm. Faces are counter-clockwise
     from above. A class without faces has no surface. Equal inputs give equal bytes.
 
-    Parameters
-    ----------
-    file : binary file object
-        Open for writing.
-    parts_of_meshes : iterable of Part
-        In any order, all in one CRS; each is read once. Memory is least if neighbours follow each other.
-    project : Project
-        Name, time and vertical CRS.
-    folder : Path, optional
-        Folder of the temporary files, which need as much space as the uncompressed file; by default that of
-        the system.
-    compress : bool
-        Whether the file is compressed with gzip.
-
-    Raises
-    ------
-    TaskError
-        If no mesh has a face, or if two meshes have different CRSs.
+    - `file`: open for writing.
+    - `parts_of_meshes`: in any order, all in one CRS; each is read once. Memory is least if neighbours follow
+      each other.
+    - `project`: name, time and vertical CRS.
+    - `folder`: folder of the temporary files, which need as much space as the uncompressed file; by default
+      that of the system.
+    - `compress`: whether the file is compressed with gzip.
     """
     with ExitStack() as stack:
 
@@ -261,12 +244,8 @@ def _collect(
 ) -> str:
     """Add the faces of all parts to the surfaces of their level; return the meshes' CRS.
 
-    Parameters
-    ----------
-    surfaces : dict
-        Road and ground of each level; those of further levels are added.
-    surfaces_of : callable
-        Makes those of a level.
+    - `surfaces`: road and ground of each level; those of further levels are added.
+    - `surfaces_of`: makes those of a level.
     """
     system = ""
     open_vertices: dict[int, dict[Place, _OpenVertex]] = {}

@@ -113,10 +113,7 @@ def _file(route: int) -> str:
 def _road(road: int, line: ReferenceLine, along: Stations, steps: Stations) -> Row:
     """Return the columns of a road in the layer ``roads``.
 
-    Parameters
-    ----------
-    along, steps : Stations
-        Of the surface without steps, and of the steps above it.
+    - `along`, `steps`: of the surface without steps, and of the steps above it.
     """
     step = np.diff(along.s)
     edges = [steps.height + slope * steps.width / 2 for slope in (steps.left, steps.right)]

@@ -85,15 +85,7 @@ LAYERS = (
 def write_mosaics(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
 ) -> dict[str, Any] | None:
-    """Write one raster per quantity over all tiles; with a level, return it for the manifest.
-
-    Raises
-    ------
-    ConfigError
-        If the tiles have no common lattice, or the raster is too large.
-    OSError
-        If a file cannot be written.
-    """
+    """Write one raster per quantity over all tiles; with a level, return it for the manifest."""
     grid = whole_grid([tile.grid for tile in source.tiles], options.resolution_m)
     level, number = options.level, 0
     with _drafts(folder) as drafts:
@@ -124,13 +116,7 @@ def _drafts(folder: Location) -> Iterator[Path]:
 
 @contextmanager
 def _gdal(target: Location, **limits: Any) -> Iterator[None]:
-    """Set GDAL's limits, and raise its errors as those of the system.
-
-    Raises
-    ------
-    OSError
-        If GDAL has an error; names the target.
-    """
+    """Set GDAL's limits, and raise its errors as those of the system."""
     try:
         with rasterio.Env(**limits):
             yield
@@ -139,13 +125,7 @@ def _gdal(target: Location, **limits: Any) -> Iterator[None]:
 
 
 def whole_grid(grids: Sequence[Grid], cell: float | None) -> Grid:
-    """Return the grid over all grids: on their own lattice, or on multiples of a cell size (m).
-
-    Raises
-    ------
-    ConfigError
-        If the grids have no common lattice, or the grid has too many cells.
-    """
+    """Return the grid over all grids: on their own lattice, or on multiples of a cell size (m)."""
     if cell is None:
         whole = Grid.holding(grids)
         if whole is None:

@@ -54,13 +54,7 @@ class Network:
 
 @lru_cache(maxsize=1)
 def network(source: Source, options: Options) -> Network:
-    """Return the roads of an export; the formats of one export share the result.
-
-    Raises
-    ------
-    ConfigError
-        If there are no centre lines, they cannot be read, or none lies on the tiles.
-    """
+    """Return the roads of an export; the formats of one export share the result."""
     boxes = shapely.box(*np.array([tile.grid.bounds for tile in source.tiles]).T)
     found = _read(source, options)
     given = f"--roads {options.roads}" if options.roads else f"the roads of {source.run.path}"

@@ -42,17 +42,11 @@ def encode(mesh: Mesh, materials: str, place: Georeference, photo: Bounds | None
     Coordinates are rounded to 0.05 mm, texture coordinates to 5e-8 of the image. Faces are counter-clockwise
     from above. A class without faces has no group.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        The mesh of one tile.
-    materials : str
-        Name of the file of `encode_materials`, without a folder.
-    place : Georeference
-        What coordinates are relative to.
-    photo : tuple of float, optional
-        West, south, east and north of the outer edges of the image that the materials name (m); None if they
-        name none.
+    - `mesh`: the mesh of one tile.
+    - `materials`: name of the file of `encode_materials`, without a folder.
+    - `place`: what coordinates are relative to.
+    - `photo`: west, south, east and north of the outer edges of the image that the materials name (m); None
+      if they name none.
     """
     head = [f"# {line}" for line in place.lines()]
     blocks = ["\n".join([*head, f"# axes {AXES}", f"mtllib {materials}", ""])]
@@ -75,10 +69,7 @@ def encode(mesh: Mesh, materials: str, place: Georeference, photo: Bounds | None
 def encode_materials(texture: str | None = None) -> bytes:
     """Return the materials ``road`` and ``terrain`` as MTL.
 
-    Parameters
-    ----------
-    texture : str, optional
-        Name of the image of both materials, without a folder; by default each has one colour.
+    - `texture`: name of the image of both materials, without a folder; by default each has one colour.
     """
     lines = []
     for name, colour in COLOURS.items():

@@ -60,17 +60,9 @@ $
 def encode(grid: HeightGrid, comment: str = "") -> bytes:
     """Return the heights along a reference line as OpenCRG.
 
-    Parameters
-    ----------
-    grid : HeightGrid
-        Its x and y are written as they are; NaN are written as NaN.
-    comment : str
-        Text for readers, such as the coordinate system of x, y and the heights; lines of 72 characters.
-
-    Raises
-    ------
-    TaskError
-        If no height is known.
+    - `grid`: its x and y are written as they are; NaN are written as NaN.
+    - `comment`: text for readers, such as the coordinate system of x, y and the heights; lines of 72
+      characters.
     """
     line, known = grid.line, np.isfinite(grid.heights)
     if not known.any():

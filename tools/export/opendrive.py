@@ -74,17 +74,10 @@ def encode(road: Road, left_hand: bool = False) -> bytes:
 def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, name: str = "") -> None:
     """Write roads, one after the other, to a file.
 
-    Parameters
-    ----------
-    file : binary file
-    roads : iterable of bytes
-        Roads with different ids, each of `encode`.
-    proj : str
-        The roads' coordinate system as a PROJ string (`tools.export.local_frame.LocalFrame.proj`).
-    bounds : tuple of float
-        West, south, east and north of the roads (m, in that system).
-    name : str
-        Name of the database.
+    - `roads`: roads with different ids, each of `encode`.
+    - `proj`: the roads' coordinate system as a PROJ string (`tools.export.local_frame.LocalFrame.proj`).
+    - `bounds`: west, south, east and north of the roads (m, in that system).
+    - `name`: name of the database.
     """
     west, south, east, north = map(float, bounds)
     quoted = quoteattr(printable(name))

@@ -141,15 +141,7 @@ def write_pieces(
 
     Files of tiles of an earlier export that are not among the given ones are removed at the end.
 
-    Parameters
-    ----------
-    group : str
-        Name of what the items have in common, if a format has several kinds of them.
-
-    Raises
-    ------
-    ConfigError
-        If a tile's results cannot be read, a file cannot be written, or a worker dies twice.
+    - `group`: name of what the items have in common, if a format has several kinds of them.
     """
     unchanged: list[Row] = []
     kept: set[str] = set()
@@ -195,19 +187,9 @@ def write_whole(file: Location, key: str, row: Row, fill: Callable[[Path], None]
 
     Its former one, if it had another name, is removed.
 
-    Parameters
-    ----------
-    key : str
-        Fingerprint of its content and name.
-    row : dict
-        Kept in its mark.
-    fill : callable
-        Writes the file to a local path.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
+    - `key`: fingerprint of its content and name.
+    - `row`: kept in its mark.
+    - `fill`: writes the file to a local path.
     """
     folder = file.parent
     former = _Mark.read(_whole_marker(folder))
@@ -240,21 +222,9 @@ def write_joined(
 
     The figures of all tiles are returned.
 
-    Parameters
-    ----------
-    tiles : iterable of FinishedTile
-        All tiles of the source.
-    encode : callable
-        Makes the piece of a tile, whose only file has the name of `part_name`; runs in the workers.
-    options : object
-        Given to ``encode``; with the name of the file, also all that ``join`` depends on.
-
-    Raises
-    ------
-    ConfigError
-        If a tile's results cannot be read, a file cannot be written, or a worker dies twice.
-    TaskError
-        If the parts do not fit together.
+    - `tiles`: all tiles of the source.
+    - `encode`: makes the piece of a tile, whose only file has the name of `part_name`; runs in the workers.
+    - `options`: given to ``encode``; with the name of the file, also all that ``join`` depends on.
     """
     folder = file.parent
     made_of = sha256(f"{file.name} {version} {options}".encode())

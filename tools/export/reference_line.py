@@ -181,10 +181,7 @@ def usable(line: ReferenceLine, known: Floats, options: Options) -> list[Referen
     A road ends where the surface ends, and before a bend with a radius of less than half its width: there its
     cross-sections would meet.
 
-    Parameters
-    ----------
-    known : ndarray, (n,)
-        Heights at its points, NaN beyond the surface.
+    - `known` ``(n,)``: heights at its points, NaN beyond the surface.
     """
     return parts(line, np.isfinite(known) & (np.abs(line.curvature) * line.width / 2 < FOLD), options)
 

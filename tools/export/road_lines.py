@@ -52,20 +52,9 @@ def write(path: Path, roads: Iterable[RoadLine], crs: str, date: datetime) -> No
     The layer ``roads`` has a line per road, ``segments`` a line per metre. Numbers that are not known are
     null.
 
-    Parameters
-    ----------
-    path : Path
-    roads : iterable of RoadLine
-        At least one; all with the same columns.
-    crs : str
-        CRS of the points, compound if that of the heights is known.
-    date : datetime
-        Date of the data (UTC), so that equal roads give equal bytes.
-
-    Raises
-    ------
-    TaskError
-        If the file cannot be written.
+    - `roads`: at least one; all with the same columns.
+    - `crs`: CRS of the points, compound if that of the heights is known.
+    - `date`: date of the data (UTC), so that equal roads give equal bytes.
     """
     batch: list[RoadLine] = []
     new = True

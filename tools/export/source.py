@@ -139,11 +139,6 @@ class Source:
         """Yield the tiles one by one, as they were when they were selected.
 
         Only sizes and times of their files are compared, so that each format can have a pass of its own.
-
-        Raises
-        ------
-        ConfigError
-            If a tile is no longer finished, as its sources have changed in the meantime, or has a new result.
         """
         files, place = FileStates(self.run), RunPlace.of(self.run)
         for tile, before in zip(self.tiles, self.snapshots, strict=True):
@@ -176,18 +171,7 @@ def select(
 
     The state of each selected tile is checked here, once for all formats.
 
-    Parameters
-    ----------
-    track : callable
-        Shows the progress of that.
-
-    Raises
-    ------
-    ConfigError
-        If the folder is no run, the variant has no meshes in the store, no selected tile is finished, or
-        tiles have different CRSs.
-    CatalogError
-        If an id is not in the run, or no tile touches the box or the area.
+    - `track`: shows the progress of that.
     """
     run = Run.open(location, allow)
     variants = run.config.export.variants
@@ -208,13 +192,7 @@ def select(
 
 
 def check_photos(tiles: Iterable[Tile]) -> None:
-    """Check that one tile at least has an orthophoto.
-
-    Raises
-    ------
-    ConfigError
-        If none has.
-    """
+    """Check that one tile at least has an orthophoto."""
     if all(tile.layer("dop") is None for tile in tiles):
         raise ConfigError(
             "--drape needs an orthophoto (layer dop), and no exported tile has one; leave out --drape"
@@ -227,15 +205,7 @@ def photographed(tile: FinishedTile) -> TileItem:
 
 
 def texture_of(tile: FinishedTile) -> Texture | None:
-    """Return the photo of a tile, None if it has none; also if the products of its run have none.
-
-    Raises
-    ------
-    ConfigError
-        If a file of the photo changes while it is read.
-    TaskError
-        If a file of the photo is missing, broken, or not one of a photo.
-    """
+    """Return the photo of a tile, None if it has none; also if the products of its run have none."""
     pattern = tile.place.pattern
     with_photo = replace(pattern, export=pattern.export.model_copy(update={"texture": True}))
     try:

@@ -50,24 +50,12 @@ def encode(surface: NurbsSurface, bounds: Bounds, name: str, written: datetime, 
 
     Coordinates have all digits of their float64 numbers. Equal inputs give equal bytes.
 
-    Parameters
-    ----------
-    surface : NurbsSurface
-        The surface of a tile.
-    bounds : tuple of float
-        West, south, east and north of the part, as the tile's core (m). The part ends with the surface's
-        domain where that is smaller.
-    name : str
-        Name of the product, as the tile id.
-    written : datetime
-        Date and time of the file, which the format requires.
-    place : Georeference
-        What coordinates are relative to; its height is 0.
-
-    Raises
-    ------
-    TaskError
-        If the bounds and the surface's domain do not overlap.
+    - `surface`: the surface of a tile.
+    - `bounds`: west, south, east and north of the part, as the tile's core (m). The part ends with the
+      surface's domain where that is smaller.
+    - `name`: name of the product, as the tile id.
+    - `written`: date and time of the file, which the format requires.
+    - `place`: what coordinates are relative to; its height is 0.
     """
     nurbs, rational = patch(surface, bounds, place.origin[:2])
     lines = [f"FlexRoad surface {name}", f"axes {AXES}", *place.lines()]

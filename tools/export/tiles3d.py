@@ -55,18 +55,12 @@ def placed(
 ) -> Placed:
     """Return where a tile's mesh is on the Earth.
 
-    Parameters
-    ----------
-    uri : str
-        Path of the GLB, relative to the tileset.
-    bounds : tuple of float
-        West, south, east and north of the tile (m).
-    heights : tuple of float
-        Lowest and highest height of the mesh (m).
-    origin : tuple of float
-        Easting and northing of the run's origin (m), which the coordinates of its GLB files are relative to.
-    conversion : Ellipsoidal
-        From the CRS and the heights of the run to WGS 84.
+    - `uri`: path of the GLB, relative to the tileset.
+    - `bounds`: west, south, east and north of the tile (m).
+    - `heights`: lowest and highest height of the mesh (m).
+    - `origin`: easting and northing of the run's origin (m), which the coordinates of its GLB files are
+      relative to.
+    - `conversion`: from the CRS and the heights of the run to WGS 84.
     """
     west, south, east, north = bounds
     low, high = heights[0] - MARGIN_M, heights[1] + MARGIN_M
@@ -88,21 +82,11 @@ def placed(
 def sheet_placed(uri: str, points: Floats, conversion: Ellipsoidal) -> tuple[Placed, Floats]:
     """Return where a mesh is whose points are all converted, and its points in the frame of its tile.
 
-    Parameters
-    ----------
-    uri : str
-        Path of the GLB, relative to the tileset.
-    points : ndarray, (V, 3)
-        Easting, northing and height (m).
-    conversion : Ellipsoidal
-        From the CRS and the heights of the run to WGS 84.
-
-    Returns
-    -------
-    Placed
-        Its transform is from east, north and up at the middle of the points, and has no error.
-    ndarray, (V, 3)
-        The points in that frame (m): small numbers, which float32 holds to 0.2 mm at 4 km.
+    - `uri`: path of the GLB, relative to the tileset.
+    - `points` ``(V, 3)``: easting, northing and height (m).
+    - `conversion`: from the CRS and the heights of the run to WGS 84.
+    - result: its transform is from east, north and up at the middle of the points, and has no error.
+    - result ``(V, 3)``: the points in that frame (m): small numbers, which float32 holds to 0.2 mm at 4 km.
     """
     longitude, latitude, height = conversion.geographic(*points.T)
     middle = [float(axis.min() + axis.max()) / 2 for axis in (longitude, latitude, height)]
@@ -134,18 +118,12 @@ def tile(
 ) -> dict[str, Any]:
     """Return the entry of a tile.
 
-    Parameters
-    ----------
-    content : Placed
-        Its mesh.
-    error_m : float
-        Error of showing it instead of the finest tiles (m).
-    parent : Placed, optional
-        The mesh of the tile of which it is a child: the transform of a tile applies to its children, too.
-    children : sequence of dict
-        The entries of tiles that replace it.
-    extras
-        What else is known of the tile.
+    - `content`: its mesh.
+    - `error_m`: error of showing it instead of the finest tiles (m).
+    - `parent`: the mesh of the tile of which it is a child: the transform of a tile applies to its children,
+      too.
+    - `children`: the entries of tiles that replace it.
+    - `extras`: what else is known of the tile.
     """
     matrix = np.reshape(content.transform, (4, 4)).T
     if parent:

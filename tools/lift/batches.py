@@ -22,13 +22,8 @@ def with_heights(
 ) -> Iterator[tuple[T, Heights | None]]:
     """Yield each part, in its order, with the heights of its points.
 
-    Parameters
-    ----------
-    parts : iterable
-    points : callable
-        Returns x and y of the points of a part, ``(n,)`` each; None if it needs no heights.
-    heights : callable
-        Heights of a run.
+    - `points`: returns x and y of the points of a part, ``(n,)`` each; None if it needs no heights.
+    - `heights`: heights of a run.
     """
     batch, size = list[tuple[T, tuple[Floats, Floats] | None]](), 0
     for part in parts:

@@ -162,24 +162,11 @@ def lift(
 ) -> LiftedFile:
     """Write a file with the heights of a run.
 
-    Parameters
-    ----------
-    ground : Ground
-        The run.
-    source, out : Path
-        The file, and where its copy is written: both are complete files of the same format.
-    options : Options
-    crs, offset
-        CRS of the file, and what is added to its coordinates (m), if the file does not say them.
-    report : Path, optional
-        A CSV with a row per road or feature; places above limits are in a GeoPackage beside it.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is of an unknown format, has no CRS, or does not lie on the run's tiles.
-    OSError
-        If an output cannot be written.
+    - `ground`: the run.
+    - `source`, `out`: the file, and where its copy is written: both are complete files of the same format.
+    - `crs`, `offset`: CRS of the file, and what is added to its coordinates (m), if the file does not say
+      them.
+    - `report`: a CSV with a row per road or feature; places above limits are in a GeoPackage beside it.
     """
     _require_outputs(source, out, report)
     with _explained(source):

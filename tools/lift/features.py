@@ -89,12 +89,7 @@ def lifted(
     Lines are straight between their vertices in the CRS of the file. Features without any ground are yielded
     as they are.
 
-    Parameters
-    ----------
-    features : sequence
-        Some of a layer's: they are in memory together.
-    run : RunSurface
-    options : Options
+    - `features`: some of a layer's: they are in memory together.
     """
     paths = _Paths.of(features, run)
     ends = np.cumsum(paths.samples_of_feature(len(features)))

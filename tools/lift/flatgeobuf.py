@@ -68,14 +68,7 @@ def frame(source: Path) -> Frame:
 
 
 def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
-    """Copy a file with heights; yield the rows of the report.
-
-    Raises
-    ------
-    TaskError
-        If the file is damaged or has geometries other than points, lines and polygons; continues a sentence
-        that begins with its name.
-    """
+    """Copy a file with heights; yield the rows of the report."""
     info, rows, failures = _info(source), list[Lifted](), list[Exception]()
     kind = info["geometry_type"]
     if kind not in KINDS and kind.removesuffix(" Z") not in KINDS:

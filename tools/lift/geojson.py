@@ -77,13 +77,7 @@ def _crs(value: Any) -> str | None:
 
 
 def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
-    """Copy a file with heights; yield the rows of the report.
-
-    Raises
-    ------
-    TaskError
-        If the file is no GeoJSON, or damaged; continues a sentence that begins with its name.
-    """
+    """Copy a file with heights; yield the rows of the report."""
     with _opened(source) as file, out.open("w", encoding="latin1", newline="") as copy:
         batch, size, first = list[_Item | str](), 0, 0
         for piece in _pieces(file):

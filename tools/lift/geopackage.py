@@ -66,14 +66,7 @@ def frame(source: Path) -> Frame:
 
 
 def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
-    """Copy a file with heights; yield the rows of the report.
-
-    Raises
-    ------
-    TaskError
-        If the file is damaged or has geometries other than points, lines and polygons; continues a sentence
-        that begins with its name.
-    """
+    """Copy a file with heights; yield the rows of the report."""
     path = vector_name(source)
     shutil.copyfile(path, out)
     with _opened(out) as file:

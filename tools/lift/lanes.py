@@ -30,13 +30,7 @@ class Extent:
 
 
 def extent(road: ET.Element, s: Floats) -> Extent:
-    """Return the extent of the lanes of a road.
-
-    Raises
-    ------
-    TaskError
-        If an attribute is missing or no number; continues a sentence that begins with the name of the road.
-    """
+    """Return the extent of the lanes of a road."""
     middle = np.zeros(len(s))
     if len(offsets := records(road.findall("lanes/laneOffset"))):
         middle = np.where(s < offsets[0, 0], 0.0, value_at(offsets, s))

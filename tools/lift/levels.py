@@ -27,12 +27,8 @@ def along(heights: Heights, wanted: Numbers) -> tuple[Floats, Numbers]:
     a stretch has several levels, that one is taken with which the grade changes least, from before the
     stretch to behind it. A line that has several levels from end to end is on the highest.
 
-    Parameters
-    ----------
-    heights : Heights
-        Of n points in their order along a line.
-    wanted : ndarray, (n,)
-        Numbers of levels, or `ANY`.
+    - `heights`: of n points in their order along a line.
+    - `wanted` ``(n,)``: numbers of levels, or `ANY`.
     """
     z, numbers = heights.ground.copy(), np.zeros(len(wanted), np.int8)
     others = [(number, row) for number, row in zip(heights.numbers, heights.z, strict=True) if number != 0]

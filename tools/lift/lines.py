@@ -37,12 +37,8 @@ class Line:
     def of(cls, x: Floats, y: Floats, metres: tuple[float, float] = (1.0, 1.0), step: float = STEP_M) -> Line:
         """Return a line with points between its vertices, at most ``step`` from each other (m).
 
-        Parameters
-        ----------
-        x, y : ndarray, (k,)
-            Its vertices.
-        metres : tuple of float
-            Length of a unit of x and of y (m).
+        - `x`, `y` ``(k,)``: its vertices.
+        - `metres`: length of a unit of x and of y (m).
         """
         with np.errstate(over="ignore", invalid="ignore"):
             away = np.nan_to_num(np.hypot(np.diff(x) * metres[0], np.diff(y) * metres[1]))
@@ -61,14 +57,9 @@ class Line:
     def needed(self, z: Floats, tolerance: float, add: bool = True) -> NDArray[np.intp]:
         """Return the indices of the vertices that a line needs to stay within a tolerance, its own included.
 
-        Parameters
-        ----------
-        z : ndarray, (n,)
-            Heights (m); NaN where it keeps those that it has.
-        tolerance : float
-            Largest distance of the line from these heights (m).
-        add : bool
-            Whether it gets vertices that it does not have.
+        - `z` ``(n,)``: heights (m); NaN where it keeps those that it has.
+        - `tolerance`: largest distance of the line from these heights (m).
+        - `add`: whether it gets vertices that it does not have.
         """
         if not add or len(z) < 3:
             return np.flatnonzero(self.own)

@@ -104,13 +104,7 @@ class Left:
 
 
 def frame(source: Path) -> Frame:
-    """Return where the coordinates of a file are: its ``geoReference`` and ``offset``.
-
-    Raises
-    ------
-    TaskError
-        If the file cannot be read; continues a sentence that begins with its name.
-    """
+    """Return where the coordinates of a file are: its ``geoReference`` and ``offset``."""
     with xml_text.opened(source) as file:
         for part in xml_text.parts(file, {"header", "road"}):
             if isinstance(part, bytes):
@@ -128,13 +122,7 @@ def frame(source: Path) -> Frame:
 
 
 def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Iterator[Lifted]:
-    """Copy a file with heights; yield the rows of the report.
-
-    Raises
-    ------
-    TaskError
-        If the file cannot be read; continues a sentence that begins with its name.
-    """
+    """Copy a file with heights; yield the rows of the report."""
     of_links = LinkedLevels(source, heights)
     with xml_text.opened(source) as file, xml_text.written(out) as copy:
         parts = map(_read, xml_text.parts(file, {"road"}))

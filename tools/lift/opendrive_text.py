@@ -22,11 +22,8 @@ def records(name: str, pieces: Floats) -> list[str]:
 def with_profiles(road: Part, elevation: Sequence[str], lateral: Sequence[str] | None) -> bytes:
     """Return the text of a road with the elements of its profiles; missing ones are added in their place.
 
-    Parameters
-    ----------
-    road : Part
-    elevation, lateral : sequence of str
-        Elements in ``elevationProfile`` and in ``lateralProfile``; None leaves the latter as it is.
+    - `elevation`, `lateral`: elements in ``elevationProfile`` and in ``lateralProfile``; None leaves the
+      latter as it is.
     """
     around, within = _indents(road)
     edits, added = list[Edit](), ""

@@ -43,13 +43,7 @@ def frame(source: Path) -> Frame:
 
 
 def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Iterator[Lifted]:
-    """Copy a file with heights; yield the rows of the report.
-
-    Raises
-    ------
-    TaskError
-        If the file cannot be read; continues a sentence that begins with its name.
-    """
+    """Copy a file with heights; yield the rows of the report."""
     network = _Network.read(source, _names(source))
     network.find_heights(heights)
     copy = _Added(network, options)

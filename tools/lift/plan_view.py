@@ -60,14 +60,7 @@ class PlanView:
 
 
 def read(road: ET.Element) -> PlanView:
-    """Return the plan of a road.
-
-    Raises
-    ------
-    TaskError
-        If it has none, or an attribute is missing or no number; continues a sentence that begins with the
-        name of the road.
-    """
+    """Return the plan of a road."""
     geometries = road.findall("planView/geometry")
     if not geometries:
         raise TaskError("has no planView with a geometry")
@@ -81,13 +74,7 @@ def read(road: ET.Element) -> PlanView:
 
 
 def numbers(element: ET.Element, *names: str, missing: float | None = None) -> list[float]:
-    """Return attributes as numbers.
-
-    Raises
-    ------
-    TaskError
-        If one is missing (without ``missing``), or is no finite number.
-    """
+    """Return attributes as numbers."""
     found = []
     for name in names:
         text = element.get(name)

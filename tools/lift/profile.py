@@ -21,14 +21,9 @@ def cubic_pieces(s: Floats, z: Floats, slope: Floats, tolerance: float) -> Float
     from piece to piece, and profiles that meet with one value and slope meet exactly. Each piece is as long
     as the tolerance allows.
 
-    Parameters
-    ----------
-    s : ndarray, (n,)
-        Distances along the road, ascending (m); at least two.
-    z, slope : ndarray, (n,)
-        Values of the profile there, and their derivatives by s.
-    tolerance : float
-        Largest distance of a piece from the values between its ends.
+    - `s` ``(n,)``: distances along the road, ascending (m); at least two.
+    - `z`, `slope` ``(n,)``: values of the profile there, and their derivatives by s.
+    - `tolerance`: largest distance of a piece from the values between its ends.
     """
     ends = _ends(s, z, slope, tolerance)
     a, b = ends[:-1], ends[1:]
@@ -50,14 +45,9 @@ def value_at(pieces: Floats, s: Floats) -> Floats:
 def vertices(s: Floats, z: Floats, kept: Bools, tolerance: float) -> NDArray[np.intp]:
     """Return the indices of the points that a line needs so that it stays within a tolerance.
 
-    Parameters
-    ----------
-    s, z : ndarray, (n,)
-        Distances along the line and heights (m).
-    kept : ndarray, (n,)
-        The points that the line has in any case; the first and last one are.
-    tolerance : float
-        Largest distance of the line from the heights of the points that it does not have (m).
+    - `s`, `z` ``(n,)``: distances along the line and heights (m).
+    - `kept` ``(n,)``: the points that the line has in any case; the first and last one are.
+    - `tolerance`: largest distance of the line from the heights of the points that it does not have (m).
     """
     return _vertices(s, z, kept, tolerance)
 

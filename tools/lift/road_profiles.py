@@ -53,12 +53,8 @@ def cross_sections(
 ) -> CrossSections:
     """Return cross-sections.
 
-    Parameters
-    ----------
-    s, t, z, inside, joined
-        As of `CrossSections`.
-    beside : tuple of ndarray, (n,)
-        Heights on the reference line, and `AHEAD_M` before and after it.
+    - `s`, `t`, `z`, `inside`, `joined`: as of `CrossSections`.
+    - `beside` ``(n,)``: heights on the reference line, and `AHEAD_M` before and after it.
     """
     on, before, after = beside
     used = np.where(inside, z, np.nan)

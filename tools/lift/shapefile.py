@@ -77,14 +77,7 @@ def _info(source: Path) -> dict[str, Any]:
 
 
 def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
-    """Copy a file with heights; yield the rows of the report.
-
-    Raises
-    ------
-    TaskError
-        If the file is damaged or has geometries other than points, lines and polygons; continues a sentence
-        that begins with its name.
-    """
+    """Copy a file with heights; yield the rows of the report."""
     vector_name(source)
     parts = _parts(source)
     for end in KEPT:

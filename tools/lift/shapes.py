@@ -55,14 +55,7 @@ class Shape:
 
 
 def of_wkb(data: bytes | memoryview) -> Shape:
-    """Return the geometry of a WKB, in ISO's form or with the flags of EWKB.
-
-    Raises
-    ------
-    TaskError
-        If it is damaged, or has curves or surfaces of triangles; continues a sentence that begins with the
-        name of its feature.
-    """
+    """Return the geometry of a WKB, in ISO's form or with the flags of EWKB."""
     try:
         shape, _ = _read(data, 0, 0)
     except (struct.error, ValueError, IndexError) as error:

@@ -49,11 +49,6 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
 
     A second copy follows if the first one has met roads above roads or the limit of the surface: what a line
     has there depends on those that it meets.
-
-    Raises
-    ------
-    TaskError
-        If the file cannot be read; continues a sentence that begins with its name.
     """
     network = _Network.read(source)
     copy = _Copy(network, Meetings(), heights, options)

@@ -117,13 +117,7 @@ def written(path: Path) -> Iterator[BinaryIO]:
 
 
 def root_name(path: Path) -> str:
-    """Return the name of the outermost element of a file.
-
-    Raises
-    ------
-    TaskError
-        As of `parts`.
-    """
+    """Return the name of the outermost element of a file."""
     with opened(path) as file:
         names = list[str]()
 
@@ -149,17 +143,7 @@ def parts(file: BinaryIO, names: Collection[str]) -> Iterator[bytes | Part]:
 
     Of elements within each other, the outer one is handed over.
 
-    Parameters
-    ----------
-    file : binary file
-    names : collection of str
-        Names of elements, as they are written.
-
-    Raises
-    ------
-    TaskError
-        If the file is no well-formed XML, declares entities, is in UTF-16, or has elements that are too deep
-        or too large. The message continues a sentence that begins with the name of the file.
+    - `names`: names of elements, as they are written.
     """
     reader = _Reader(names)
     try:

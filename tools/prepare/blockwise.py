@@ -76,25 +76,11 @@ def write_blocks(
 
     The points of each block are read first; rasters then take the cells around a block, too, but no points.
 
-    Parameters
-    ----------
-    writer : RasterWriter
-        Writer of the output rasters. Its grid is aligned to the block edges to whole cells.
-    bucketed : BucketedPoints
-        The points on disk; they are removed.
-    options : Options
-        How points become rasters.
-    executor : Executor
-        Runs two worker calls per block, on workers that are held.
-    log : Callable[[str], None]
-        Called with a line of progress: the number of blocks.
-
-    Raises
-    ------
-    ConfigError
-        If the disk is full, or a worker dies.
-    TaskError
-        If a block would not fit in memory.
+    - `writer`: writer of the output rasters. Its grid is aligned to the block edges to whole cells.
+    - `bucketed`: the points on disk; they are removed.
+    - `options`: how points become rasters.
+    - `executor`: runs two worker calls per block, on workers that are held.
+    - `log`: called with a line of progress: the number of blocks.
     """
     first = list(_points_jobs(writer, bucketed, options))
     second = list(_cells_jobs(writer, bucketed, options, first))
@@ -142,13 +128,7 @@ def _cells_jobs(
 
 
 def _check_memory(of_points: Sequence[_PointsJob], of_cells: Sequence[_CellsJob]) -> None:
-    """Check that each block with its rim fits in memory.
-
-    Raises
-    ------
-    TaskError
-        If a block has too many points or cells.
-    """
+    """Check that each block with its rim fits in memory."""
     counts: dict[BlockIndex, int] = {}
     for job in of_points:
         reach = points_reach_m(job.options, job.grid.cell)

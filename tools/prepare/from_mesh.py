@@ -72,27 +72,13 @@ def prepare_mesh(
 ) -> PreparedDataset:
     """Make the rasters and the catalog of an area from a mesh file.
 
-    Parameters
-    ----------
-    path : Path
-        OBJ, PLY or glTF; see `tools.prepare.mesh.read.read_mesh` for colours and georeference.
-    out : Path
-        Output folder.
-    common : PrepareOptions
-        Options shared by all commands.
-    mesh_options : MeshOptions
-        Options of meshes.
-    options : to_rasters.Options
-        How points become rasters.
-    executor : Executor
-        Runs the blocks.
-    log : callable
-        Called with lines of progress.
-
-    Raises
-    ------
-    TaskError, CatalogError, ConfigError
-        If the mesh or the roads cannot be used, or the folder cannot be written; no files are left behind.
+    - `path`: OBJ, PLY or glTF; see `tools.prepare.mesh.read.read_mesh` for colours and georeference.
+    - `out`: output folder.
+    - `common`: options shared by all commands.
+    - `mesh_options`: options of meshes.
+    - `options`: how points become rasters.
+    - `executor`: runs the blocks.
+    - `log`: called with lines of progress.
     """
     check_roads(common)
     log(f"reading {path}")

@@ -59,27 +59,13 @@ def prepare_odm(
 ) -> PreparedDataset:
     """Make the rasters and the catalog of an area from an OpenDroneMap project folder.
 
-    Parameters
-    ----------
-    folder : Path
-        The project: the folder that contains ``odm_dem``, ``odm_orthophoto``, ``odm_texturing``.
-    out : Path
-        Output folder.
-    common : PrepareOptions
-        Options shared by all commands.
-    mesh_options : MeshOptions
-        Options of meshes; used if the project has no surface model.
-    options : to_rasters.Options
-        Ground filter and voids if there is no ``dtm.tif``; all options for a mesh or points.
-    executor : Executor
-        Runs the blocks of points.
-    log : callable
-        Called with lines of progress.
-
-    Raises
-    ------
-    ConfigError, CatalogError, TaskError
-        If the project has none of these files, or one cannot be read; no files are left behind.
+    - `folder`: the project: the folder that contains ``odm_dem``, ``odm_orthophoto``, ``odm_texturing``.
+    - `out`: output folder.
+    - `common`: options shared by all commands.
+    - `mesh_options`: options of meshes; used if the project has no surface model.
+    - `options`: ground filter and voids if there is no ``dtm.tif``; all options for a mesh or points.
+    - `executor`: runs the blocks of points.
+    - `log`: called with lines of progress.
     """
     if (folder / DSM).is_file():
         return _from_rasters(folder, out, common, options, log)

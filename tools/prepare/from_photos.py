@@ -89,27 +89,14 @@ def prepare_photos(
 ) -> PreparedDataset:
     """Make the rasters and the catalog of an area from overlapping photographs with GNSS tags.
 
-    Parameters
-    ----------
-    images : Sequence of Path
-        Photographs, or folders of them.
-    out : Path
-        Output folder.
-    common : PrepareOptions
-        Options shared by all commands. Cells finer than the stereo resolves are made coarser, with a note.
-    photos_options : PhotosOptions
-        Options of photographs.
-    options : to_rasters.Options
-        How points become rasters.
-    executor : Executor
-        Runs photographs and blocks.
-    log : callable
-        Called with lines of progress.
-
-    Raises
-    ------
-    TaskError, CatalogError, ConfigError
-        If pycolmap is missing, a photograph has no position, or they do not match; no files are left behind.
+    - `images`: photographs, or folders of them.
+    - `out`: output folder.
+    - `common`: options shared by all commands. Cells finer than the stereo resolves are made coarser, with a
+      note.
+    - `photos_options`: options of photographs.
+    - `options`: how points become rasters.
+    - `executor`: runs photographs and blocks.
+    - `log`: called with lines of progress.
     """
     check_roads(common)
     sfm.colmap()

@@ -50,35 +50,15 @@ def prepare_points(
     Every file is decoded once. Memory holds one chunk of a file or one block per worker, whatever the size of
     the files and the area. Temporary files take 16 bytes per point.
 
-    Parameters
-    ----------
-    files : Sequence[Path]
-        LAS, LAZ or COPC files, and folders of them.
-    out : Path
-        Output folder.
-    common : PrepareOptions
-        Options shared by all commands.
-    options : Options
-        How points become rasters; its ``ground`` is replaced by the parameter.
-    executor : Executor
-        Reads the files, makes the blocks and writes the COGs.
-    log : Callable[[str], None]
-        Called with lines of progress.
-    ground : str
-        How ground points are identified: ``classes``, ``filter``, ``morphological`` or ``auto``. With
-        ``auto``, classes are used if in every file at least `MIN_GROUND` of the points, but not all, have a
-        ground class.
-
-    Raises
-    ------
-    CatalogError
-        If a file is missing, unreadable, empty or cut short, points are too far apart, the files' CRSs
-        differ or are unknown, or ``ground`` is ``classes`` and no point has a ground class.
-    TaskError
-        If a block, or the road mask, would not fit in memory.
-    ConfigError
-        If the folder cannot be written, the disk is full or too small, or cell and pixel sizes do not fit
-        each other.
+    - `files`: LAS, LAZ or COPC files, and folders of them.
+    - `out`: output folder.
+    - `common`: options shared by all commands.
+    - `options`: how points become rasters; its ``ground`` is replaced by the parameter.
+    - `executor`: reads the files, makes the blocks and writes the COGs.
+    - `log`: called with lines of progress.
+    - `ground`: how ground points are identified: ``classes``, ``filter``, ``morphological`` or ``auto``. With
+      ``auto``, classes are used if in every file at least `MIN_GROUND` of the points, but not all, have a
+      ground class.
     """
     check_roads(common)
     step = common.step_m
@@ -229,13 +209,7 @@ def _left_out(bucketed: BucketedPoints, colourless: Sequence[str]) -> tuple[str,
 def _require_no_gap(
     clouds: Sequence[Cloud], frame: MetricTransform, bucketed: BucketedPoints, cell_m: float
 ) -> None:
-    """Check that a large area is not large because of a few distant points.
-
-    Raises
-    ------
-    CatalogError
-        If an area of more than `LARGE` cells has an empty gap of `GAP_M` and of half its side.
-    """
+    """Check that a large area is not large because of a few distant points."""
     west, south, east, north = bucketed.bounds
     if (east - west) * (north - south) <= LARGE * cell_m**2:
         return

@@ -42,15 +42,7 @@ def bounded() -> Iterator[None]:
 def image_errors(failure: str, remedy: str, file: Path) -> Iterator[None]:
     """Context manager that bounds images, and turns the errors of reading one into a `TaskError`.
 
-    Parameters
-    ----------
-    failure : str
-        Beginning of the message: the image, and that it cannot be read.
-
-    Raises
-    ------
-    TaskError
-        If the image is damaged or has too many pixels.
+    - `failure`: beginning of the message: the image, and that it cannot be read.
     """
     try:
         with bounded():
@@ -64,13 +56,7 @@ def image_errors(failure: str, remedy: str, file: Path) -> Iterator[None]:
 
 
 def check_pixels(image: PIL.Image.Image, name: str, remedy: str, file: Path) -> None:
-    """Check the size of an open image before its pixels are read.
-
-    Raises
-    ------
-    TaskError
-        If it has more than `MOST_PIXELS`, see `image_errors` for the parameters.
-    """
+    """Check the size of an open image before its pixels are read."""
     if image.width * image.height > MOST_PIXELS:
         raise TaskError(
             f"{name} has {image.width:,} x {image.height:,} pixels, more than {MOST_PIXELS / 1e6:.0f} "

@@ -45,31 +45,13 @@ def prepared_grid(
 ) -> Grid:
     """Return the grid of an area: on multiples of the cell and the pixel, after all limits are checked.
 
-    Parameters
-    ----------
-    bounds : tuple of float
-        Bounds of the data (m).
-    crs : str
-        CRS of the rasters.
-    common : PrepareOptions
-        Cell, pixel, tile size and roads.
-    source : str
-        What the data is, for messages: a file.
-    out : Path
-        Output folder.
-    photo : bool
-        Whether there is an orthophoto.
-    per_cell : int
-        Memory of the steps that hold the complete area (bytes per cell).
-
-    Raises
-    ------
-    CatalogError
-        If the area is too large.
-    TaskError
-        If there is too little memory.
-    ConfigError
-        If there is too little space on the disk.
+    - `bounds`: bounds of the data (m).
+    - `crs`: CRS of the rasters.
+    - `common`: cell, pixel, tile size and roads.
+    - `source`: what the data is, for messages: a file.
+    - `out`: output folder.
+    - `photo`: whether there is an orthophoto.
+    - `per_cell`: memory of the steps that hold the complete area (bytes per cell).
     """
     west, south, east, north = bounds
     sides = east - west, north - south
@@ -107,21 +89,10 @@ def _aligned(bounds: Bounds, crs: str, cell: float, step: float) -> Grid:
 def check_disk(out: Path, needed: float, what: str, remedy: str) -> None:
     """Check that temporary files fit on the disk of a folder.
 
-    Parameters
-    ----------
-    out : Path
-        The folder; it need not exist.
-    needed : float
-        Estimated size (bytes).
-    what : str
-        What needs it: the beginning of the message.
-    remedy : str
-        What the user can do.
-
-    Raises
-    ------
-    ConfigError
-        If there is less space.
+    - `out`: the folder; it need not exist.
+    - `needed`: estimated size (bytes).
+    - `what`: what needs it: the beginning of the message.
+    - `remedy`: what the user can do.
     """
     existing = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
     free = shutil.disk_usage(existing).free
@@ -135,19 +106,9 @@ def check_disk(out: Path, needed: float, what: str, remedy: str) -> None:
 def check_extent(name: str, plan: NDArray[np.float64], before: Bounds | None) -> None:
     """Check that new points are not too far from each other and from the points before them.
 
-    Parameters
-    ----------
-    name : str
-        The file, for the message.
-    plan : ndarray, (2, n)
-        Eastings and northings (m).
-    before : tuple of float, optional
-        Bounds of the points before: west, south, east, north (m).
-
-    Raises
-    ------
-    CatalogError
-        If they are more than `LONGEST_M` apart.
+    - `name`: the file, for the message.
+    - `plan` ``(2, n)``: eastings and northings (m).
+    - `before`: bounds of the points before: west, south, east, north (m).
     """
     bounds = np.array([plan.min(axis=1), plan.max(axis=1)])
     if before is not None:

@@ -48,13 +48,7 @@ class PrepareOptions:
 
     @property
     def step_m(self) -> float:
-        """The larger of cell and pixel (m), a multiple of the smaller; grids are aligned to multiples of it.
-
-        Raises
-        ------
-        ConfigError
-            If a size is not positive, or neither is a multiple of the other.
-        """
+        """The larger of cell and pixel (m), a multiple of the smaller; grids are aligned to its multiples."""
         small, large = sorted((self.cell_m, self.dop_cell_m))
         pair = f"--cell {self.cell_m:g} --dop-cell {self.dop_cell_m:g}"
         if not small > 0:

@@ -30,11 +30,6 @@ def check_replaced(out: Path) -> None:
 
     A raster is, if it has the tag of its layer. The catalog is, if it lies beside such a DSM: it is removed
     before the rasters are, and written after them.
-
-    Raises
-    ------
-    ConfigError
-        If a file is of another program, or is no regular file, or the folder is a file.
     """
     if not out.is_dir():
         if out.exists():
@@ -60,13 +55,7 @@ def _is_own(raster: Path) -> bool:
 
 @contextlib.contextmanager
 def disk_errors(where: Path) -> Iterator[None]:
-    """Context manager that turns an `OSError` of the disk into a `ConfigError` of one line.
-
-    Raises
-    ------
-    ConfigError
-        If the disk is full or the file or folder cannot be written.
-    """
+    """Context manager that turns an `OSError` of the disk into a `ConfigError` of one line."""
     try:
         yield
     except OSError as error:
@@ -78,11 +67,6 @@ def scratch_folder(out: Path) -> Iterator[Path]:
     """Context manager that makes a hidden temporary folder inside ``out`` and removes it at the end.
 
     ``out`` is created if it does not exist, and removed again if nothing was written to it.
-
-    Raises
-    ------
-    ConfigError
-        If the folder cannot be written.
     """
     new = not out.exists()
     try:

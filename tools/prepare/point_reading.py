@@ -112,27 +112,12 @@ def bucket_points(
 ) -> BucketedPoints:
     """Move the points of all files to metres and sort them into buckets, except noise and withheld points.
 
-    Parameters
-    ----------
-    clouds : Sequence[Cloud]
-        The input files.
-    frame : MetricTransform
-        Transforms their coordinates to metres.
-    folder : Path
-        Folder for the files of points; they take 16 bytes per point.
-    edge : float
-        Edge of a block (m).
-    executor : Executor
-        Runs a worker call per million points.
-    log : Callable[[str], None]
-        Called with one line of progress per file.
-
-    Raises
-    ------
-    CatalogError
-        If a file cannot be read, points are too far apart or have no position in metres, or no point is left.
-    ConfigError
-        If the disk is full, or a worker dies.
+    - `clouds`: the input files.
+    - `frame`: transforms their coordinates to metres.
+    - `folder`: folder for the files of points; they take 16 bytes per point.
+    - `edge`: edge of a block (m).
+    - `executor`: runs a worker call per million points.
+    - `log`: called with one line of progress per file.
     """
     parts: list[_Part] = []
     bounds: Bounds | None = None

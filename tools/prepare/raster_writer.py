@@ -132,13 +132,6 @@ class RasterWriter:
         """Write a window of a layer: heights (m, NaN where there is none) or a mask, ``(H, W)``.
 
         Of ``road_height`` it has all bands, ``(3, H, W)``.
-
-        Raises
-        ------
-        ConfigError
-            If the disk is full.
-        CatalogError
-            If ``part`` is not a window of the writer's grid.
         """
         heights = layer in HEIGHTS
         with self._writing(layer):
@@ -148,15 +141,7 @@ class RasterWriter:
             raster.write(bands, window=_window(self.grid, part))
 
     def write_photo(self, photo: Orthophoto) -> None:
-        """Write a window of the orthophoto; pixels without a colour are masked.
-
-        Raises
-        ------
-        ConfigError
-            If the disk is full, or the writer was created without an orthophoto.
-        CatalogError
-            If the orthophoto's grid is not a window of the writer's pixels.
-        """
+        """Write a window of the orthophoto; pixels without a colour are masked."""
         if self.photo_grid is None:
             raise ConfigError(f"no orthophoto was requested in {self.out}")
         with self._writing(PHOTO), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
@@ -186,28 +171,13 @@ class RasterWriter:
     ) -> PreparedDataset:
         """Convert the rasters to COGs and write the catalog; existing outputs in the folder are replaced.
 
-        Parameters
-        ----------
-        tile_size_m : float
-            Side of a tile (m). An area no larger than this is a single tile; a larger one is divided at
-            multiples of it.
-        date : datetime, optional
-            Acquisition date; None: ``assumed`` is used, with a note.
-        dataset : str
-            Name of the data in reports.
-        min_cover : float
-            Tiles with heights in less than this share (0 to 1) of their cells are left out.
-        assumed : datetime, optional
-            When the source was written, with a time zone; None: now.
-        executor : Executor
-            Converts each layer by a worker call.
-
-        Raises
-        ------
-        ConfigError
-            If the disk is full, a worker dies, or no tile has enough heights.
-        CatalogError
-            If the roads overlap no tile.
+        - `tile_size_m`: side of a tile (m). An area no larger than this is a single tile; a larger one is
+          divided at multiples of it.
+        - `date`: acquisition date; None: ``assumed`` is used, with a note.
+        - `dataset`: name of the data in reports.
+        - `min_cover`: tiles with heights in less than this share (0 to 1) of their cells are left out.
+        - `assumed`: when the source was written, with a time zone; None: now.
+        - `executor`: converts each layer by a worker call.
         """
         names = [layer for layer in LAYERS if layer in self._open]
         for layer in names:

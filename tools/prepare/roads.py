@@ -47,13 +47,7 @@ LINES = ("LineString", "MultiLineString")
 
 
 def check_roads(common: PrepareOptions) -> None:
-    """Check the roads before the work that precedes their use; a mesh is only checked to exist.
-
-    Raises
-    ------
-    ConfigError
-        If the roads do not exist, are no raster, mesh or vector file, or lack the layer or a feature of it.
-    """
+    """Check the roads before the work that precedes their use; a mesh is only checked to exist."""
     path = common.roads
     if path is None:
         return
@@ -67,15 +61,7 @@ def check_roads(common: PrepareOptions) -> None:
 def add_roads(writer: RasterWriter, common: PrepareOptions) -> bool:
     """Write the road mask, if roads were given; a vector file of roads is entered in the catalog, too.
 
-    Returns
-    -------
-    bool
-        Whether a road mask was written: False without roads, and for lines.
-
-    Raises
-    ------
-    ConfigError
-        If the roads cannot be read, or none is on the writer's grid.
+    - result: whether a road mask was written: False without roads, and for lines.
     """
     if common.roads is None:
         return False
@@ -115,23 +101,11 @@ def burn(
 ) -> Bools | None:
     """Return the cells whose centre is road, ``(H, W)``, or None if the roads are lines.
 
-    Parameters
-    ----------
-    path : Path
-        Polygons in any format GDAL reads; a raster that is not 0 on roads; or a mesh of the roads.
-    layer : str, optional
-        Layer of a vector file; required if it has several.
-    where : str, optional
-        SQL condition that selects features: ``class = 'road'``.
-    grid : Grid
-        The cells.
-    notify : callable
-        Receives one line about text in another encoding than declared.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, holds points, or has no road on the grid.
+    - `path`: polygons in any format GDAL reads; a raster that is not 0 on roads; or a mesh of the roads.
+    - `layer`: layer of a vector file; required if it has several.
+    - `where`: SQL condition that selects features: ``class = 'road'``.
+    - `grid`: the cells.
+    - `notify`: receives one line about text in another encoding than declared.
     """
     mask = _mesh(path, grid) if path.suffix.lower() in MESHES else _raster(path, grid)
     if mask is None:

@@ -37,22 +37,11 @@ def write_report(
 ) -> Location:
     """Write RUN/report.<form> and return its path.
 
-    Parameters
-    ----------
-    run : Run
-    form : {"md", "csv", "html"}
-    track : callable
-        Shows the progress of each step.
-    viewer : Location, optional
-        Folder of `flexroad view`, to which an HTML report links; by default RUN/viewer if there is one.
-    compared : Location, optional
-        Another run over the same tiles, with which an HTML report compares the figures; by default this run
-        before its last execution.
-
-    Raises
-    ------
-    ConfigError
-        If ``compared`` has no rows, or ``viewer`` has no page.
+    - `track`: shows the progress of each step.
+    - `viewer`: folder of `flexroad view`, to which an HTML report links; by default RUN/viewer if there is
+      one.
+    - `compared`: another run over the same tiles, with which an HTML report compares the figures; by default
+      this run before its last execution.
     """
     address = _viewer_address(run, viewer) if form == "html" else ""
     before = _before(run, compared) if form == "html" else None

@@ -140,13 +140,7 @@ class Content:
 
 
 def gather(run: Run, track: Track = untracked) -> Content:
-    """Collect the tables of a run; of one that is not finished, those of the tiles so far.
-
-    Raises
-    ------
-    ConfigError
-        If metrics.parquet is damaged.
-    """
+    """Collect the tables of a run; of one that is not finished, those of the tiles so far."""
     rows = _rows(run)
     done = rows[rows.status == "done"]
     states: dict[str, TileState] = {}

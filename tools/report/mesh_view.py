@@ -54,20 +54,13 @@ def draw(
 ) -> Image.Image:
     """Draw one mesh as seen obliquely from the south-south-west.
 
-    Parameters
-    ----------
-    vertices : ndarray
-        East, north and up, ``(V, 3)``, m.
-    faces : ndarray
-        Vertex indices, ``(F, 3)``, counter-clockwise seen from above.
-    road : ndarray
-        True for road faces, ``(F,)``.
-    colours : ndarray, optional
-        Red, green and blue at the vertices, ``(V, 3)``; by default road and terrain have one colour each.
-    within : sequence of float, optional
-        West, south, east and north of the part to draw, in the vertices' coordinates (m).
-    size_px : sequence of int
-        Width and height of the picture.
+    - `vertices`: east, north and up, ``(V, 3)``, m.
+    - `faces`: vertex indices, ``(F, 3)``, counter-clockwise seen from above.
+    - `road`: true for road faces, ``(F,)``.
+    - `colours`: red, green and blue at the vertices, ``(V, 3)``; by default road and terrain have one colour
+      each.
+    - `within`: west, south, east and north of the part to draw, in the vertices' coordinates (m).
+    - `size_px`: width and height of the picture.
     """
     whole = pv.PolyData.from_regular_faces(vertices * [1, 1, EXAGGERATION], faces)
     # Normals are computed on the complete mesh, so that there is no seam between road and terrain.

@@ -52,15 +52,9 @@ def tile_pictures(
 ) -> list[TilePictures]:
     """Draw the exported variant of every tile, or of a large run that of the worst tiles.
 
-    Parameters
-    ----------
-    run : Run
-    content : Content
-        Its tables.
-    first : sequence of str
-        Ids of finished tiles that are drawn in any case, and come first.
-    track : callable
-        Shows the progress.
+    - `content`: its tables.
+    - `first`: ids of finished tiles that are drawn in any case, and come first.
+    - `track`: shows the progress.
     """
     variant = run.config.export.variants[0]
     tile_ids = list(dict.fromkeys([*first, *_shown(content)]))
@@ -141,23 +135,13 @@ def render_meshes(
 ) -> dict[str, bytes | None]:
     """Draw oblique views of meshes from the south, all in one child process.
 
-    Parameters
-    ----------
-    meshes : Mapping of str to Mesh
-        Meshes by name.
-    colours : Mapping of str to ndarray, optional
-        Red, green and blue at the vertices of each mesh, ``(V, 3)``; by default road and terrain have one
-        colour each.
-    within : Bounds, optional
-        The part to draw (m, in the meshes' CRS); by default the complete mesh.
-    size_px : tuple of int, optional
-        Width and height of a picture.
-
-    Returns
-    -------
-    dict
-        A PNG by name, or None if it could not be drawn; the reason is logged as a warning. Heights are
-        exaggerated by the factor given in the picture.
+    - `meshes`: meshes by name.
+    - `colours`: red, green and blue at the vertices of each mesh, ``(V, 3)``; by default road and terrain
+      have one colour each.
+    - `within`: the part to draw (m, in the meshes' CRS); by default the complete mesh.
+    - `size_px`: width and height of a picture.
+    - result: a PNG by name, or None if it could not be drawn; the reason is logged as a warning. Heights are
+      exaggerated by the factor given in the picture.
     """
     if not meshes:
         return {}

@@ -61,12 +61,8 @@ NEAR, LINE = 0.3, 0.04
 def hillshade(height: Floats, grid: Grid, title: str = "", road: Bools | None = None) -> bytes:
     """Draw heights as a shaded relief with a colour bar.
 
-    Parameters
-    ----------
-    height : Floats
-        Heights (m), ``(H, W)``; NaN stays empty.
-    road : Bools, optional
-        Road cells, drawn over the relief.
+    - `height`: heights (m), ``(H, W)``; NaN stays empty.
+    - `road`: road cells, drawn over the relief.
     """
     low, high = _limits(height)
     norm = Normalize(low, high)
@@ -81,12 +77,8 @@ def hillshade(height: Floats, grid: Grid, title: str = "", road: Bools | None = 
 def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: str = "") -> bytes:
     """Draw the kept and the dropped part of a road mask over the relief; the legend gives both areas.
 
-    Parameters
-    ----------
-    height : Floats
-        The DSM (m), ``(H, W)``.
-    raw, kept : Bools
-        Road before and after the filter (the paper's M^r and M^{r+}), ``(H, W)``.
+    - `height`: the DSM (m), ``(H, W)``.
+    - `raw`, `kept`: road before and after the filter (the paper's M^r and M^{r+}), ``(H, W)``.
     """
     return _parts_picture(height, (("kept", kept, KEPT), ("dropped", raw & ~kept, DROPPED)), grid, title)
 
@@ -96,14 +88,9 @@ def support_picture(
 ) -> bytes:
     """Draw the support of the surface on road cells over the relief; the legend gives the areas.
 
-    Parameters
-    ----------
-    height : Floats
-        The DSM (m), ``(H, W)``.
-    support : ndarray
-        Class of each cell, a `flexroad.tasks.quality.support.Support`, ``(H, W)``.
-    road : Bools
-        Road cells before the filter, ``(H, W)``.
+    - `height`: the DSM (m), ``(H, W)``.
+    - `support`: class of each cell, a `flexroad.tasks.quality.support.Support`, ``(H, W)``.
+    - `road`: road cells before the filter, ``(H, W)``.
     """
     kinds = (Support.MEASURED, KEPT), (Support.DTM, BY_DTM), (Support.INFERRED, DROPPED)
     names = {Support.MEASURED: "measured", Support.DTM: "DTM", Support.INFERRED: "inferred"}
@@ -141,15 +128,10 @@ def error_map(
 ) -> bytes:
     """Draw signed vertical errors: red is too high, blue too low, arrows say that some exceed the limit.
 
-    Parameters
-    ----------
-    error : Floats
-        Mesh or surface minus reference (m), ``(H, W)``; NaN stays empty.
-    road : Bools, optional
-        Cells whose outline is drawn.
-    limit_m : float, optional
-        End of the colour bar on both sides (m). By default the 98th percentile of the absolute error,
-        rounded up to 1, 2 or 5 times a power of ten; set it to compare pictures.
+    - `error`: mesh or surface minus reference (m), ``(H, W)``; NaN stays empty.
+    - `road`: cells whose outline is drawn.
+    - `limit_m`: end of the colour bar on both sides (m). By default the 98th percentile of the absolute
+      error, rounded up to 1, 2 or 5 times a power of ten; set it to compare pictures.
     """
     limit = limit_m if limit_m is not None else _round_limit(error)
     figure, axes = _map(error, grid, title, "RdBu_r", Normalize(-limit, limit))
@@ -166,12 +148,8 @@ def segmentation_map(
 ) -> bytes:
     """Draw the outlines of labelled and segmented road over an orthophoto.
 
-    Parameters
-    ----------
-    photo : ndarray
-        An orthophoto of the grid (red, green, blue), ``(3, h, w)``.
-    truth, segmented : Bools
-        Road by the labels and by the segmenter, ``(H, W)``.
+    - `photo`: an orthophoto of the grid (red, green, blue), ``(3, h, w)``.
+    - `truth`, `segmented`: road by the labels and by the segmenter, ``(H, W)``.
     """
     figure, axes = _map(np.moveaxis(photo, 0, -1) / 255, grid, title)
     # The first line is wider, so that it is visible below the second where both agree.
@@ -193,16 +171,10 @@ def curves(
 ) -> bytes:
     """Draw lines in one chart.
 
-    Parameters
-    ----------
-    lines : Mapping of str to pair of Floats
-        The x and y values of each line by name, ``(n,)`` each.
-    labels : tuple of str
-        Labels of the x and the y axis.
-    limits : tuple, optional
-        Limits of the x and the y axis.
-    mark : tuple, optional
-        x, y and name of a point to mark.
+    - `lines`: the x and y values of each line by name, ``(n,)`` each.
+    - `labels`: labels of the x and the y axis.
+    - `limits`: limits of the x and the y axis.
+    - `mark`: x, y and name of a point to mark.
     """
     figure = Figure(figsize=(WIDTH_PX / DPI, 3.4), dpi=DPI, layout="constrained")
     axes = figure.add_subplot()
@@ -328,20 +300,12 @@ def estimate_picture(
 ) -> bytes:
     """Draw the error estimate of the road over the relief.
 
-    Parameters
-    ----------
-    height : Floats
-        The DSM (m), ``(H, W)``.
-    estimate : Floats
-        Estimated error of the surface (m), ``(H, W)``.
-    road : Bools
-        Road cells before the filter, ``(H, W)``.
-    grid : Grid
-        Where the cells lie.
-    places : Mapping
-        Place by flag; each has a circle, with the names of its flags.
-    title : str
-        What is drawn, above the map.
+    - `height`: the DSM (m), ``(H, W)``.
+    - `estimate`: estimated error of the surface (m), ``(H, W)``.
+    - `road`: road cells before the filter, ``(H, W)``.
+    - `grid`: where the cells lie.
+    - `places`: place by flag; each has a circle, with the names of its flags.
+    - `title`: what is drawn, above the map.
     """
     norm = Normalize(0, LIMIT_M, clip=True)
     grey = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*height.shape, 3))

@@ -69,16 +69,10 @@ def edge_steps(
 ) -> EdgeSteps:
     """Return the steps per exported variant and pair of neighbours.
 
-    Parameters
-    ----------
-    run : Run
-        The run; pairs whose surfaces are not in its store are left out.
-    results : Results, optional
-        The results of all finished tiles; by default the tiles to be compared are checked.
-    most : int
-        Largest number of tiles compared with their neighbours.
-    track : callable
-        Shows the progress.
+    - `run`: the run; pairs whose surfaces are not in its store are left out.
+    - `results`: the results of all finished tiles; by default the tiles to be compared are checked.
+    - `most`: largest number of tiles compared with their neighbours.
+    - `track`: shows the progress.
     """
     tiles = run.catalog.usable
     every = math.ceil(len(tiles) / most)

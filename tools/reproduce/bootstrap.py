@@ -58,11 +58,8 @@ def interval(values: Floats) -> tuple[float, float]:
 def bootstrap(figures: pd.DataFrame) -> Means:
     """Average the figures over the tiles and over resamples of the tiles.
 
-    Parameters
-    ----------
-    figures : DataFrame
-        One row per ``(tile_id, variant)``, every tile with every variant. NaN figures (a tile without road)
-        are left out of the mean.
+    - `figures`: one row per ``(tile_id, variant)``, every tile with every variant. NaN figures (a tile
+      without road) are left out of the mean.
     """
     table = figures.reset_index().pivot(index="tile_id", columns="variant", values=list(figures))
     values = table.to_numpy(dtype=np.float64)

@@ -40,14 +40,10 @@ def check(claim: Claim, means: Means, dataset: str = GEROD) -> Verdict:
     weaker, above it stronger. Whatever the verdict, it is "not decided" if fewer than `LEVEL` percent of the
     resamples give it.
 
-    Parameters
-    ----------
-    claim : Claim
-        A claim of the paper.
-    means : Means
-        Means of the run.
-    dataset : str
-        The paper's dataset that the run is compared with; claims about other datasets are not tested.
+    - `claim`: a claim of the paper.
+    - `means`: means of the run.
+    - `dataset`: the paper's dataset that the run is compared with; claims about other datasets are not
+      tested.
     """
     paper = [_paper(claim, name) for name in claim.variants]
     if claim.dataset != dataset or not means.variants.issuperset(claim.variants):

@@ -76,13 +76,7 @@ class Comparison:
 
 
 def compare(data: MetricsData) -> Comparison:
-    """Compare the figures of a run with the paper's.
-
-    Raises
-    ------
-    ConfigError
-        If the run has FlexRoad only, no variant to compare it with.
-    """
+    """Compare the figures of a run with the paper's."""
     paper = DSC3D if data.dataset == DSC3D else GEROD
     tables = {"Table I": TABLE_I_DSC3D} if paper == DSC3D else {"Table I": TABLE_I, "Table II": TABLE_II}
     means = {classes: bootstrap(data.part(classes)) for classes in data.classes}

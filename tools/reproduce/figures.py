@@ -45,29 +45,11 @@ def write_figures(
 ) -> list[str]:
     """Draw every figure whose variants are in the run, and write ``figures.md`` with the captions.
 
-    Parameters
-    ----------
-    run : Run
-        A run with finished tiles.
-    folder : Path
-        Folder for NAME.pdf, NAME.png, NAME.webp and figures.md.
-    tile_id : str, optional
-        The tile of the maps, renders and profile; by default the tile with the median road L2.
-    roles : Roles, optional
-        Which variant is which method; by default derived from the variants' options.
-
-    Returns
-    -------
-    list of str
-        One line per figure that could not be drawn, with the reason.
-
-    Raises
-    ------
-    ConfigError
-        If no tile of the run has every variant, the run mixes datasets, or the tile's results cannot be
-        recomputed.
-    CatalogError
-        If the catalog has no such tile.
+    - `run`: a run with finished tiles.
+    - `folder`: folder for NAME.pdf, NAME.png, NAME.webp and figures.md.
+    - `tile_id`: the tile of the maps, renders and profile; by default the tile with the median road L2.
+    - `roles`: which variant is which method; by default derived from the variants' options.
+    - result: one line per figure that could not be drawn, with the reason.
     """
     roles = roles or roles_of(run.config)
     data = collect(run)
@@ -126,11 +108,8 @@ def trade_off(config: Config, full: str, done: pd.DataFrame) -> FigureFile:
 def sweep(chains: Mapping[str, Chain], full: str, options: tuple[str, ...]) -> dict[str, str]:
     """Return the variants that differ from the full pipeline only in these options, and the full one.
 
-    Returns
-    -------
-    dict
-        Label by variant, ordered by the options' values; empty if the methods of the full pipeline lack one
-        of the options.
+    - result: label by variant, ordered by the options' values; empty if the methods of the full pipeline lack
+      one of the options.
     """
     if not all(hasattr(chains[full][stage], name) for stage, _, name in (o.partition(".") for o in options)):
         return {}
@@ -159,14 +138,9 @@ def _text(value: Any) -> str:
 def draw_trade_off(means: pd.DataFrame, sweeps: Mapping[str, Mapping[str, str]], full: str) -> Figure:
     """Draw one panel per sweep.
 
-    Parameters
-    ----------
-    means : DataFrame
-        ``mad_road_deg`` and ``l2_road_m`` by variant.
-    sweeps : Mapping
-        For each title, the labels by variant.
-    full : str
-        The full pipeline, part of every sweep.
+    - `means`: ``mad_road_deg`` and ``l2_road_m`` by variant.
+    - `sweeps`: for each title, the labels by variant.
+    - `full`: the full pipeline, part of every sweep.
     """
     figure = new_figure(2.4)
     axes = figure.subplots(1, len(sweeps), sharey=True, squeeze=False)[0]
@@ -203,11 +177,6 @@ def statistics(run: Run, full: str, done: pd.DataFrame) -> pd.DataFrame:
     """Return ``tile_id, stratum, road_percent, height_range_m`` of the finished tiles.
 
     The road share is that of the run's table; heights are those of the DSM, with houses and trees.
-
-    Raises
-    ------
-    ConfigError
-        If a tile's source files can no longer be read.
     """
     table = done.loc[done.variant == full, ["tile_id", "stratum", "road_fraction"]].copy()
     wanted = set(table.tile_id)

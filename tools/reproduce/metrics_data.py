@@ -90,25 +90,12 @@ def collect(
 ) -> MetricsData:
     """Return the figures of a run and of the runs it is compared with.
 
-    Parameters
-    ----------
-    run : Run
-        The main run.
-    true : Run, optional
-        The same tiles, classed by the true road mask.
-    dsc3d : Run, optional
-        Scenes of DSC3D or of its stand-in, measured against the reference that the paper describes.
-    dsc3d_true : Run, optional
-        The same scenes, measured against the true surface.
-    literal : Run, optional
-        A run with configs/literal.yaml over the same tiles or some of them.
-    dsm : Run, optional
-        The same tiles and variants with configs/ablation_dsm.yaml: measured against the DSM.
-
-    Raises
-    ------
-    ConfigError
-        If a run has no rows yet or mixes datasets, or two runs to compare have different tiles or variants.
+    - `run`: the main run.
+    - `true`: the same tiles, classed by the true road mask.
+    - `dsc3d`: scenes of DSC3D or of its stand-in, measured against the reference that the paper describes.
+    - `dsc3d_true`: the same scenes, measured against the true surface.
+    - `literal`: a run with configs/literal.yaml over the same tiles or some of them.
+    - `dsm`: the same tiles and variants with configs/ablation_dsm.yaml: measured against the DSM.
     """
     if dsc3d is None and dsc3d_true is not None:
         raise ConfigError(f"--dsc3d-true {dsc3d_true.path} needs --dsc3d: give that run, too")

@@ -64,17 +64,11 @@ def side_by_side(
 ) -> Iterator[Section]:
     """Yield a table of the paper with our figures beside it, one section per group of figures.
 
-    Parameters
-    ----------
-    name : str
-        Name of the table, the first part of the titles.
-    rows : tuple of Row
-        The paper's rows; every variant is in `ours`.
-    ours : Mapping[str, Means]
-        Our means by column name; the difference from the paper is added if there is only one. A variant that
-        a column lacks has a dash there.
-    line : str
-        The data of the table, if not the page's main data.
+    - `name`: name of the table, the first part of the titles.
+    - `rows`: the paper's rows; every variant is in `ours`.
+    - `ours`: our means by column name; the difference from the paper is added if there is only one. A variant
+      that a column lacks has a dash there.
+    - `line`: the data of the table, if not the page's main data.
     """
     for figures in GROUPS:
         table = pd.DataFrame({"variant": [row.label for row in rows]})
@@ -309,14 +303,9 @@ def road_numbers(rows: tuple[Row, ...], data: MetricsData) -> list[pd.DataFrame]
 def distances_of(rows: tuple[Row, ...], means: Means, relative: bool) -> np.ndarray:
     """Return the absolute logarithms of the ratios of our figures to the paper's, ``(rows, 4)``.
 
-    Parameters
-    ----------
-    rows : tuple of Row
-        Rows of Table II with the full pipeline.
-    means : Means
-        Our means.
-    relative : bool
-        Whether to compare the ratios to the full pipeline in place of the figures.
+    - `rows`: rows of Table II with the full pipeline.
+    - `means`: our means.
+    - `relative`: whether to compare the ratios to the full pipeline in place of the figures.
     """
     paper = np.array([[row.value(figure) for figure in FIGURES_SCORED] for row in rows])
     ours = np.array([[means.mean[row.variant, figure] for figure in FIGURES_SCORED] for row in rows])

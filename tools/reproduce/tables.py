@@ -41,20 +41,9 @@ def write_comparison(
 ) -> tuple[Path, ...]:
     """Write the paper's tables with a run's figures beside them; return the paths of the files.
 
-    Parameters
-    ----------
-    run : Run
-        A run with variants named as in configs/ablation.yaml; missing variants are left out.
-    folder : Path
-        Folder for the files.
-    true, dsc3d, dsc3d_true, literal, dsm : Run, optional
-        The runs that `collect` takes.
-
-    Raises
-    ------
-    ConfigError
-        If a run has no figures or mixes datasets, two runs to compare have different tiles, or the folder
-        cannot be written.
+    - `run`: a run with variants named as in configs/ablation.yaml; missing variants are left out.
+    - `folder`: folder for the files.
+    - `true`, `dsc3d`, `dsc3d_true`, `literal`, `dsm`: the runs that `collect` takes.
     """
     data = collect(run, true, dsc3d, dsc3d_true, literal, dsm)
     texts = pages(data)

@@ -78,14 +78,9 @@ def along(raster: Floats, row: Floats, col: Floats) -> Floats:
 def draw_profile(view: TileView, row: Floats, col: Floats, heights: dict[str, Floats]) -> Figure:
     """Draw a map of the path, the heights along it and their errors.
 
-    Parameters
-    ----------
-    view : TileView
-        The tile.
-    row, col : Floats
-        The path, in cells.
-    heights : dict of str to Floats
-        Heights along the path (m) by label: ``raw DSM``, ``Plane``, ``FlexRoad`` and ``truth``.
+    - `view`: the tile.
+    - `row`, `col`: the path, in cells.
+    - `heights`: heights along the path (m) by label: ``raw DSM``, ``Plane``, ``FlexRoad`` and ``truth``.
     """
     figure = new_figure(2.9)
     axes = figure.subplot_mosaic([["map", "heights"], ["map", "errors"]], width_ratios=[1, 2.1])

@@ -122,15 +122,7 @@ def typical_tile(done: pd.DataFrame, variant: str) -> str:
 
 
 def read_tile_view(run: Run, tile_id: str, roles: Roles) -> TileView:
-    """Read a tile's results from the store; results that are not stored are recomputed.
-
-    Raises
-    ------
-    CatalogError
-        If the catalog has no such tile.
-    ConfigError
-        If the run has no such variant, or a stage fails on the tile.
-    """
+    """Read a tile's results from the store; results that are not stored are recomputed."""
     (tile,) = run.catalog.select([tile_id]).tiles
     (status,) = peek_statuses(run, [tile])
     graph = status.graph
@@ -168,10 +160,7 @@ def _result(tile: FinishedTile, core: Grid) -> Result:
 def missing_roles(methods: Iterable[tuple[str, str | None]]) -> str:
     """Return which methods have no variant in the run, as a message; empty if all have one.
 
-    Parameters
-    ----------
-    methods : iterable of (str, str or None)
-        Label and variant of each method that a figure needs.
+    - `methods`: label and variant of each method that a figure needs.
     """
     missing = [label for label, variant in methods if variant is None]
     if not missing:

@@ -27,10 +27,7 @@ def vehicle_trajectory(road: Bools) -> tuple[Floats, Floats]:
     end of the first, which is exact on roads without loops. It is then moved to the right, halfway to the
     edge of the road.
 
-    Parameters
-    ----------
-    road : Bools
-        Road cells, ``(H, W)``.
+    - `road`: road cells, ``(H, W)``.
     """
     if not road.any():
         return np.empty(0), np.empty(0)

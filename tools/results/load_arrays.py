@@ -52,30 +52,13 @@ def load_arrays(
 ) -> TileData:
     """Return the data of one tile, whose core is the grid of the DSM.
 
-    Parameters
-    ----------
-    dsm, dtm : xarray.DataArray, (H, W)
-        Heights (m). NaN and the array's nodata value mean unknown.
-    road_mask : xarray.DataArray, (H, W), or Source
-        Road where True or not 0, or roads as vectors.
-    options : Options
-        The halo is NaN where the DTM and the mask do not reach beyond the DSM.
-    road_values : sequence of int
-        Values of the mask that mean road; empty: every value but 0 and nodata.
-
-    Returns
-    -------
-    TileData
-        The DTM and the mask are copied where their cells coincide with those of the DSM. Otherwise they are
-        resampled (heights bilinearly, the mask to the nearest cell), with a note. A mask without road cells,
-        or whose values do not fit those that mean road, gives a note, too.
-
-    Raises
-    ------
-    TaskError
-        If an array has no CRS, is in degrees or feet, is rotated, has pixels that are not square or more
-        than two dimensions; if the CRS of two arrays differ; if there are too few heights, or none in the
-        range of heights; if values of the mask are fractions.
+    - `dsm`, `dtm`: heights (m). NaN and the array's nodata value mean unknown.
+    - `road_mask`: road where True or not 0, or roads as vectors.
+    - `options`: the halo is NaN where the DTM and the mask do not reach beyond the DSM.
+    - `road_values`: values of the mask that mean road; empty: every value but 0 and nodata.
+    - result: the DTM and the mask are copied where their cells coincide with those of the DSM. Otherwise they
+      are resampled (heights bilinearly, the mask to the nearest cell), with a note. A mask without road
+      cells, or whose values do not fit those that mean road, gives a note, too.
     """
     if options.road_height == "layer":
         raise TaskError("load.road_height is layer, but arrays have none; set it to auto")
@@ -244,13 +227,7 @@ def _grid(dsm: RasterWindow) -> Grid:
 
 
 def _absurd(patch: RasterWindow) -> str:
-    """Set heights outside the valid range to NaN, as `load` does; return a note, or "" if there are none.
-
-    Raises
-    ------
-    TaskError
-        If there are no others.
-    """
+    """Set heights outside the valid range to NaN, as `load` does; return a note, or "" if there are none."""
     given = replace(patch, values=patch.values.copy())
     count = remove_absurd(patch.values)
     if count and np.isnan(patch.values).all():

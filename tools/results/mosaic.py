@@ -78,15 +78,7 @@ def mosaic(run: Run, variant: str, bounds: Bounds | None) -> tuple[xr.Dataset, G
 
     The arrays are backed by Dask, with a chunk between any two neighbouring edges of tiles.
 
-    Parameters
-    ----------
-    bounds : tuple of float or None
-        None for all tiles.
-
-    Raises
-    ------
-    ConfigError
-        If the bounds are empty, or tiles have different cell sizes or lattices.
+    - `bounds`: none for all tiles.
     """
     tiles = run.catalog.usable
     grid = _grid(tiles, bounds)

@@ -64,13 +64,7 @@ class AnswerTable:
     """The level that was asked for."""
 
     def write_csv(self, out: TextIO | Path) -> None:
-        """Write the table as CSV; text that spreadsheets would take for a formula begins with an apostrophe.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
+        """Write the table as CSV; text that a spreadsheet takes for a formula begins with an apostrophe."""
         table = self.table.copy()
         for name in MILLIMETRES:
             if name in table and table[name].dtype.kind == "f":
@@ -83,15 +77,7 @@ class AnswerTable:
             out.write(text)
 
     def write_geopackage(self, path: Path) -> None:
-        """Write the table as a GeoPackage of points in the CRS of the run, 3D where they have a height.
-
-        Raises
-        ------
-        ConfigError
-            If a column cannot be written.
-        OSError
-            If the file cannot be written.
-        """
+        """Write the table as a GeoPackage of points in the CRS of the run, 3D where they have a height."""
         known = np.isfinite(self.easting) & np.isfinite(self.northing)
         shapes = np.full(len(known), None, dtype=object)
         shapes[known] = shapely.points(self.easting[known], self.northing[known])
@@ -112,11 +98,6 @@ def at_points(ground: Ground, points: Points, level: LevelWanted = None) -> Answ
 
     Points of a vector file also get the columns easting and northing (m), in the CRS of the run. With a level
     there is also a column level; with all levels, each point has a row for each level that it has.
-
-    Raises
-    ------
-    ConfigError
-        If the points have a CRS and the tiles of the run have several, or a result of a tile is missing.
     """
     easting, northing, table = points.x, points.y, points.table
     if points.crs is not None:
@@ -153,11 +134,6 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float, level: Level
     The columns are line (only if there are several), distance_m, easting, northing, height_m, grade_percent,
     nx, ny, nz, tile, class and flags. The grade is that of the surface in the direction of the line, positive
     uphill. Flags are those up to the next point. For levels see `at_points`.
-
-    Raises
-    ------
-    ConfigError
-        If there are too many points, or a result of a tile is missing.
     """
     points = stations(lines, step_m)
     easting, northing = points.easting.to_numpy(), points.northing.to_numpy()
@@ -195,11 +171,6 @@ def stations(lines: list[Floats], step_m: float) -> pd.DataFrame:
 
     The columns are line (from 1), distance_m (in plan, from the start of the line), easting, northing (m),
     and east, north: the unit vector of the line's direction, at a vertex that of the part that begins there.
-
-    Raises
-    ------
-    ConfigError
-        If these are more than `MAX_POINTS`.
     """
     lengths = [float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines]
     number = sum(length / step_m + 2 for length in lengths)

@@ -66,22 +66,9 @@ class Points:
 def read_points(path: Path, given: str | None = None, layer: str | None = None) -> Points:
     """Read the points of a CSV or vector file.
 
-    Parameters
-    ----------
-    path : Path
-        A vector file if its name ends like one (`VECTOR_SUFFIXES`), else a CSV (`parse_csv`).
-    given : str, optional
-        CRS of the points, as the user says it.
-    layer : str, optional
-        Layer of a vector file; needed if it has several.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, has no such columns or layer, or has other geometries than points; if a
-        coordinate is not a number; if the file has another CRS than ``given``.
-    CatalogError
-        If ``given`` is no CRS.
+    - `path`: a vector file if its name ends like one (`VECTOR_SUFFIXES`), else a CSV (`parse_csv`).
+    - `given`: CRS of the points, as the user says it.
+    - `layer`: layer of a vector file; needed if it has several.
     """
     if path.suffix.lower() in VECTOR_SUFFIXES:
         return _points(*read_features(path, given, layer), path)
@@ -100,20 +87,9 @@ def parse_csv(data: bytes, name: str, given: str | None = None) -> Points:
     ``northing`` or ``x`` and ``y``. Without these, or with a CRS in degrees, they are ``longitude`` and
     ``latitude`` or ``lon`` and ``lat``, in WGS 84 if no CRS is given.
 
-    Parameters
-    ----------
-    data : bytes
-        The file, in UTF-8.
-    name : str
-        Its name, for messages.
-    given : str, optional
-        CRS of the coordinates, as the user says it.
-
-    Raises
-    ------
-    ConfigError
-        If the text is not UTF-8, a column is missing, a line has too many values, or a coordinate is not a
-        number.
+    - `data`: the file, in UTF-8.
+    - `name`: its name, for messages.
+    - `given`: CRS of the coordinates, as the user says it.
     """
     try:
         text = data.decode("utf-8-sig")
@@ -188,13 +164,7 @@ def _numbers(values: Sequence[str], lines: Sequence[int], where: str, comma: boo
 
 
 def read_features(path: Path, given: str | None, layer: str | None) -> tuple[Any, str]:
-    """Return the features of a vector file as a GeoDataFrame with a CRS, and a note if there is one.
-
-    Raises
-    ------
-    ConfigError
-        See `read_points`.
-    """
+    """Return the features of a vector file as a GeoDataFrame with a CRS, and a note if there is one."""
     try:
         file = vector_name(path)
         memory.check(WHOLE * path.stat().st_size, f"{path}, read as a whole,", "split it", str(path))
@@ -237,22 +207,11 @@ def read_lines(given: str, crs: str | None, layer: str | None, run_crs: str) -> 
 
     A line is straight between its vertices in the CRS of the run.
 
-    Parameters
-    ----------
-    given : str
-        A vector file of lines, or the vertices of one line: ``"x y, x y"``. Parts of one feature that touch
-        at their ends are one line.
-    crs : str or None
-        CRS of the lines, as the user says it; None: that of the file, or for vertices that of the run.
-    layer : str or None
-        Layer of a vector file; needed if it has several.
-    run_crs : str
-        CRS of the result.
-
-    Raises
-    ------
-    ConfigError
-        If the text is no line, the file cannot be read or has no lines, or a line cannot be transformed.
+    - `given`: a vector file of lines, or the vertices of one line: ``"x y, x y"``. Parts of one feature that
+      touch at their ends are one line.
+    - `crs`: CRS of the lines, as the user says it; None: that of the file, or for vertices that of the run.
+    - `layer`: layer of a vector file; needed if it has several.
+    - `run_crs`: CRS of the result.
     """
     if _COORDINATES.fullmatch(given) and not Path(given).exists():
         lines, source = [_vertices(given)], crs

@@ -348,13 +348,7 @@ def _embankment(top: Floats, aside: Floats) -> Floats:
 
 
 def make_crossings(grid: Grid, seed: int, options: CrossingOptions = DEFAULTS) -> Scene:
-    """Make one tile of the world of a seed, as `scene.make_scene` does; the mask is the visible road.
-
-    Raises
-    ------
-    TaskError
-        If the seed is negative.
-    """
+    """Make one tile of the world of a seed, as `scene.make_scene` does; the mask is the visible road."""
     if seed < 0:
         raise TaskError(f"a seed is 0 or more, not {seed}")
     world = Crossings(seed, options)

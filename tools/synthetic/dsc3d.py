@@ -95,10 +95,7 @@ def survey(scenes: int = len(SITES), seed: int = 0) -> list[Place]:
     A scene takes the first location of its row where hills of at most slope `STEEPEST` give its rise. The
     slope is then set so that they give exactly its rise.
 
-    Parameters
-    ----------
-    scenes : int
-        Number of scenes, the first of `SITES`.
+    - `scenes`: number of scenes, the first of `SITES`.
     """
     return [_locate(row, site, seed) for row, site in enumerate(SITES[:scenes])]
 

@@ -142,10 +142,7 @@ def survey(tiles: int = TILES, seed: int = 0) -> list[tuple[str, Grid, str, Scen
     The tiles of a smaller survey are a subset of those of a larger one. Tiles lie on the absolute grid, 3 km
     apart.
 
-    Parameters
-    ----------
-    tiles : int
-        Number of tiles; 240 as in the paper.
+    - `tiles`: number of tiles; 240 as in the paper.
     """
     return [
         _place(row, stratum, number, seed)

@@ -16,21 +16,10 @@ def block(
 ) -> list[tuple[str, Grid]]:
     """Return the ids and grids of a near-square block of neighbouring tiles.
 
-    Parameters
-    ----------
-    tiles : int
-        Number of tiles; the last row may be incomplete.
-    size_m : int
-        Side of a tile on the absolute grid (m).
-    cell : float
-        Cell size (m).
-    crs : str
-        Coordinate reference system in metres.
-
-    Raises
-    ------
-    CatalogError
-        If ``size_m`` is not a whole number of cells.
+    - `tiles`: number of tiles; the last row may be incomplete.
+    - `size_m`: side of a tile on the absolute grid (m).
+    - `cell`: cell size (m).
+    - `crs`: coordinate reference system in metres.
     """
     columns = math.ceil(math.sqrt(tiles))
     rows = math.ceil(tiles / max(columns, 1))

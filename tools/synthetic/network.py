@@ -87,13 +87,7 @@ STRATA = {
 
 
 def find_stratum(name: str) -> Stratum:
-    """Return the stratum with a name.
-
-    Raises
-    ------
-    TaskError
-        If the name is unknown.
-    """
+    """Return the stratum with a name."""
     if name not in STRATA:
         raise TaskError(f"no stratum {name!r}; there are {', '.join(STRATA)}")
     return STRATA[name]

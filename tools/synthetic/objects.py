@@ -314,12 +314,8 @@ def roofs_seen(
 ) -> tuple[Roof, ...]:
     """Return the roofs of all houses.
 
-    Parameters
-    ----------
-    lean : float
-        Displacement per height above the ground, at the edge of an image.
-    facades : float
-        Fraction of the houses whose facades are mistaken for road.
+    - `lean`: displacement per height above the ground, at the edge of an image.
+    - `facades`: fraction of the houses whose facades are mistaken for road.
     """
     if not houses:
         return ()

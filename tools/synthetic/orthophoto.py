@@ -71,24 +71,10 @@ def orthophoto(
 ) -> NDArray[np.uint8]:
     """Return the orthophoto of the scene that `make_scene` gives for the same arguments.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the world, 0 or more.
-    stratum : str, optional
-        See `make_scene`.
-    gsd : float
-        Ground sampling distance (m).
-
-    Returns
-    -------
-    (3, H, W) array
-        Red, green and blue, 0 to 255, over the grid's bounds.
-
-    Raises
-    ------
-    TaskError
-        If the tile is not a whole number of pixels wide or high, or the scene cannot be made.
+    - `seed`: seed of the world, 0 or more.
+    - `stratum`: see `make_scene`.
+    - `gsd`: ground sampling distance (m).
+    - result: red, green and blue, 0 to 255, over the grid's bounds.
     """
     pixels = _pixel_grid(grid, gsd)
     # A photo shows surfaces, without the height noise and the voids of a scan.

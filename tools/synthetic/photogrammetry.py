@@ -54,15 +54,8 @@ class PhotogrammetryScene:
 def photogrammetry(place: Place, seed: int) -> PhotogrammetryScene:
     """Make one scene of the stand-in for DSC3D.
 
-    Parameters
-    ----------
-    place : Place
-        A place from `tools.synthetic.dsc3d.survey`.
-
-    Returns
-    -------
-    PhotogrammetryScene
-        Equal input gives equal scenes. The mesh fills the square of the place, except for open holes.
+    - `place`: a place from `tools.synthetic.dsc3d.survey`.
+    - result: equal input gives equal scenes. The mesh fills the square of the place, except for open holes.
     """
     site, grid = place.site, place.grid
     truth = make_scene(grid, seed, site.stratum, place.options)
@@ -131,10 +124,7 @@ def encode(mesh: TexturedMesh) -> bytes:
     Vertices are relative to the whole-metre corner of the mesh, in glTF's axes (x east, y up, z south). CRS
     and corner are in the scene's ``extras``, as in FlexRoad's other GLB files. Equal input gives equal bytes.
 
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        Faces that share a vertex must also share its texture coordinates.
+    - `mesh`: faces that share a vertex must also share its texture coordinates.
     """
     assert mesh.uv is not None
     origin = np.floor(mesh.vertices.min(axis=0))
@@ -159,12 +149,8 @@ def encode(mesh: TexturedMesh) -> bytes:
 def lattice(eastings: Floats, northings: Floats, height: Floats, gap: Bools) -> tuple[Floats, Faces]:
     """Return vertices ``(V, 3)`` and faces ``(F, 3)``, two per quad, counter-clockwise from above.
 
-    Parameters
-    ----------
-    eastings, northings : (W,) and (H,) array
-        Coordinates of the nodes (m); northings descend.
-    height, gap : (H, W) array
-        Heights of the nodes (m), and nodes in gaps; quads with a node in a gap are left out.
+    - `eastings`, `northings`: coordinates of the nodes (m); northings descend.
+    - `height`, `gap`: heights of the nodes (m), and nodes in gaps; quads with a node in a gap are left out.
     """
     x, y = np.meshgrid(eastings, northings)
     node = np.arange(height.size, dtype=np.int32).reshape(height.shape)

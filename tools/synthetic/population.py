@@ -77,12 +77,8 @@ def populate(
 ) -> Objects:
     """Return the objects of some streets.
 
-    Parameters
-    ----------
-    farther : sequence of Street
-        These and more streets; houses do not stand on their car parks and fields.
-    ground_at : callable
-        Returns the ground at points, with all streets nearby.
+    - `farther`: these and more streets; houses do not stand on their car parks and fields.
+    - `ground_at`: returns the ground at points, with all streets nearby.
     """
     density, errors = options.density, options.mask_errors
     parks = car_parks(farther, seed, ground_at, options.car_parks * density)

@@ -70,12 +70,8 @@ class Reconstruction:
 def reconstruct(scene: Scene, seed: int, faults: Faults) -> Reconstruction:
     """Return a scene's surface with the faults of a reconstruction.
 
-    Parameters
-    ----------
-    scene : Scene
-        A scene without noise; cells of 0.5 m resolve cars and walls.
-    seed : int
-        Seed of the world; bumps and holes are functions of seed and coordinates.
+    - `scene`: a scene without noise; cells of 0.5 m resolve cars and walls.
+    - `seed`: seed of the world; bumps and holes are functions of seed and coordinates.
     """
     grid = scene.grid
     smoothed = ndimage.gaussian_filter(_static_surface(scene), faults.melt_m / grid.cell, mode="nearest")

@@ -83,17 +83,9 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     Ground, streets, objects and errors of the mask are functions of seed and absolute coordinates, so tiles
     of one seed join without a step. The noise of the heights is drawn per tile.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the world, 0 or more.
-    stratum : str, optional
-        Stratum of the complete world: ``urban``, ``suburban`` or ``rural``; by default a mix of districts.
-
-    Raises
-    ------
-    TaskError
-        If the seed is negative or the stratum unknown.
+    - `seed`: seed of the world, 0 or more.
+    - `stratum`: stratum of the complete world: ``urban``, ``suburban`` or ``rural``; by default a mix of
+      districts.
     """
     if seed < 0:
         raise TaskError(f"a seed is 0 or more, not {seed}")
@@ -240,14 +232,9 @@ def scan(scene: Scene, per_m2: float, noise_m: float, seed: int = 0) -> Points:
 
     Heights are those of the true ground, linear between cell centres, plus what stands on the point's cell.
 
-    Parameters
-    ----------
-    scene : Scene
-        A scene without noise of its own (`SceneOptions.dsm_noise_m`).
-    per_m2 : float
-        Number of points per m2.
-    noise_m : float
-        Standard deviation of their heights (m).
+    - `scene`: a scene without noise of its own (`SceneOptions.dsm_noise_m`).
+    - `per_m2`: number of points per m2.
+    - `noise_m`: standard deviation of their heights (m).
     """
     grid, rng = scene.grid, generator(seed, "scan", *map(int, scene.grid.origin))
     west, south, east, north = grid.bounds

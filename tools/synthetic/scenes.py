@@ -79,28 +79,13 @@ def write_scenes(
     reference of a preset's tiles is the one that the paper describes. Beside their catalog,
     ``catalog_true.parquet`` lists them with the truth as reference.
 
-    Parameters
-    ----------
-    folder : Path
-        Output folder.
-    tiles : int, optional
-        Number of tiles; if None, 4, or all of the preset.
-    seed : int
-        Seed of the world.
-    size_m : int, optional
-        Side of a tile (m); 250 if None. The size of a preset's tiles is fixed.
-    dop : bool
-        Whether to write orthophotos; the preset dsc3d always has them.
-    preset : str, optional
-        One of `PRESETS`; None for a block of neighbouring tiles.
-    decks : bool
-        Whether the block has roads on decks and in tubes (`tools.synthetic.crossings`).
-
-    Raises
-    ------
-    ConfigError
-        If the folder cannot be written, the preset is unknown or has tiles of another size, or decks are
-        wanted with photos or a preset.
+    - `folder`: output folder.
+    - `tiles`: number of tiles; if None, 4, or all of the preset.
+    - `seed`: seed of the world.
+    - `size_m`: side of a tile (m); 250 if None. The size of a preset's tiles is fixed.
+    - `dop`: whether to write orthophotos; the preset dsc3d always has them.
+    - `preset`: one of `PRESETS`; None for a block of neighbouring tiles.
+    - `decks`: whether the block has roads on decks and in tubes (`tools.synthetic.crossings`).
     """
     if decks and (dop or preset):
         what = "--dop" if dop else f"--preset {preset}"
@@ -251,21 +236,10 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Execut
     The folder of a scene contains ``mesh.glb``, its true layers (``known/<layer>/<scene>.tif``), and the
     rasters and catalog that ``prepare mesh`` writes. In the folder above are the catalogs of all scenes.
 
-    Parameters
-    ----------
-    folder : Path
-        Output folder.
-    scenes : int, optional
-        Number of scenes; all five if None.
-    seed : int
-        Seed of the world.
-    executor : Executor, optional
-        Executor of the scenes; this process if None.
-
-    Raises
-    ------
-    ConfigError
-        If ``scenes`` is too large, a scene fails, or the folder cannot be written.
+    - `folder`: output folder.
+    - `scenes`: number of scenes; all five if None.
+    - `seed`: seed of the world.
+    - `executor`: executor of the scenes; this process if None.
     """
     available = len(dsc3d.SITES)
     if scenes is not None and scenes > available:

@@ -31,16 +31,11 @@ def segmentation(
 ) -> Bools:
     """Return the road mask with the errors of a segmentation, ``(H, W)``.
 
-    Parameters
-    ----------
-    edge : (H, W) array
-        Distance of the cells to the nearest carriageway's edge, negative on the road (m).
-    objects : Objects
-        Objects: crowns hide the road; spots, and some areas, roofs and facades, are classified wrongly.
-    ground_at : callable
-        Returns the ground at points, for patches.
-    options : SceneOptions
-        Sizes of the errors; ``mask_errors`` 0 gives a perfect mask.
+    - `edge`: distance of the cells to the nearest carriageway's edge, negative on the road (m).
+    - `objects`: objects: crowns hide the road; spots, and some areas, roofs and facades, are classified
+      wrongly.
+    - `ground_at`: returns the ground at points, for patches.
+    - `options`: sizes of the errors; ``mask_errors`` 0 gives a perfect mask.
     """
     if not options.patch_m or not options.mask_errors:
         return _classified(canvas, edge, objects, options)

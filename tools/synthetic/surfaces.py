@@ -48,16 +48,10 @@ class Relief:
 def relief(seed: int, slope: float, roughness_m: float, datum_m: float, embankment_m: float = 0.0) -> Relief:
     """Return the relief of a world.
 
-    Parameters
-    ----------
-    slope : float
-        Root mean square slope of the hills.
-    roughness_m : float
-        Root mean square height of the humps (m).
-    datum_m : float
-        Mean height of the world (m).
-    embankment_m : float
-        Root mean square height of streets above or below the hills (m).
+    - `slope`: root mean square slope of the hills.
+    - `roughness_m`: root mean square height of the humps (m).
+    - `datum_m`: mean height of the world (m).
+    - `embankment_m`: root mean square height of streets above or below the hills (m).
     """
     rng = generator(seed, "relief")
     hills, humps = np.geomspace(320, 2400, 9), np.geomspace(25, 140, 10)

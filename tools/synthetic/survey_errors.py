@@ -106,14 +106,9 @@ def growth(
 ) -> Floats:
     """Return the height of low vegetation, ``(H, W)``, m; 0 where there is none.
 
-    Parameters
-    ----------
-    x, y, edge : (H, W) array
-        Coordinates in the plan's frame, and distance to the nearest carriageway (m).
-    height_m : float
-        Mean height inside a thicket (m).
-    rng : numpy.random.Generator
-        Draws the height of each cell relative to the mean.
+    - `x`, `y`, `edge`: coordinates in the plan's frame, and distance to the nearest carriageway (m).
+    - `height_m`: mean height inside a thicket (m).
+    - `rng`: draws the height of each cell relative to the mean.
     """
     lengths = np.geomspace(*THICKET_M, 18)
     thick = waves(generator(seed, "thickets"), lengths, np.sqrt(2 / lengths.size))(x, y)

@@ -24,12 +24,8 @@ SPREAD = 0.5
 def hidden(canvas: Canvas, dsm: Floats, crowns: Sequence[Crown], seed: int, length: float) -> Bools:
     """Return the cells that crowns hide, ``(H, W)``: beside a crown, and below the middle of its height.
 
-    Parameters
-    ----------
-    dsm : (H, W) array
-        Surface model (m).
-    length : float
-        Mean length of the hidden ground at the edge of an image, per height of the crown.
+    - `dsm`: surface model (m).
+    - `length`: mean length of the hidden ground at the edge of an image, per height of the crown.
     """
     found = np.zeros(dsm.shape, np.bool_)
     if length <= 0 or not crowns:

@@ -108,13 +108,7 @@ class LabelledTiles:
     vectors: rasterise.Options
 
     def labelled(self, tile: Tile) -> tuple[TileData, Bools] | None:
-        """Return a tile and its labels, ``(H, W)``, or None if it has no labels.
-
-        Raises
-        ------
-        TaskError
-            If the tile cannot be read.
-        """
+        """Return a tile and its labels, ``(H, W)``, or None if it has no labels."""
         data = load.load(tile, self.load)
         if self.options.labels == "vector":
             return None if data.roads is None else (data, rasterise.rasterise_roads(data, self.vectors))
@@ -122,13 +116,7 @@ class LabelledTiles:
         return None if road is None else (data, road)
 
     def read(self, tile: Tile) -> tuple[TileData, Bools]:
-        """Return a tile that is expected to have labels, and its labels.
-
-        Raises
-        ------
-        TaskError
-            If the tile has no labels any more, or cannot be read.
-        """
+        """Return a tile that is expected to have labels, and its labels."""
         labelled = self.labelled(tile)
         if labelled is None:
             raise TaskError(f"tile {tile.id} has lost its labels since training began; start again")
@@ -213,21 +201,9 @@ class Samples(Sequence[Sample]):
 def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> Outcome:
     """Train a head on a catalog and validate it.
 
-    Parameters
-    ----------
-    catalog : Catalog
-    config : Config
-        Options of its first exported variant: those of `load`, and those of `segment` if it is dinov2.
-    options : TrainOptions
-    log : callable
-        Called with each line of progress.
-
-    Raises
-    ------
-    ConfigError
-        If one of the settings is unknown, or the labels cannot be used.
-    TaskError
-        If training fails.
+    - `config`: options of its first exported variant: those of `load`, and those of `segment` if it is
+      dinov2.
+    - `log`: called with each line of progress.
     """
     settings = _settings(options)
     tiles = LabelledTiles(options, _chain(config)["load"], _vector_options(config))

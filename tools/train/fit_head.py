@@ -145,14 +145,7 @@ def train(
     options: Options,
     progress: Progress | None = None,
 ) -> Trained:
-    """Train a head; keep the epoch with the lowest loss on the validation tiles.
-
-    Raises
-    ------
-    TaskError
-        If the backbone is missing, or no training or no validation tile has an orthophoto and labels of both
-        road and other ground.
-    """
+    """Train a head; keep the epoch with the lowest loss on the validation tiles."""
     backbone = load_backbone(options.backbone, options.device, options.half)
     if options.layers > backbone.layers:
         raise TaskError(f"{backbone.name} has {backbone.layers} layers, not {options.layers}; lower layers")

@@ -41,17 +41,8 @@ COLUMNS = {
 def write_model(outcome: Outcome, path: Path) -> tuple[Path, ...]:
     """Write the report and the model; return the paths, the model first.
 
-    Parameters
-    ----------
-    outcome : Outcome
-        The result of the training.
-    path : Path
-        Path of the model; without a suffix, ``.safetensors`` is added.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be written. The model is written last, so a model always has its report.
+    - `outcome`: the result of the training.
+    - `path`: path of the model; without a suffix, ``.safetensors`` is added.
     """
     path = path if path.suffix else path.with_suffix(outcome.trained.suffix)
     html, record = path.with_name(f"{path.name}.html"), path.with_name(f"{path.name}.json")

@@ -66,17 +66,8 @@ def split(pieces: Sequence[Block], share: float, gap_m: float, seed: int) -> Spl
     Eight directions of the line are tried in an order drawn from the seed. The first one with road and other
     ground on both sides is used.
 
-    Parameters
-    ----------
-    pieces : sequence of Block
-        At least two, all in one CRS.
-    share : float
-        Fraction of the blocks on the validation side, 0 to 1; each side has at least one block.
-
-    Raises
-    ------
-    ConfigError
-        If no direction gives road and other ground on both sides.
+    - `pieces`: at least two, all in one CRS.
+    - `share`: fraction of the blocks on the validation side, 0 to 1; each side has at least one block.
     """
     count = min(max(1, round(share * len(pieces))), len(pieces) - 1)
     for turn in np.random.default_rng(seed).permutation(DIRECTIONS):

@@ -105,18 +105,7 @@ def write_viewer(
     photo_px: int = 1024,
     track: Track = untracked,
 ) -> Written:
-    """Write the viewer of a run, or of the selected tiles, into a folder.
-
-    Raises
-    ------
-    ConfigError
-        If the folder is of the run or has other files, no tile can be shown, tiles have different CRSs,
-        or a tile's results cannot be read.
-    CatalogError
-        If an id is not in the run, or no tile touches the box.
-    OSError
-        If a file cannot be written.
-    """
+    """Write the viewer of a run, or of the selected tiles, into a folder."""
     tiles = shown_tiles(run, ids, bbox)
     variant = run.config.export.variants[0]
     _claim(out, run)
@@ -143,15 +132,7 @@ def write_viewer(
 
 
 def shown_tiles(run: Run, ids: Sequence[str], bbox: Bounds | None) -> tuple[Tile, ...]:
-    """Return the tiles of the map.
-
-    Raises
-    ------
-    ConfigError
-        If none has a place, or they have different CRSs.
-    CatalogError
-        If an id is not in the run, or no tile touches the box.
-    """
+    """Return the tiles of the map."""
     tiles = tuple(tile for tile in run.catalog.select(ids, bbox).tiles if not tile.fault)
     if not tiles:
         raise ConfigError(
@@ -174,14 +155,7 @@ def _built() -> Path:
 
 
 def _claim(out: Location, run: Run) -> None:
-    """Take the folder for this run's viewer: remove the page of an earlier one, and note the run.
-
-    Raises
-    ------
-    ConfigError
-        If the folder is the run, its store or one of their folders, has other files or links that lead
-        out of it, or is the viewer of another run.
-    """
+    """Take the folder for this run's viewer: remove the page of an earlier one, and note the run."""
     for place in (run.path, run.store, run.path / "tiles"):
         if absolute(out) == absolute(place) or absolute(out) in absolute(place).parents:
             raise ConfigError(f"{out} is a folder of the run or above it; choose another one with -o")
@@ -306,15 +280,7 @@ class _Files(SimpleHTTPRequestHandler):
 def server(folder: Path, port: int) -> ThreadingHTTPServer:
     """Return a server of a folder on this computer's loopback address.
 
-    Parameters
-    ----------
-    port : int
-        0 for any free one.
-
-    Raises
-    ------
-    OSError
-        If the port is in use.
+    - `port`: 0 for any free one.
     """
     return ThreadingHTTPServer((LOOPBACK, port), partial(_Files, directory=str(folder)))
 

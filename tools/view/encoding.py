@@ -109,13 +109,8 @@ def encode_run(content: Mapping[str, Any]) -> bytes:
 def picture(height: Floats, road: Bools, cell: float) -> bytes:
     """Return a tile seen from above as a small grey WebP image: hillshade, roads darker.
 
-    Parameters
-    ----------
-    height : (H, W) array
-        The surface (m); NaN beyond the survey, where the picture is transparent.
-    road : (H, W) array of bool
-    cell : float
-        Size of a cell (m).
+    - `height`: the surface (m); NaN beyond the survey, where the picture is transparent.
+    - `cell`: size of a cell (m).
     """
     by_south, by_east = np.gradient(height, cell) if min(height.shape) > 1 else np.zeros((2, *height.shape))
     east, north, up = np.array(SUN) / np.linalg.norm(SUN)

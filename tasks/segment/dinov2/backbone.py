@@ -104,10 +104,7 @@ class Backbone:
         The tokens of the last ``layers`` layers, each passed through the model's final layer norm, are
         concatenated, as for the linear segmentation heads of the DINOv2 paper (Oquab et al. 2023).
 
-        Parameters
-        ----------
-        windows : (n, 3, size, size) array
-            Normalised by `MEAN` and `STD`; ``size`` is a multiple of `PATCH`.
+        - `windows`: normalised by `MEAN` and `STD`; ``size`` is a multiple of `PATCH`.
         """
         side = windows.shape[-1] // PATCH
         dtype = torch.float16 if self.device == "cuda" else torch.bfloat16
@@ -122,20 +119,10 @@ class Backbone:
 def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Backbone:
     """Read a backbone from the cache or a folder; the last one read is kept in memory.
 
-    Parameters
-    ----------
-    name : str
-        Hub name (``facebook/dinov2-small``, ``facebook/dinov2-with-registers-base``) or folder with
-        ``config.json`` and ``model.safetensors``.
-    device : str
-        ``auto`` uses a GPU if there is one.
-    half : bool
-        Compute in half precision: float16 on a GPU, bfloat16 on the CPU.
-
-    Raises
-    ------
-    TaskError
-        If the extra, the weights or the device are missing, or the files are not a DINOv2 model.
+    - `name`: hub name (``facebook/dinov2-small``, ``facebook/dinov2-with-registers-base``) or folder with
+      ``config.json`` and ``model.safetensors``.
+    - `device`: ``auto`` uses a GPU if there is one.
+    - `half`: compute in half precision: float16 on a GPU, bfloat16 on the CPU.
     """
     try:
         has_gpu = torch.cuda.is_available()

@@ -79,13 +79,7 @@ class Head:
 
 
 def read_head(path: Path) -> Head:
-    """Read a head's file.
-
-    Raises
-    ------
-    TaskError
-        If the file does not exist, is damaged or is not a head, or safetensors is not installed.
-    """
+    """Read a head's file."""
     try:
         safe_open, damaged = safetensors.safe_open, safetensors.SafetensorError
     except ImportError as error:
@@ -110,13 +104,7 @@ def read_head(path: Path) -> Head:
 
 
 def _array(file: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return an array of a file, checked.
-
-    Raises
-    ------
-    ValueError
-        If its shape or type is another, or a value is not finite.
-    """
+    """Return an array of a file, checked."""
     part = file.get_slice(name)
     found, kind = tuple(part.get_shape()), part.get_dtype()
     if found != shape or kind != "F32":
@@ -135,13 +123,7 @@ def _reason(error: Exception) -> str:
 
 
 def check(head: Head, backbone: Backbone) -> None:
-    """Check that a head was trained on this backbone.
-
-    Raises
-    ------
-    TaskError
-        If model type, size, layers or weights differ.
-    """
+    """Check that a head was trained on this backbone."""
     about = head.about
     expected = {
         "model_type": about.model_type,

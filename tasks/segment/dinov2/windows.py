@@ -27,14 +27,9 @@ Corner = tuple[int, int]
 def cover(grid: Grid, gsd_m: float, size: int, overlap: int = 0) -> Grid:
     """Return the pixel grid of all windows that overlap a grid; it consists of whole windows.
 
-    Parameters
-    ----------
-    grid : Grid
-        The area to cover; the windows extend beyond it by up to ``size`` pixels.
-    gsd_m : float
-        Size of the windows' pixels (m).
-    size, overlap : int
-        Side of a window, and its overlap with the next one (pixels).
+    - `grid`: the area to cover; the windows extend beyond it by up to ``size`` pixels.
+    - `gsd_m`: size of the windows' pixels (m).
+    - `size`, `overlap`: side of a window, and its overlap with the next one (pixels).
     """
     step, side = (size - overlap) * gsd_m, size * gsd_m
     first, last = math.floor((grid.west - side) / step) + 1, math.ceil(grid.east / step) - 1
@@ -68,18 +63,11 @@ def blend(
 ) -> NDArray[np.float32]:
     """Return the weighted mean of the windows' predictions, ``(h, w)``.
 
-    Parameters
-    ----------
-    predict : callable
-        Called with ``batch`` windows at a time, the last time with fewer.
-    image : (bands, h, w) array
-        Consists of whole windows, see `cover`.
-    valid : (h, w) array
-        Pixels with data; windows without any are skipped and count as 0.
-    size, overlap : int
-        As in `cover` (pixels).
-    batch : int
-        Windows per call of ``predict``.
+    - `predict`: called with ``batch`` windows at a time, the last time with fewer.
+    - `image`: consists of whole windows, see `cover`.
+    - `valid`: pixels with data; windows without any are skipped and count as 0.
+    - `size`, `overlap`: as in `cover` (pixels).
+    - `batch`: windows per call of ``predict``.
 
     Notes
     -----

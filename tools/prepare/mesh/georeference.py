@@ -43,13 +43,7 @@ class Georeference:
         )
 
     def apply(self, path: Path, vertices: Floats) -> tuple[str, Floats]:
-        """Return the CRS and the vertices with the offset added, ``(V, 3)``.
-
-        Raises
-        ------
-        TaskError
-            If the CRS is missing or invalid, or the vertices are local and there is no offset.
-        """
+        """Return the CRS and the vertices with the offset added, ``(V, 3)``."""
         if self.offset is not None and not all(abs(axis) <= FARTHEST for axis in self.offset):
             raise TaskError(
                 f"{path} has the offset {self.offset}, which is no place; give --offset EASTING NORTHING "
@@ -76,11 +70,6 @@ def read_sidecar(path: Path) -> Georeference:
     Supported are ``data_meta.json`` (DeepScenario: UTM zone and offset), ``coords.txt``, also in
     ``odm_georeferencing`` (OpenDroneMap: UTM zone, then an offset in plan, none in height), ``metadata.xml``
     (ContextCapture, DJI Terra and others: ``SRS`` and ``SRSOrigin``), and ``.prj`` (only the CRS).
-
-    Raises
-    ------
-    TaskError
-        If a sidecar file cannot be parsed.
     """
     result = Georeference()
     for folder in path.resolve().parents[:SEARCHED_FOLDERS]:

@@ -70,28 +70,12 @@ def read_mesh(
 ) -> TexturedMesh:
     """Read a mesh and georeference it.
 
-    Parameters
-    ----------
-    path : Path
-        OBJ with its MTL and textures, PLY or glTF; may have several materials, and colours of vertices.
-    up : str, optional
-        The file's upward axis; by default y in glTF, as its standard requires, and z elsewhere.
-    crs : str, optional
-        CRS of the mesh; by default that in the file (FlexRoad's own GLB has one) or in its sidecar.
-    offset : tuple of float, optional
-        Easting, northing and height of the mesh's origin; by default from the same sources.
-    colours : bool
-        Whether colours are needed; if not, textures are not read.
-
-    Returns
-    -------
-    TexturedMesh
-        In units of its CRS, which may be feet; every face has a colour if ``colours`` is True.
-
-    Raises
-    ------
-    TaskError
-        If the mesh cannot be read, has no georeference, or lacks colours that are needed.
+    - `path`: OBJ with its MTL and textures, PLY or glTF; may have several materials, and colours of vertices.
+    - `up`: the file's upward axis; by default y in glTF, as its standard requires, and z elsewhere.
+    - `crs`: CRS of the mesh; by default that in the file (FlexRoad's own GLB has one) or in its sidecar.
+    - `offset`: easting, northing and height of the mesh's origin; by default from the same sources.
+    - `colours`: whether colours are needed; if not, textures are not read.
+    - result: in units of its CRS, which may be feet; every face has a colour if ``colours`` is True.
     """
     resolver = Beside(path)
     with _errors(path, resolver):
@@ -292,13 +276,7 @@ def _check(path: Path, vertices: Floats, faces: NDArray[np.int64]) -> tuple[str,
 
 
 def gltf_elements(path: Path) -> int:
-    """Return the number of vertices and indices that reading a file makes, each instance counted.
-
-    Raises
-    ------
-    Exception
-        Of many types, if the file is damaged.
-    """
+    """Return the number of vertices and indices that reading a file makes, each instance counted."""
     header = _header(path)
     counts: list[int] = [_count(accessor) for accessor in header.get("accessors", [])]
     # Accessors without a view have no bytes in the file; they are filled with zeros.

@@ -34,19 +34,10 @@ OPTIONS = ecsrc.Options(keep_largest=None)
 def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float, options: ecsrc.Options = OPTIONS) -> Floats:
     """Interpolate the ground cells of a DTM that ECSRC does not keep.
 
-    Parameters
-    ----------
-    dtm : ndarray, (H, W)
-        Bare ground as given by a ground filter, m; NaN where there is none.
-    ground : ndarray of bool, (H, W)
-        Cells with ground points; the heights of the others are interpolated.
-    fill_m : float
-        Gaps up to this width are interpolated linearly (m), wider ones become NaN.
-
-    Returns
-    -------
-    ndarray, (H, W)
-        m; cells without a height in ``dtm`` have none in the result.
+    - `dtm` ``(H, W)``: bare ground as given by a ground filter, m; NaN where there is none.
+    - `ground` ``(H, W)``: cells with ground points; the heights of the others are interpolated.
+    - `fill_m`: gaps up to this width are interpolated linearly (m), wider ones become NaN.
+    - result ``(H, W)``: m; cells without a height in ``dtm`` have none in the result.
     """
     ground = ground & np.isfinite(dtm)
     kept = _kept(dtm, ground, grid, options)
@@ -62,12 +53,8 @@ def reference(
 ) -> tuple[Floats, Bools]:
     """Return the paper's ground truth: heights of road and terrain, and the road mask, ``(H, W)`` each.
 
-    Parameters
-    ----------
-    dsm, dtm : ndarray, (H, W)
-        Highest surface and refined bare ground, m; NaN where there is none.
-    road : ndarray of bool, (H, W)
-        The raw road mask.
+    - `dsm`, `dtm` ``(H, W)``: highest surface and refined bare ground, m; NaN where there is none.
+    - `road` ``(H, W)``: the raw road mask.
     """
     kept = _kept(dsm, road, grid, options)
     return np.where(kept, dsm, dtm), kept

@@ -76,13 +76,7 @@ class TexturedMesh:
 
 
 def in_metres(mesh: TexturedMesh, frame: MetricTransform) -> TexturedMesh:
-    """Return the mesh in the frame's CRS, in metres.
-
-    Raises
-    ------
-    CatalogError
-        If the mesh is outside the area of that CRS.
-    """
+    """Return the mesh in the frame's CRS, in metres."""
     return replace(mesh, crs=frame.target, vertices=np.column_stack(frame.metres(*mesh.vertices.T)))
 
 
@@ -93,17 +87,9 @@ def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
     one random point each. The density is that of independent points, with fewer clusters and gaps. Equal
     input gives equal points.
 
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        In a CRS in metres.
-    density : float
-        Points per m2 of surface.
-
-    Yields
-    ------
-    Points
-        At most `CHUNK` points, with colours if all faces have a colour.
+    - `mesh`: in a CRS in metres.
+    - `density`: points per m2 of surface.
+    - result: at most `CHUNK` points, with colours if all faces have a colour.
     """
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(np.linalg.norm(mesh.normals, axis=1) / 2)
@@ -125,15 +111,8 @@ def orthophoto(mesh: TexturedMesh, grid: Grid) -> Orthophoto:
 
     If the texture is finer than the pixels, several rays per pixel are averaged, at most `MOST_RAYS` across.
 
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        Must be in a CRS in metres, and all faces must have a colour.
-
-    Returns
-    -------
-    Orthophoto
-        Pixels are valid where at least one of their rays hits the mesh.
+    - `mesh`: must be in a CRS in metres, and all faces must have a colour.
+    - result: pixels are valid where at least one of their rays hits the mesh.
     """
     rays = _rays(mesh, grid.cell)
     colour = np.zeros((3, *grid.shape), np.uint8)

@@ -118,13 +118,7 @@ def _decode(path: Path, source: Any, held: int) -> NDArray[np.uint8]:
 
 
 def beside(mesh: Path, name: str) -> Path:
-    """Return a file that a mesh names.
-
-    Raises
-    ------
-    TaskError
-        If it lies outside the folder of the mesh, after links are resolved.
-    """
+    """Return a file that a mesh names."""
     folder = mesh.parent.resolve()
     try:
         path = (folder / name).resolve()

@@ -106,11 +106,6 @@ def read_shot(path: Path) -> Shot:
     """Read position, camera and date of a photograph from its EXIF and XMP tags.
 
     DJI's own XMP position is preferred: it has more digits, and accuracies where the drone had corrections.
-
-    Raises
-    ------
-    TaskError
-        If the file is not an image or has no GNSS position.
     """
     remedy = "leave it out, or make it smaller"
     with image_errors(f"{path} cannot be read as a photograph", remedy, path), Image.open(path) as image:
@@ -151,15 +146,7 @@ def read_shot(path: Path) -> Shot:
 
 
 def place_photos(shots: Sequence[Shot], to_crs: str | None = None) -> PlacedPhotos:
-    """Transform the camera positions to one metric CRS: the UTM zone of the place, or ``to_crs``.
-
-    Raises
-    ------
-    TaskError
-        If there are fewer than 3 photographs, or they are from different places.
-    CatalogError
-        If ``to_crs`` is not a CRS.
-    """
+    """Transform the camera positions to one metric CRS: the UTM zone of the place, or ``to_crs``."""
     if len(shots) < 3:
         raise TaskError(f"{len(shots)} photographs are too few; at least 3 that overlap are needed")
     longitude, latitude = (np.array([getattr(s, a) for s in shots]) for a in ("longitude", "latitude"))
@@ -177,20 +164,10 @@ def place_photos(shots: Sequence[Shot], to_crs: str | None = None) -> PlacedPhot
 def read_control(path: Path, placed: PlacedPhotos, crs: str | None = None) -> Control:
     """Read ground control points from CSV: image, x_px, y_px, easting, northing, height, optionally name.
 
-    Parameters
-    ----------
-    path : Path
-        The table: one row per point and photograph. Rows with the same name (without names, the same
-        coordinates) are one point. Pixels are counted from the upper left corner; heights are in metres.
-    placed : PlacedPhotos
-        The photographs; rows refer to them by file name.
-    crs : str, optional
-        CRS of easting and northing; by default that of the photographs.
-
-    Raises
-    ------
-    TaskError
-        If a column is missing, a value is not a number, or a photograph is not among those given.
+    - `path`: the table: one row per point and photograph. Rows with the same name (without names, the same
+      coordinates) are one point. Pixels are counted from the upper left corner; heights are in metres.
+    - `placed`: the photographs; rows refer to them by file name.
+    - `crs`: CRS of easting and northing; by default that of the photographs.
     """
     paths = {shot.path.name: shot.path for shot in placed.shots}
     by_name: dict[str, tuple[list[float], dict[Path, tuple[float, float]]]] = {}

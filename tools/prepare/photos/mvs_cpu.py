@@ -111,17 +111,8 @@ def partners(reconstruction: Reconstruction, number: int, options: Options) -> l
 def photo_cloud(view: View, others: Sequence[View], points: Floats, options: Options) -> Cloud:
     """Return the dense cloud of a photograph: one oriented point per pixel on which its pairs agree.
 
-    Parameters
-    ----------
-    others : Sequence of View
-        Its partners; with fewer than 2 the cloud is empty.
-    points : Floats
-        Sparse points visible in the photograph, ``(n, 3)``, m; they limit the range of depths.
-
-    Raises
-    ------
-    TaskError
-        If pycolmap is missing.
+    - `others`: its partners; with fewer than 2 the cloud is empty.
+    - `points`: sparse points visible in the photograph, ``(n, 3)``, m; they limit the range of depths.
     """
     pixels = _pinhole(view, options.size)
     rays = pixels.rays()

@@ -32,17 +32,8 @@ def available() -> bool:
 def patchmatch(reconstruction: Reconstruction, work: Path, options: Options) -> Cloud:
     """Return the fused cloud of all photographs, relative to the reconstruction's origin.
 
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Its model and photographs are read from their files.
-    work : Path
-        Folder for undistorted photographs and depth maps: about 20 bytes per pixel of each photograph.
-
-    Raises
-    ------
-    TaskError
-        If pycolmap is missing, or the cloud is empty.
+    - `reconstruction`: its model and photographs are read from their files.
+    - `work`: folder for undistorted photographs and depth maps: about 20 bytes per pixel of each photograph.
     """
     pycolmap = colmap()
     workspace, fused = work / "stereo", work / "fused.ply"
@@ -56,13 +47,7 @@ def patchmatch(reconstruction: Reconstruction, work: Path, options: Options) -> 
 
 
 def read_ply(path: Path) -> Cloud:
-    """Read the points from the PLY file of COLMAP's fusion.
-
-    Raises
-    ------
-    TaskError
-        If there are none.
-    """
+    """Read the points from the PLY file of COLMAP's fusion."""
     _, _, body = path.read_bytes().partition(b"end_header\n")
     records = np.frombuffer(body, RECORD)
     if not len(records):

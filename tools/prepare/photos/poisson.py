@@ -43,23 +43,12 @@ def poisson(
 ) -> TexturedMesh:
     """Return the surface of a cloud as a mesh with vertex colours.
 
-    Parameters
-    ----------
-    cloud : Cloud
-        Points about ``spacing_m`` apart, with normals.
-    spacing_m : float
-        Distance between neighbouring points (m).
-    crs, origin : str, Floats
-        CRS, and the position of the cloud's origin in it: easting, northing, height, ``(3,)``, m.
-    work : Path
-        Folder for two temporary PLY files.
-    threads : int, optional
-        Number of threads; by default one per core.
-
-    Raises
-    ------
-    TaskError
-        If pycolmap is missing, or there are too few points for a surface.
+    - `cloud`: points about ``spacing_m`` apart, with normals.
+    - `spacing_m`: distance between neighbouring points (m).
+    - `crs`, `origin`: CRS, and the position of the cloud's origin in it: easting, northing, height, ``(3,)``,
+      m.
+    - `work`: folder for two temporary PLY files.
+    - `threads`: number of threads; by default one per core.
     """
     pycolmap = colmap()
     write_ply(work / "cloud.ply", cloud)

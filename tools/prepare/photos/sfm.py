@@ -121,13 +121,7 @@ class Reconstruction:
 
 
 def colmap() -> Any:
-    """Return pycolmap, an optional dependency, and silence its log.
-
-    Raises
-    ------
-    TaskError
-        If it or a library that it needs is not installed; the message says what to install.
-    """
+    """Return pycolmap, an optional dependency, and silence its log."""
     try:
         # It logs hundreds of lines of progress; its errors are raised here as TaskError.
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -148,22 +142,11 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct the poses of photographs and sparse points from their features and GNSS positions.
 
-    Parameters
-    ----------
-    placed : PlacedPhotos
-        The photographs and their GNSS positions.
-    work : Path
-        Empty folder for the database and the model.
-    options : Options
-        Options. The same seed and number of threads give the same result up to rounding.
-    control : Control, optional
-        Ground control points. If 3 or more are marked in at least 2 placed photographs each, they alone
-        determine the georeference; GNSS is then only used for matching.
-
-    Raises
-    ------
-    TaskError
-        If pycolmap is missing, no photographs match, or fewer than 3 or less than half of them can be placed.
+    - `placed`: the photographs and their GNSS positions.
+    - `work`: empty folder for the database and the model.
+    - `options`: options. The same seed and number of threads give the same result up to rounding.
+    - `control`: ground control points. If 3 or more are marked in at least 2 placed photographs each, they
+      alone determine the georeference; GNSS is then only used for matching.
     """
     colmap()
     pycolmap.set_random_seed(options.seed)

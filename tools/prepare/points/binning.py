@@ -57,14 +57,9 @@ def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats
 
     Values are summed in the order of the points: another order changes only the last digits.
 
-    Parameters
-    ----------
-    cells : Cells
-        The cells of the points, ``(n,)``; points outside the grid are left out.
-    shape : tuple of int
-        Rows and columns.
-    *values : Floats
-        One value per point, ``(n,)``.
+    - `cells`: the cells of the points, ``(n,)``; points outside the grid are left out.
+    - `shape`: rows and columns.
+    - `values`: one value per point, ``(n,)``.
     """
     size = shape[0] * shape[1]
     with np.errstate(invalid="ignore"):
@@ -123,18 +118,11 @@ def top_layer(
 ) -> TopLayer:
     """Return mean, number and spread of the points of each cell's top layer.
 
-    Parameters
-    ----------
-    cells : Cells
-        The cells of the points, ``(n,)``.
-    height : Floats
-        The points, ``(n,)``, m.
-    highest : Floats
-        Highest point per cell, ``(H, W)``, m; NaN where there is none.
-    depth_m : float
-        Points up to this much below the highest one belong to the top layer (m).
-    shape : tuple of int
-        Rows and columns.
+    - `cells`: the cells of the points, ``(n,)``.
+    - `height`: the points, ``(n,)``, m.
+    - `highest`: highest point per cell, ``(H, W)``, m; NaN where there is none.
+    - `depth_m`: points up to this much below the highest one belong to the top layer (m).
+    - `shape`: rows and columns.
     """
     count, below, squared = _sums(cells, height, highest.ravel(), depth_m)
     with np.errstate(invalid="ignore"):

@@ -52,22 +52,11 @@ def ground(
     Point p is ground if ``h_p - h_q <= slope * d + confidence * sqrt(2) * noise_m`` for all q at a distance
     ``d <= radius_m`` in plan. Low outliers are not ground, and are not compared.
 
-    Parameters
-    ----------
-    easting, northing, height : ndarray, (n,)
-        In metres. Points with NaN or infinite coordinates are not ground.
-    asked : ndarray of bool, (n,), optional
-        Points for which the answer is needed; all others are returned as not ground. None asks for all.
-
-    Returns
-    -------
-    ndarray of bool, (n,)
-        Independent of the order of the points.
-
-    Raises
-    ------
-    TaskError
-        If the arrays differ in length.
+    - `easting`, `northing`, `height` ``(n,)``: in metres. Points with NaN or infinite coordinates are not
+      ground.
+    - `asked` ``(n,)``: points for which the answer is needed; all others are returned as not ground. None
+      asks for all.
+    - result ``(n,)``: independent of the order of the points.
     """
     points = low_outliers.without_low_outliers(easting, northing, height, options.radius_m, options)
     is_asked = np.ones(points.order.size, bool) if asked is None else asked[points.order]
@@ -80,16 +69,8 @@ def ground(
 def ground_cells(heights: Floats, cell: float, options: Options) -> Bools:
     """Return which cells of a surface model are ground: `ground` applied to the cell centres.
 
-    Parameters
-    ----------
-    heights : ndarray, (H, W)
-        In metres; cells with NaN are not ground.
-    cell : float
-        Cell size (m).
-
-    Returns
-    -------
-    ndarray of bool, (H, W)
+    - `heights` ``(H, W)``: in metres; cells with NaN are not ground.
+    - `cell`: cell size (m).
     """
     row, col = np.indices(heights.shape, np.float64).reshape(2, -1)
     return ground(col * cell, -row * cell, heights.ravel(), options).reshape(heights.shape)

@@ -60,17 +60,8 @@ def without_low_outliers(
     A point is a low outlier if within ``low_radius_m`` at most ``low_companions`` others are lower or at most
     ``low_m`` higher, and 20 times as many points (counting itself) are above that.
 
-    Parameters
-    ----------
-    easting, northing, height : ndarray, (n,)
-        In metres.
-    radius_m : float
-        Radius of searches in the buckets (m), for their size.
-
-    Raises
-    ------
-    TaskError
-        If the arrays differ in length.
+    - `easting`, `northing`, `height` ``(n,)``: in metres.
+    - `radius_m`: radius of searches in the buckets (m), for their size.
     """
     if not (easting.shape == northing.shape == height.shape == (height.size,)):
         shapes = f"{easting.shape}, {northing.shape} and {height.shape}"

@@ -50,20 +50,9 @@ def ground(easting: Floats, northing: Floats, height: Floats, options: Options) 
     0 to ``radius_m`` in steps of a cell. Cells without points have no effect. Low outliers are not ground,
     and do not count.
 
-    Parameters
-    ----------
-    easting, northing, height : ndarray, (n,)
-        In metres. Points with NaN or infinite coordinates are not ground.
-
-    Returns
-    -------
-    ndarray of bool, (n,)
-        Independent of the order of the points, and of those farther away than ``reach_m``.
-
-    Raises
-    ------
-    TaskError
-        If the arrays differ in length.
+    - `easting`, `northing`, `height` ``(n,)``: in metres. Points with NaN or infinite coordinates are not
+      ground.
+    - result ``(n,)``: independent of the order of the points, and of those farther away than ``reach_m``.
     """
     points = low_outliers.without_low_outliers(easting, northing, height, options.radius_m, options)
     out = np.zeros(height.shape, bool)
@@ -84,14 +73,9 @@ def ground(easting: Floats, northing: Floats, height: Floats, options: Options) 
 def _highest_ground(surface: Floats, radius: int, fall: float) -> Floats:
     """Return the lowest sum of an opening and of the fall over its radius, for all radii, ``(H, W)``, m.
 
-    Parameters
-    ----------
-    surface : (H, W) array
-        Heights (m); inf without points.
-    radius : int
-        Largest radius, in cells.
-    fall : float
-        Fall of the ground over one cell (m).
+    - `surface`: heights (m); inf without points.
+    - `radius`: largest radius, in cells.
+    - `fall`: fall of the ground over one cell (m).
     """
     result = surface.copy()
     for size in range(1, radius + 1):

@@ -21,12 +21,8 @@ def photo(points: Points, grid: Grid, fill_m: float) -> Orthophoto:
     Of points at the same height, the one with the greatest red, then green, then blue is used; of pixels at
     the same distance, the northernmost, then the westernmost.
 
-    Parameters
-    ----------
-    points : Points
-        Must have colours, and include a rim of ``fill_m`` around the grid.
-    fill_m : float
-        Pixels whose centre is farther than this from that of a valid pixel stay without colour (m).
+    - `points`: must have colours, and include a rim of ``fill_m`` around the grid.
+    - `fill_m`: pixels whose centre is farther than this from that of a valid pixel stay without colour (m).
     """
     assert points.colour is not None
     rim = grid.buffered(fill_m)

@@ -45,15 +45,10 @@ def triangulated(ground: Floats, grid: Grid, void_m: float, inner: Window | None
     as the lowest point would be. A cell with ground points whose centre is outside all triangles, as at the
     border of the survey, has the mean height of its points.
 
-    Parameters
-    ----------
-    ground : ndarray, (3, H, W)
-        Easting and northing of the cells' centroids from the grid's north-west corner, and their height (m);
-        NaN without ground points.
-    void_m : float
-        The DTM is NaN where a circle of this diameter plus `EMPTY_CIRCLE_CELLS` has no node (m).
-    inner : Window, optional
-        See `tin`.
+    - `ground` ``(3, H, W)``: easting and northing of the cells' centroids from the grid's north-west corner,
+      and their height (m); NaN without ground points.
+    - `void_m`: the DTM is NaN where a circle of this diameter plus `EMPTY_CIRCLE_CELLS` has no node (m).
+    - `inner`: see `tin`.
     """
     east, north, height = ground
     interpolated = tin(east, north, height, grid, void_m + EMPTY_CIRCLE_CELLS * grid.cell, inner)
@@ -70,21 +65,11 @@ def tin(
 ) -> Floats:
     """Return heights at the cell centres, interpolated over the triangles of the nodes, ``(H, W)``, m.
 
-    Parameters
-    ----------
-    east, north : Floats
-        Position of a cell's node, from the grid's north-west corner, ``(H, W)``, m.
-    height : Floats
-        Height of a cell's node, ``(H, W)``, m; NaN if the cell has no node.
-    widest_m : float
-        Largest diameter of a triangle's circumcircle (m).
-    inner : Window, optional
-        The cells whose heights are needed; others may be wrong. None needs all.
-
-    Returns
-    -------
-    Floats
-        NaN where there is no triangle.
+    - `east`, `north`: position of a cell's node, from the grid's north-west corner, ``(H, W)``, m.
+    - `height`: height of a cell's node, ``(H, W)``, m; NaN if the cell has no node.
+    - `widest_m`: largest diameter of a triangle's circumcircle (m).
+    - `inner`: the cells whose heights are needed; others may be wrong. None needs all.
+    - result: NaN where there is no triangle.
     """
     nodes = np.isfinite(height)
     if inner is not None:
@@ -200,10 +185,7 @@ def fill_voids(heights: Floats, grid: Grid, size_m: float) -> Floats:
     The centres of the cells around the voids are triangulated (see `tin`). A square or a strip of n cells
     across is filled if ``size_m`` is at least n cells.
 
-    Parameters
-    ----------
-    heights : ndarray, (H, W) or (n, H, W)
-        One raster, or several with the same voids (m); NaN in voids.
+    - `heights` ``(H, W) or (n, H, W)``: one raster, or several with the same voids (m); NaN in voids.
     """
     layers = heights.reshape(-1, *grid.shape)
     void = np.isnan(layers[0])

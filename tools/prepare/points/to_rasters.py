@@ -71,17 +71,10 @@ class Options(base.Options):
 def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Rasters:
     """Make the rasters of a block of ground.
 
-    Parameters
-    ----------
-    points : Points
-        In the grid's CRS (m), including a rim of `reach_m` around the grid; others have no effect.
-    dop_cell : float, optional
-        Pixel of the orthophoto (m); None makes no orthophoto.
-
-    Returns
-    -------
-    Rasters
-        NaN without points, and the DTM without ground points; no orthophoto if the points have no colours.
+    - `points`: in the grid's CRS (m), including a rim of `reach_m` around the grid; others have no effect.
+    - `dop_cell`: pixel of the orthophoto (m); None makes no orthophoto.
+    - result: NaN without points, and the DTM without ground points; no orthophoto if the points have no
+      colours.
     """
     rim = grid.buffered(cells_reach_m(options, grid.cell))
     pixels = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
@@ -94,17 +87,10 @@ def of_points(
 ) -> tuple[CellHeights, Orthophoto | None]:
     """Return what the points of each cell give, and the orthophoto.
 
-    Parameters
-    ----------
-    points : Points
-        In the grid's CRS (m), including a rim of `points_reach_m` around the grid; others have no effect.
-    pixels : Grid, optional
-        Pixels of the orthophoto; None makes no orthophoto.
-
-    Returns
-    -------
-    CellHeights, Orthophoto or None
-        No orthophoto if the points have no colours.
+    - `points`: in the grid's CRS (m), including a rim of `points_reach_m` around the grid; others have no
+      effect.
+    - `pixels`: pixels of the orthophoto; None makes no orthophoto.
+    - result: no orthophoto if the points have no colours.
     """
     if options.despike_m is not None:
         points = _without_spikes(points, grid.buffered(points_reach_m(options, grid.cell)), options.despike_m)
@@ -128,10 +114,7 @@ def of_points(
 def of_cells(heights: CellHeights, rim: Grid, grid: Grid, options: Options) -> Rasters:
     """Return the rasters of a block of ground, without orthophoto.
 
-    Parameters
-    ----------
-    heights : CellHeights
-        On the cells of ``rim``: the grid and `cells_reach_m` around it.
+    - `heights`: on the cells of ``rim``: the grid and `cells_reach_m` around it.
     """
     inner = rim.window(grid)
     top = heights.top

@@ -53,16 +53,10 @@ class Comparison:
 def compare(table: TileTable, before: pd.DataFrame, variant: str, name: str) -> Comparison:
     """Compare the tiles of a run with the rows of another one, called ``name``.
 
-    Parameters
-    ----------
-    table : TileTable
-        The tiles of this run.
-    before : DataFrame
-        The other run's metrics.parquet.
-    variant : str
-        The variant that is compared.
-    name : str
-        Name of the other run in the text.
+    - `table`: the tiles of this run.
+    - `before`: the other run's metrics.parquet.
+    - `variant`: the variant that is compared.
+    - `name`: name of the other run in the text.
     """
     own = before[(before.variant == variant) & (before.status == "done")].drop_duplicates("tile_id")
     old = own.set_index("tile_id").reindex(table.frame.index)

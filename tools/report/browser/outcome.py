@@ -127,16 +127,11 @@ def reasons(
 ) -> list[Reason]:
     """Return a tile's flags in words.
 
-    Parameters
-    ----------
-    row : Mapping
-        The tile's row of metrics.parquet.
-    options : Options
-        The thresholds of the flags.
-    places : Mapping
-        Place of each flag, as far as known (`flexroad.tasks.quality.places.places`).
-    notes : sequence of str
-        Notes on the sources of the tile: a DSM that lies off the DTM as a whole is why roads are dropped.
+    - `row`: the tile's row of metrics.parquet.
+    - `options`: the thresholds of the flags.
+    - `places`: place of each flag, as far as known (`flexroad.tasks.quality.places.places`).
+    - `notes`: notes on the sources of the tile: a DSM that lies off the DTM as a whole is why roads are
+      dropped.
     """
     given = row.get("flags")
     names = given.split(", ") if isinstance(given, str) and given else []
@@ -229,16 +224,10 @@ def cards(table: TileTable) -> list[tuple[str, int, str]]:
 def statements(content: Content, table: TileTable, failed: Mapping[str, str], run: str) -> list[Statement]:
     """Return what is to be known of a run, the most urgent first.
 
-    Parameters
-    ----------
-    content : Content
-        The tables of the run.
-    table : TileTable
-        Its tiles.
-    failed : Mapping
-        The error of each failed tile by id.
-    run : str
-        Path of the run, for commands.
+    - `content`: the tables of the run.
+    - `table`: its tiles.
+    - `failed`: the error of each failed tile by id.
+    - `run`: path of the run, for commands.
     """
     run = shlex.quote(run)
     return [

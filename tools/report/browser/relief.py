@@ -50,16 +50,9 @@ class Relief:
 def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = untracked) -> Relief | None:
     """Draw the surfaces of tiles as a shaded relief with their roads; None if none is in the store.
 
-    Parameters
-    ----------
-    run : Run
-        The run.
-    tiles : iterable of Tile
-        The tiles to draw; those whose surface is not in the store are left out.
-    results : Results
-        The results of all finished tiles.
-    track : callable
-        Shows the progress.
+    - `tiles`: the tiles to draw; those whose surface is not in the store are left out.
+    - `results`: the results of all finished tiles.
+    - `track`: shows the progress.
     """
     tiles = list(tiles)
     if not tiles:

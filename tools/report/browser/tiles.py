@@ -162,13 +162,8 @@ def map_data(
 ) -> dict[str, Any]:
     """Return the tiles for the page's script: for `as_script`, which writes the arrays of figures.
 
-    Parameters
-    ----------
-    table : TileTable
-    failed : Mapping
-        The error of each failed tile by id.
-    more : Mapping
-        Further columns, as those of `numeric_columns`: differences.
+    - `failed`: the error of each failed tile by id.
+    - `more`: further columns, as those of `numeric_columns`: differences.
     """
     finite = table.bounds[np.isfinite(table.bounds[:, 0])]
     west, south, east, north = (*finite[:, :2].min(0), *finite[:, 2:].max(0)) if len(finite) else (0.0,) * 4
