@@ -128,10 +128,10 @@ lint: $(STAMP) ## Check style and types
 	$(BIN)/lint-imports
 
 bench: $(STAMP) ## Print the stages beside their floors, peers, starts and make reproduce; one other benchmark: make bench BENCH=ground
-	@$(BIN)/python -m tests.bench $(BENCH)
+	@$(BIN)/python -m bench $(BENCH)
 
 speed: $(STAMP) ## Measure the tables and the plot of docs/results/speed.md anew
-	@PYTHONPATH=. $(BIN)/python tests/bench/speed_page.py
+	@PYTHONPATH=. $(BIN)/python bench/speed_page.py
 
 # The extras of pyproject.toml in the image, and where PyTorch's build for CPUs comes from.
 BUILDER ?= podman

@@ -71,7 +71,6 @@ def is_helper(file: str) -> bool:
     path = Path(file)
     return (
         path.is_relative_to("tests")
-        and not path.is_relative_to("tests/bench")
         and not path.name.startswith("test_")
         and path != PASSED.relative_to(ROOT)
     )

@@ -57,7 +57,7 @@ def test_core_without_tools_works(tmp_path):
         assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
 
 
-SCRIPTS = sorted((ROOT / "tests" / "bench").glob("*.py"))
+SCRIPTS = sorted((ROOT / "bench").glob("*.py"))
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ Ground = Literal["auto", "classes", "filter", "morphological"]
 MIN_GROUND = 0.01
 """A file with a smaller share of ground points is taken as not classified."""
 DENSE, DENSE_CONFIDENCE = 50.0, 3.0
-"""Above this density (points per m2) the slope filter uses this ``confidence`` (docs/archive/ground.md)."""
+"""Above this density (points per m2) the slope filter uses this ``confidence``."""
 FEWER = "prepare fewer files at a time"
 LARGE, GAP_M = 10**9, 10_000.0
 """From so many cells on, an area may not have an empty gap of this width (m) and of half its side."""

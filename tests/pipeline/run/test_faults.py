@@ -1,6 +1,6 @@
 """Faults during a run: afterwards the same command gives the results of an undisturbed run.
 
-Faults of a single module are tested in that module's tests; `docs/faults.md` lists all of them.
+Faults of a single module are tested in that module's tests; `tests/faults.md` lists all of them.
 """
 
 import contextlib

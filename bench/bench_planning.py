@@ -5,7 +5,7 @@ sheets of 1 km. Only the first tile is computed. The others get its stored resul
 and its row, and their markers are without products: writing and reading of meshes is not measured. CPU time
 counts, not the time on the wall.
 
-Usage: ``python tests/bench/bench_planning.py [TILES] [--only COMMAND ...]``
+Usage: ``python bench/bench_planning.py [TILES] [--only COMMAND ...]``
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ def measure(folder: Path, words: list[str]) -> None:
     output = subprocess.run(
         [sys.executable, "-S", "-c", LAUNCHER, "-c", code, *words],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
         capture_output=True,
         check=True,
     )

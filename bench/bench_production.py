@@ -1,6 +1,6 @@
 """The production settings against the paper's: on the benchmark, in two real towns, on a real survey.
 
-``PYTHONPATH=. python tests/bench/bench_production.py 240`` gives the table of docs/fit.md; without a number
+``PYTHONPATH=. python bench/bench_production.py 240`` gives the table of docs/fit.md; without a number
 4 tiles of the benchmark are used. Stages and options are those of configs/paper.yaml and
 configs/production.yaml, tile by tile as in a run; only the benchmark's tiles, which have no neighbours, have
 no halo.

@@ -9,7 +9,7 @@ import ast
 import subprocess
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 CORE = ("catalog", "tasks", "pipeline", "flexroad")
 TOOLS = sorted(folder.name for folder in (ROOT / "tools").iterdir() if (folder / "__init__.py").is_file())
 
@@ -41,22 +41,22 @@ def main() -> None:
         [file for file in tracked(*folders) if file.suffix == ".py"] for folders in (CORE, ["tools"])
     )
     source = core + tools
-    tests = [file for file in tracked("tests") if file.suffix == ".py"]
+    tests = [file for file in tracked("tests", "bench") if file.suffix == ".py"]
     trees = [ast.parse(file.read_text()) for file in source]
     classes = [node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)]
     pages = [file for file in tracked("docs") if file.suffix == ".md"]
-    live = [file for file in pages if not {"archive", "results"} & set(file.parts)]
+    live = [file for file in pages if "results" not in file.parts]
     figures = {
         "core: lines of Python": lines(core),
         "tools: lines of Python": lines(tools),
         "source: files": len(source),
         "source: public classes": sum(not name.startswith("_") for name in classes),
         "source: imports in functions": sum(map(inner_imports, trees)),
-        "tests: lines of Python": lines(tests),
-        "tests: files": len(tests),
+        "tests, bench: lines of Python": lines(tests),
+        "tests, bench: files": len(tests),
         "README: lines": lines([ROOT / "README.md"]),
         "docs: words": words(live),
-        "docs: words of results, archive": words(pages) - words(live),
+        "docs: words of results": words(pages) - words(live),
     }
     for folder in (*CORE[:3], *(f"tools/{name}" for name in TOOLS)):
         figures[f"{folder}: lines"] = lines([file for file in source if file.is_relative_to(ROOT / folder)])

@@ -2,7 +2,7 @@
 
 Plane, RGT and FlexRoad's T depend only on the data and the mask. The preset was tuned to them and to nothing
 else. Heights are compared with the DTM extended by bridges, as in the paper.
-Usage: ``PYTHONPATH=. python tests/bench/bench_gerod.py [TILES SEED]``; the default is 48 tiles of seed 0,
+Usage: ``PYTHONPATH=. python bench/bench_gerod.py [TILES SEED]``; the default is 48 tiles of seed 0,
 the complete survey of seed 1 is ``240 1``.
 """
 

@@ -4,7 +4,7 @@ CPU ms of one thread: the lowest of some rounds, mean of tiles from urban to rur
 `floors.py`, over what one core did at most in the same run. A tile alone computes its four corners and four
 edges; in a mosaic, where neighbours share them, it pays for one corner and two edges.
 
-Usage: ``python tests/bench/bench_tile.py [--rounds 5] [--tiles 4] [--json FILE]``
+Usage: ``python bench/bench_tile.py [--rounds 5] [--tiles 4] [--json FILE]``
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from bench import floors, measure_stages
+from bench.floors import Work
+from bench.timing import Peak, one_thread, peak
 from flexroad.catalog import Catalog, Tile
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.borders import STAGE as BORDER
@@ -27,9 +30,6 @@ from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator
 from flexroad.tasks.load import load_border
 from flexroad.tools.synthetic.scenes import write_scenes
-from tests.bench import floors, measure_stages
-from tests.bench.floors import Work
-from tests.bench.timing import Peak, one_thread, peak
 
 CONFIGS = ("production", "paper")
 SEED = 11

@@ -2,7 +2,7 @@
 
 The five scenes that stand in for DSC3D are made in any case: more tiles change only the other commands.
 
-Usage: ``PYTHONPATH=. python tests/bench/bench_reproduce.py [TILES]``
+Usage: ``PYTHONPATH=. python bench/bench_reproduce.py [TILES]``
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.bench.bench_start import FLEXROAD, cpu_s
+from bench.bench_start import FLEXROAD, cpu_s
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 
 
 def main(tiles: int) -> None:

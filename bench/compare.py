@@ -5,7 +5,7 @@ configuration. Both process the same tiles, one after the other, so that a slowe
 lowest time of all rounds counts for each stage of each tile; the table has means over tiles. A tile is alone
 in its store: it computes its four corners and four edges itself. Heights and rows of both are compared.
 
-Usage: ``python tests/bench/compare.py OTHER_CHECKOUT [--rounds 5] [--tiles 4] [--configs production paper]``
+Usage: ``python bench/compare.py OTHER_CHECKOUT [--rounds 5] [--tiles 4] [--configs production paper]``
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import rasterio
 from flexroad.pipeline import ONE_THREAD
 from flexroad.tools.synthetic.scenes import write_scenes
 
-HERE = Path(__file__).parents[2]
+HERE = Path(__file__).parents[1]
 SCRIPT = Path(__file__).with_name("measure_stages.py")
 CONFIGS = ("production", "paper")
 SEED = 11

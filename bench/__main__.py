@@ -1,6 +1,6 @@
 """``make bench``: stages and floors, peers, start of commands, ``make reproduce``; then what else there is.
 
-Usage: ``python -m tests.bench [NAME ... | all]``; a name is that of a file, without ``bench_``.
+Usage: ``python -m bench [NAME ... | all]``; a name is that of a file, without ``bench_``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def main(names: list[str]) -> None:
     chosen = list(there) if names == ["all"] else names or list(FIRST)
     if unknown := [name for name in chosen if name not in there]:
         raise SystemExit(f"no benchmark {', '.join(unknown)}; there are {', '.join(there)}")
-    environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(FOLDER.parents[1])}
+    environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(FOLDER.parent)}
     for name in chosen:
         print(f"\n== {name}", flush=True)
         subprocess.run([sys.executable, str(there[name])], check=True, env=environment)
@@ -31,7 +31,7 @@ def main(names: list[str]) -> None:
         print("\nothers, one by one (make bench BENCH=NAME; several minutes with BENCH=all):")
         for name in [name for name in there if name not in FIRST]:
             print(f"  {name:18}{about(there[name])}")
-        print("two checkouts against each other: python tests/bench/compare.py OTHER_CHECKOUT")
+        print("two checkouts against each other: python bench/compare.py OTHER_CHECKOUT")
 
 
 def about(path: Path) -> str:

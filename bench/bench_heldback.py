@@ -11,7 +11,7 @@ within the 90% interval, and how many of the worst tenth are among the tenth wit
 
 Small places have few such squares, so they are run with several draws of them (`DRAWN`), pooled.
 
-Usage: ``python tests/bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...] [--draw NUMBER]``;
+Usage: ``python bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...] [--draw NUMBER]``;
 each NAME is a further configuration, production with options: ``--set soft=fit.bending_m3=20``. Another
 number of the first draw gives other squares and other synthetic scenes. Real places need FLEXROAD_REAL_DATA.
 Intervals are 95% intervals of a bootstrap over the squares, those of MAD and T over the tiles.
@@ -427,7 +427,7 @@ def main() -> None:
         name, _, option = text.partition("=")
         configs[name] = ("production", (*configs.get(name, ("", ()))[1], option))
     data = os.environ.get("FLEXROAD_REAL_DATA")
-    there = places(Path(data) if data else None, Path(__file__).parents[1] / "real" / "roads")
+    there = places(Path(data) if data else None, Path(__file__).parents[1] / "tests" / "real" / "roads")
     for name in chosen.places or there:
         with tempfile.TemporaryDirectory() as scratch:
             folders = [Path(scratch) / f"draw {number}" for number in range(DRAWN.get(name, 1))]

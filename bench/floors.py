@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.timing import Peak
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
-from tests.bench.timing import Peak
 
 SUPPORT = 4
 """Basis functions that are not zero at a place, along each axis: degree 3."""

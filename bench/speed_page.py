@@ -3,7 +3,7 @@
 Everything is CPU time, so other programs on the machine change it little. The page says how each figure is
 made; the text around the tables is not touched.
 
-Usage: ``python tests/bench/speed_page.py [--rounds 5] [--tiles 4] [--simulated 10000]``
+Usage: ``python bench/speed_page.py [--rounds 5] [--tiles 4] [--simulated 10000]``
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from bench import bench_points, bench_simulated, bench_tile, measure_stages
+from bench.timing import Peak, cpu_s, one_cpu_s, one_thread, peak
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
@@ -25,10 +27,8 @@ from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks import load
 from flexroad.tasks.options import stage_function
 from flexroad.tools.synthetic.scenes import write_scenes
-from tests.bench import bench_points, bench_simulated, bench_tile, measure_stages
-from tests.bench.timing import Peak, cpu_s, one_cpu_s, one_thread, peak
 
-PAGE = Path(__file__).parents[2] / "docs" / "results" / "speed.md"
+PAGE = Path(__file__).parents[1] / "docs" / "results" / "speed.md"
 PLOT = PAGE.parents[1] / "images" / "speed.webp"
 STATE = 550_000
 """Tiles of 250 m of one German state (34,100 km2)."""

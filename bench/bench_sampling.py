@@ -1,9 +1,9 @@
 """Samplings of the same surfaces: size, CPU time and smoothness of meshes, and their distance from them.
 
-Usage: ``PYTHONPATH=. python tests/bench/bench_sampling.py CATALOG...``; each catalog gives a table, the mean
+Usage: ``PYTHONPATH=. python bench/bench_sampling.py CATALOG...``; each catalog gives a table, the mean
 over its tiles. Surfaces, masks and frames are those of production. Distances are those of
 `tasks.metrics.mesh_distance`, with the 99th percentile on roads and that of terrain from the surface without
-the steps that a mesh without breaklines leaves out. docs/archive/sampling.md has the results.
+the steps that a mesh without breaklines leaves out.
 """
 
 import os

@@ -4,7 +4,7 @@ Both run each configuration over the same synthetic tiles, with the same interpr
 fingerprints (names of the files in the store), the bytes of all products and mosaics, the metrics without
 times, and the sources, nodes and versions in each tile's item. The exit code is 1 if something differs.
 
-Usage: ``python tests/bench/same_results.py OTHER_CHECKOUT [--tiles 12] [--configs production paper]``
+Usage: ``python bench/same_results.py OTHER_CHECKOUT [--tiles 12] [--configs production paper]``
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import pandas as pd
 from flexroad.pipeline import ONE_THREAD
 from flexroad.tools.synthetic.scenes import write_scenes
 
-HERE = Path(__file__).parents[2]
+HERE = Path(__file__).parents[1]
 SEED, SIZE_M = 7, 120
 PRODUCTS = (".glb", ".ply", ".tif", ".npz", ".vrt")
 ITEM = ("fingerprint", "nodes", "sources", "versions", "notes")

@@ -2,7 +2,7 @@
 
 It imports nothing of its own folder, so that the interpreter of another checkout can run it (`compare.py`).
 
-Usage: ``python tests/bench/measure_stages.py CATALOG CONFIG FOLDER``; prints a JSON object for each round.
+Usage: ``python bench/measure_stages.py CATALOG CONFIG FOLDER``; prints a JSON object for each round.
 """
 
 from __future__ import annotations

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.gis_peers import installed
+from bench.timing import cpu_s, one_cpu_s, one_thread
 from flexroad.catalog import Catalog, Grid
 from flexroad.pipeline.config.loading import load_config
 from flexroad.tasks import load, sample
@@ -26,8 +28,6 @@ from flexroad.tasks.options import stage_function
 from flexroad.tasks.roads.dtm_validity import ground_to_fit
 from flexroad.tasks.types import Floats, RoadClusters, RoadMask, Surface, TileData
 from flexroad.tools.synthetic.scenes import write_scenes
-from tests.bench.gis_peers import installed
-from tests.bench.timing import cpu_s, one_cpu_s, one_thread
 
 SEED = 11
 NEIGHBOURS, SMOOTHING = 30, 3.0

@@ -2,7 +2,7 @@
 
 Plane, RGT and FlexRoad's T depend only on the data and the mask. The scenes were tuned to these rows and to
 nothing else.
-Usage: ``PYTHONPATH=. python tests/bench/bench_dsc3d.py [SEED]``; the default seed is 0.
+Usage: ``PYTHONPATH=. python bench/bench_dsc3d.py [SEED]``; the default seed is 0.
 """
 
 import sys

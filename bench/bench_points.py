@@ -4,7 +4,7 @@ CPU seconds of complete commands: the lowest of some rounds, with those of their
 scan always; with FLEXROAD_REAL_DATA also the north of Autzen, whose ground the slope filter then classifies.
 With another checkout both run in turn, A B A B, and their rasters are compared.
 
-Usage: ``python tests/bench/bench_points.py [--rounds 3] [--million 5] [--workers 1 2] [--other CHECKOUT]``
+Usage: ``python bench/bench_points.py [--rounds 3] [--million 5] [--workers 1 2] [--other CHECKOUT]``
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from flexroad.pipeline import ONE_THREAD
 from flexroad.tools.prepare.points.ground_filter import Options, ground
 from tests.make_clouds import write_cloud
 
-HERE = Path(__file__).parents[2]
+HERE = Path(__file__).parents[1]
 AUTZEN, FOOT = "autzen/autzen_north.laz", 0.3048
 PER_M2 = 8
 METHODS = ("classes", "filter")

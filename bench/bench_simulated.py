@@ -1,7 +1,7 @@
 """Tiles that return at once: what client, scheduler and workers cost per tile, and the client's memory.
 
 The tiles are tiny parts of two large rasters and a mask. Usage:
-``python tests/bench/bench_simulated.py [TILES]``; 100,000 tiles take an hour.
+``python bench/bench_simulated.py [TILES]``; 100,000 tiles take an hour.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import psutil
 import rasterio
 from numpy.typing import NDArray
 
+from bench.timing import resident_mb
 from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose
@@ -29,7 +30,6 @@ from flexroad.pipeline.execute.executor import Probe
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tools.synthetic import SceneOptions, make_scene
-from tests.bench.timing import resident_mb
 from tests.made_result import done
 
 TILES = 2000

@@ -6,7 +6,7 @@ of Eugene, Oregon (Watershed Sciences, PDAL/data, CC BY 4.0). The photograph is 
 points, moved by 2 m onto its heights. Section "Autzen" of docs/results/real_data.md has the command that
 makes the rasters.
 
-Usage: ``python tests/bench/street_picture.py RUN PHOTO.tif OUT.webp`` (needs OpenGL)
+Usage: ``python bench/street_picture.py RUN PHOTO.tif OUT.webp`` (needs OpenGL)
 """
 
 from __future__ import annotations
