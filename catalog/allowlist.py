@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Collection, Iterable, Iterator
-from pathlib import Path
 
-from flexroad.catalog.guard.open_raster import MAX_DEPTH, vrt_sources
-from flexroad.catalog.guard.refused import Refused
 from flexroad.catalog.index import Catalog
 from flexroad.catalog.storage.paths import Location, resolved
 from flexroad.catalog.tile import LAYERS, Layer, Tile
@@ -19,25 +16,18 @@ TOPS = ("/", "s3:/", "s3:")
 
 
 def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
-    """Raise an error if a tile, or a VRT (``.vrt``) on disk that it names, names a file that may not be read.
+    """Raise an error if a tile names a file that may not be read.
 
-    `Tile.paths` and `open_raster` raise the same error, but only when the file is needed.
+    `Tile.paths` raises the same error, but only when the file is needed.
 
     - `layers`: the layers that will be read; other layers are not checked.
     """
-    checked = set[str]()
     for tile, layer in _chosen(catalog, layers):
         if tile.allowed is None:
             continue
         if outside := tile.outside(layer):
             folders = _needed(catalog, tile.allowed, layers)
             raise tile.allowed.refusal(f"tile {tile.id}: {layer.name}", outside, folders)
-        for vrt_name in {full_name(tile.root, file) for file in layer.files} - checked:
-            checked.add(vrt_name)
-            for name in _sources(vrt_name):
-                if not tile.allowed.permits(name):
-                    folders = _needed(catalog, tile.allowed, layers)
-                    raise tile.allowed.refusal(f"tile {tile.id}: {layer.name} {vrt_name}", name, folders)
 
 
 def needed(catalog: Catalog, folder: Location | str, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
@@ -58,7 +48,7 @@ def _needed(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str]) 
 def _outside(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str]) -> Iterator[str]:
     """Yield the name of every file outside the allowed folders that could be allowed."""
     names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
-    for name in (name for file in names for name in (file, *_sources(file))):
+    for name in names:
         if not ADDRESS.match(name) and not allowed.permits(name):
             yield resolved(name)
 
@@ -66,19 +56,6 @@ def _outside(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str])
 def _chosen(catalog: Catalog, layers: Collection[str]) -> Iterator[tuple[Tile, Layer]]:
     for tile in catalog.tiles:
         yield from ((tile, layer) for layer in tile.all_layers if layer.name in layers)
-
-
-def _sources(name: str, depth: int = MAX_DEPTH) -> tuple[str, ...]:
-    """Return the files that a VRT on disk names; empty for other files and for one that cannot be read."""
-    on_disk = not ADDRESS.match(name) and not name.lower().startswith("s3:")
-    if not depth or not on_disk or not name.lower().endswith(".vrt"):
-        return ()
-    try:
-        named = vrt_sources(Path(name))
-    except (Refused, OSError):
-        # The reader reports it.
-        return ()
-    return (*named, *(file for source in named for file in _sources(source, depth - 1)))
 
 
 def _outermost(folders: Iterable[str]) -> set[str]:

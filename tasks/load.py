@@ -199,7 +199,6 @@ def layer_source(tile: Tile, name: str) -> Source | None:
         name,
         files,
         layer.crs,
-        allowed=tile.allowed,
         reproject=layer.reproject,
         sublayer=layer.sublayer,
         missing=tile.missing,

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.storage.paths import Location
-from flexroad.catalog.trust import AllowedFolders
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -37,8 +36,6 @@ class Source:
     """CRS of files without one."""
     optional: bool = False
     """Whether rasters that are missing or broken are left out, as around a border, and not an error."""
-    allowed: AllowedFolders | None = None
-    """Where the files that a VRT names may lie; None: anywhere on disk."""
     reproject: bool = False
     """Whether rasters in another CRS than the tile's are warped; else they are an error."""
     sublayer: str | None = None

@@ -1,6 +1,6 @@
 """Source rasters that a thread keeps open: a tile, its corners and its edges read the same files.
 
-Only files on disk that need no other file are kept: no VRT, no side-car files. A file that has changed, or
+Only files on disk without side-car files are kept. A file that has changed, or
 whose folder has, since it was opened is opened and checked again.
 """
 
@@ -18,17 +18,16 @@ from typing import Any
 
 from flexroad.catalog.guard.open_raster import open_alone, open_raster
 from flexroad.catalog.storage.paths import Location
-from flexroad.catalog.trust import AllowedFolders
 
 MOST = 64
 """Largest number of files that a thread keeps open: nine tiles with seven layers."""
 
 
 @contextmanager
-def kept_raster(path: Location, allowed: AllowedFolders | None = None) -> Iterator[Any]:
+def kept_raster(path: Location) -> Iterator[Any]:
     """Open a source raster as `open_raster` does, and keep it open for the next time if nothing fails."""
     if not isinstance(path, Path):
-        with open_raster(path, allowed) as dataset:
+        with open_raster(path) as dataset:
             yield dataset
         return
     path = path.absolute()
@@ -36,7 +35,7 @@ def kept_raster(path: Location, allowed: AllowedFolders | None = None) -> Iterat
     state = _State.of(path)
     dataset = _idle.take(path, state) or open_alone(path)
     if dataset is None:
-        with open_raster(path, allowed) as dataset:
+        with open_raster(path) as dataset:
             yield dataset
         return
     try:

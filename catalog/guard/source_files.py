@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
-from flexroad.catalog.guard.open_raster import MAX_DEPTH, side_car_names, vrt_sources
+from flexroad.catalog.guard.open_raster import side_car_names
 from flexroad.catalog.storage.paths import FileStat, Location, file_stat, stat
 
 SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".sbx", ".idm", ".ind")
@@ -19,8 +19,6 @@ ALONE = (".geojson", ".json", ".fgb", ".osm", ".pbf")
 """Endings of vector formats of one file."""
 SETTLED_NS = 2 * 10**9
 """Age at which the time of a folder shows every later change of its names."""
-KEPT_S = 1.0
-"""Time for which `RecentStates` keeps the state of a VRT (s)."""
 
 
 def source_stat(where: Location) -> FileStat | None:
@@ -36,48 +34,16 @@ def source_stat(where: Location) -> FileStat | None:
     parts = [part for part in _files(path) if part != path]
     if not parts:
         return own
-    states = [(_relative(part, path), file_stat(part)) for part in parts]
+    states = [(part.rpartition("/")[2], file_stat(part)) for part in parts]
     return FileStat(own.size, f"{own.version}+{hashlib.sha256(repr(states).encode()).hexdigest()[:16]}")
 
 
-def _relative(part: str, path: str) -> str:
-    """Return the name of a part relative to the folder of its source, where most parts are."""
-    folder, _, _ = path.rpartition("/")
-    beside, _, name = part.rpartition("/")
-    return name if beside == folder else os.path.relpath(part, folder or ".")
-
-
-class RecentStates:
-    """States of sources in one pass over tiles; that of a VRT, which may name many files, is kept for 1 s.
-
-    A change in that second is one just after the source was looked up: the next pass notices it.
-    """
-
-    def __init__(self) -> None:
-        self._kept: dict[Path, tuple[float, FileStat | None]] = {}
-
-    def __call__(self, where: Location) -> FileStat | None:
-        """Return `source_stat`."""
-        if not isinstance(where, Path) or not _is_vrt(where.name):
-            return source_stat(where)
-        now = time.monotonic()
-        then, state = self._kept.get(where, (-KEPT_S, None))
-        if now - then >= KEPT_S:
-            state = source_stat(where)
-            self._kept[where] = now, state
-        return state
-
-
 def files_of(path: Path) -> Iterator[Path]:
-    """Yield the files of a source: itself, the parts beside it, and those of the files that a VRT names.
-
-    A VRT is one by its ending, so that the first bytes of other files are not read. Files that it names may
-    be missing.
-    """
+    """Yield the files of a source: itself, and the parts beside it."""
     return map(Path, _files(str(path)))
 
 
-def _files(path: str, depth: int = MAX_DEPTH) -> Iterator[str]:
+def _files(path: str) -> Iterator[str]:
     yield path
     # Texts in place of paths, and no function for a step: a run looks up each source of each tile.
     folder, name = os.path.split(path)
@@ -86,18 +52,6 @@ def _files(path: str, depth: int = MAX_DEPTH) -> Iterator[str]:
         # Readers of a GeoPackage leave an empty -wal.
         if not part.endswith("-wal") or _has_bytes(part):
             yield part
-    if depth and _is_vrt(name):
-        try:
-            named = vrt_sources(Path(path))
-        except OSError:
-            # It is reported when it is opened.
-            return
-        for file in named:
-            yield from _files(file, depth - 1)
-
-
-def _is_vrt(name: str) -> bool:
-    return name.lower().endswith(".vrt")
 
 
 def _has_bytes(path: str) -> bool:

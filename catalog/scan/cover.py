@@ -19,7 +19,6 @@ from flexroad.catalog.guard.open_raster import ERRORS
 from flexroad.catalog.scan.rasters import georeference_fault, heights_fault, quiet
 from flexroad.catalog.scan.valid_cells import read_valid
 from flexroad.catalog.storage.paths import Location
-from flexroad.catalog.trust import AllowedFolders
 
 LOWEST, HIGHEST = -9000.0, 1e6
 """Values outside are undeclared nodata (-9999, 3e38) in any unit; `load` knows the unit and is stricter."""
@@ -29,18 +28,12 @@ AS_TEXT = (".xyz", ".gz", ".asc", ".txt")
 """Endings of formats that cannot be read in parts: their files count as without gaps."""
 
 
-def height_share(
-    grid: Grid,
-    paths: Iterable[Location],
-    allowed: AllowedFolders | None = None,
-    crs: str | None = None,
-) -> float | None:
+def height_share(grid: Grid, paths: Iterable[Location], crs: str | None = None) -> float | None:
     """Return the share (0 to 1) of a grid's cells whose centre has a height in one of the rasters.
 
     - `paths`: rasters of heights, north up.
-    - `allowed`: where the files that a VRT names may lie; None: anywhere on disk.
     - `crs`: CRS of rasters without one; None: the grid's.
-    - result: none if a raster cannot be read, or not in parts, or has far finer cells than the grid.
+    - result: None if a raster cannot be read, or not in parts, or has far finer cells than the grid.
     """
     known = np.zeros(grid.shape, np.bool_)
     for path in paths:
@@ -48,7 +41,7 @@ def height_share(
             return None
         try:
             # Neighbouring tiles lie on the same files.
-            with quiet(), kept_raster(path, allowed) as raster:
+            with quiet(), kept_raster(path) as raster:
                 own_crs = crs_of(raster.crs.to_wkt() if raster.crs else None, crs, raster.bounds)
                 if not _add(known, grid, raster, own_crs):
                     return None

@@ -32,7 +32,7 @@ def mask_notes(root: Path, layer: str, names: Sequence[str], road_values: Sequen
 
     - `root`: folder that the names are relative to.
     - `layer`: name of the layer, for messages.
-    - `names`: the mask's files; what a VRT names was checked before.
+    - `names`: the mask's files.
     - `road_values`: values that mean road; empty: every value but 0 and nodata.
     """
     step = -(-len(names) // MOST_FILES)

@@ -16,7 +16,6 @@ from flexroad.catalog.scan.rasters import quiet
 from flexroad.catalog.scan.valid_cells import read_valid
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import some
-from flexroad.catalog.trust import AllowedFolders
 
 SHARE = 0.05
 """Smallest share of a file's cells that is noted."""
@@ -29,21 +28,18 @@ MAX_TEXT_BYTES = 32_000_000
 """Larger files of text are not read: their cells cannot be read in parts."""
 
 
-def plateau_notes(
-    layer: str, files: Mapping[str, Location], allowed: AllowedFolders | None = None
-) -> list[str]:
+def plateau_notes(layer: str, files: Mapping[str, Location]) -> list[str]:
     """Return a note on each exact height that many cells of a file have, with their share.
 
     Parts of some files are read, so that the time does not depend on the size of the survey.
 
     - `layer`: name of the layer, for messages.
     - `files`: the layer's files by name.
-    - `allowed`: where the files that a VRT names may lie; None: anywhere on disk.
     """
     step = -(-len(files) // MOST_FILES) or 1
     by_value: dict[tuple[float, float], list[str]] = defaultdict(list)
     for name in list(files)[::step]:
-        for height, value, share in _plateaus(files[name], allowed):
+        for height, value, share in _plateaus(files[name]):
             by_value[height, value].append(f"{name} ({share:.1%})")
     # GDAL takes the value in the file, before its scale and offset, and all its digits.
     return [
@@ -53,13 +49,13 @@ def plateau_notes(
     ]
 
 
-def _plateaus(path: Location, allowed: AllowedFolders | None) -> Iterable[tuple[float, float, float]]:
+def _plateaus(path: Location) -> Iterable[tuple[float, float, float]]:
     """Return heights that many cells of a raster have, the values in the file, and the shares (0 to 1)."""
     suffix = Path(str(path)).suffix.lower()
     try:
         if suffix == ".gz" or (suffix in AS_TEXT and Path(str(path)).stat().st_size > MAX_TEXT_BYTES):
             return []
-        with quiet(), open_raster(path, allowed) as raster:
+        with quiet(), open_raster(path) as raster:
             parts = [read_valid(raster, window=window) for window in windows(raster)]
             scale, offset = raster.scales[0], raster.offsets[0]
     except ERRORS:

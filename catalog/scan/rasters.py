@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -35,7 +35,6 @@ from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.storage.settings import gdal_options
 from flexroad.catalog.text import access_reason, some
 from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
-from flexroad.catalog.trust import AllowedFolders
 
 DATE_TAGS = ("ACQUISITIONDATETIME", "ACQUISITIONDATE", "ACQUISITION_DATE", "TIFFTAG_DATETIME")
 """Tags with a date, the first one with a value wins."""
@@ -122,21 +121,18 @@ class _Skip(Exception):
     """A file that is left out; the message is the reason."""
 
 
-def scan(
-    root: Path, layer: str, pattern: str, crs: str | None, allow: Sequence[str] = ()
-) -> tuple[list[RasterFile], list[Skipped]]:
+def scan(root: Path, layer: str, pattern: str, crs: str | None) -> tuple[list[RasterFile], list[Skipped]]:
     """Open each file of a layer once.
 
     - `root`: the folder, resolved.
     - `layer`: name of the layer, for messages.
     - `pattern`: glob pattern: see `matching`.
     - `crs`: CRS of files without one.
-    - `allow`: folders besides ``root`` that the files named by a VRT may lie below.
     - `files`: ordered by name.
     - `skipped`: files and folders that are left out.
     """
     paths, unlisted = matching(root, layer, pattern)
-    files, skipped = opened(root, layer, paths, crs, allow)
+    files, skipped = opened(root, layer, paths, crs)
     if not files:
         folder, _ = _start(root, pattern)
         raise CatalogError(
@@ -146,16 +142,15 @@ def scan(
 
 
 def opened(
-    root: Path, layer: str, paths: Iterable[Path], crs: str | None, allow: Sequence[str] = ()
+    root: Path, layer: str, paths: Iterable[Path], crs: str | None
 ) -> tuple[list[RasterFile], list[Skipped]]:
     """Open files of a layer, each once; return the usable ones, and the others with the reason."""
     files: list[RasterFile] = []
-    allowed = AllowedFolders.of(root, allow)
     skipped: list[Skipped] = []
     with quiet():
         for path in paths:
             try:
-                files.append(_open(root, path, crs, allowed, layer in HEIGHTS))
+                files.append(_open(root, path, crs, layer in HEIGHTS))
             except _Skip as reason:
                 skipped.append(Skipped(_name(root, path), layer, str(reason), str(root)))
     return files, skipped
@@ -256,9 +251,9 @@ def _name(root: Path, path: Path) -> str:
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
 
-def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heights: bool) -> RasterFile:
+def _open(root: Path, path: Path, crs: str | None, heights: bool) -> RasterFile:
     try:
-        with open_raster(path, allowed) as src:
+        with open_raster(path) as src:
             wkt = src.crs.to_wkt() if src.crs else ""
             transform, width, height, bounds = src.transform, src.width, src.height, tuple(src.bounds)
             fault = georeference_fault(src) or (heights_fault(src) if heights else None)

@@ -84,7 +84,6 @@ def index(
     min_cover: float = MIN_COVER,
     derived: Path | None = None,
     roads: str | None = None,
-    allow: Sequence[str] = (),
     roads_layer: str | None = None,
     reproject: bool = False,
 ) -> TilingResult:
@@ -109,8 +108,6 @@ def index(
         model they are the paper's extended DTM. If None, the clouds are not read, and a note is added.
     roads : str, optional
         Vector files of roads: a file, or a glob pattern relative to ``root``.
-    allow : sequence of str
-        Folders besides ``root`` that the files named by a VRT of the mask may lie below.
     roads_layer : str, optional
         Layer of the vector files, if they have several.
     reproject : bool
@@ -141,7 +138,7 @@ def index(
         why = lines(skipped)[0] if skipped else there(root)
         raise CatalogError(f"no usable dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz below {root}; {why}")
     if road_mask is not None:
-        masks, unusable = scan(root, "road_mask", road_mask, CRS, allow)
+        masks, unusable = scan(root, "road_mask", road_mask, CRS)
         layer_files["road_mask"], dated = newest_first(root, "road_mask", masks)
         notes += dated
         skipped += unusable

@@ -1,8 +1,8 @@
-"""Folders of rasters (GeoTIFF, ASCII grid, XYZ or VRT, of any extent), cut into tiles; roads as vectors."""
+"""Folders of rasters (GeoTIFF, ASCII grid or XYZ, of any extent), cut into tiles; roads as vectors."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -27,7 +27,6 @@ def index(
     date: datetime | None = None,
     crs: str | None = None,
     min_cover: float = MIN_COVER,
-    allow: Sequence[str] = (),
     roads_layer: str | None = None,
     conversion: Conversion = NO_CONVERSION,
 ) -> TilingResult:
@@ -51,8 +50,6 @@ def index(
         CRS of files without one.
     min_cover : float
         Tiles with a DSM height in less than this share (0 to 1) of their cells are left out.
-    allow : sequence of str
-        Folders besides ``root`` that the files named by a VRT may lie below.
     roads_layer : str, optional
         Layer of the vector files, if they have several.
     conversion : Conversion
@@ -67,9 +64,7 @@ def index(
     root = root.resolve()
     _check(root, patterns)
     scanned = {
-        name: scan(root, name, patterns[name], crs, allow)
-        for name in LAYERS
-        if name in patterns and name != "roads"
+        name: scan(root, name, patterns[name], crs) for name in LAYERS if name in patterns and name != "roads"
     }
     skipped = [file for _, files in scanned.values() for file in files]
     notes, files = list[str](), dict[str, list[RasterFile]]()

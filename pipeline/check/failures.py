@@ -20,7 +20,6 @@ from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.tile import HEIGHTS
-from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.check.finding import Finding
 from flexroad.pipeline.check.heights import height_findings
 from flexroad.pipeline.check.trial import trials
@@ -175,7 +174,7 @@ def _headers(tile: Tile, known: dict[tuple[Location, str | None], _Header]) -> l
         for path in paths:
             key = path, layer.crs
             if key not in known:
-                known[key] = _header(path, layer, tile.allowed)
+                known[key] = _header(path, layer)
             found.append((layer, known[key]))
     return found
 
@@ -189,9 +188,9 @@ def _other_crs(tile: Tile, headers: Sequence[tuple[Layer, _Header]]) -> str:
     return ""
 
 
-def _header(path: Location, layer: Layer, allowed: AllowedFolders | None) -> _Header:
+def _header(path: Location, layer: Layer) -> _Header:
     try:
-        with quiet(), open_raster(path, allowed) as raster:
+        with quiet(), open_raster(path) as raster:
             crs = crs_of(raster.crs.to_wkt() if raster.crs else None, layer.crs, raster.bounds)
             fault = header(raster).fault or (heights_fault(raster) if layer.name in HEIGHTS else None)
             if Path(str(path)).suffix.lower() not in AS_TEXT:
@@ -205,7 +204,7 @@ def _header(path: Location, layer: Layer, allowed: AllowedFolders | None) -> _He
 def _share(tile: Tile) -> float | None:
     """Return the share of a tile's cells that has a height in the DSM (0 to 1), None if it is not known."""
     dsm = next(_on_tile(tile, ("dsm",)), None)
-    return height_share(tile.grid, dsm[1], tile.allowed, dsm[0].crs) if dsm else None
+    return height_share(tile.grid, dsm[1], dsm[0].crs) if dsm else None
 
 
 def _few_heights(share: float | None, min_valid: float) -> str:

@@ -134,12 +134,11 @@ def catalog_rasters(
         ),
     ] = None,
     date: Date = None,
-    allow: options.Allow = None,
     tile_size: TileSize = 250,
     min_cover: MinCover = MIN_COVER,
     strict: Strict = False,
 ) -> None:
-    """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
+    """Cut folders of GeoTIFF, ASC or XYZ into tiles."""
     patterns = {
         "dsm": dsm,
         "dtm": dtm,
@@ -158,7 +157,6 @@ def catalog_rasters(
         date=date,
         crs=crs,
         min_cover=min_cover,
-        allow=allow or (),
         roads_layer=roads_layer,
         conversion=Conversion(reproject, to_crs, height_unit),
     )
@@ -179,7 +177,6 @@ def catalog_nrw(
     tile_size: TileSize = 250,
     min_cover: MinCover = MIN_COVER,
     date: Date = None,
-    allow: options.Allow = None,
     reproject: Reproject = False,
     strict: Strict = False,
 ) -> None:
@@ -196,7 +193,6 @@ def catalog_nrw(
         min_cover=min_cover,
         derived=output.parent / f"{output.stem}_bridges",
         roads=roads,
-        allow=allow or (),
         roads_layer=roads_layer,
         reproject=reproject,
     )

@@ -30,7 +30,7 @@ import yaml
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.allowlist import needed
-from flexroad.catalog.guard.source_files import RecentStates, source_stat
+from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.storage.links import links_out
 from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import (
@@ -189,8 +189,8 @@ class Run:
 
     def stat_cache(self) -> Stat:
         """Return a stat function for many source files; in a bucket it lists each folder once."""
-        remote, local = StatCache(), RecentStates()
-        return lambda file: remote(file) if is_remote(file) else local(file)
+        remote = StatCache()
+        return lambda file: remote(file) if is_remote(file) else source_stat(file)
 
     def job(self, graph: TileGraph, force: frozenset[str] = frozenset()) -> TileJob:
         """Return the job that a worker needs to process one tile."""

@@ -63,7 +63,7 @@ def _declared(tile: Tile, name: str) -> list[tuple[str, str]]:
     with quiet():
         for path in tile.paths(layer) if layer else ():
             try:
-                crs, tags = read_raster(path, name, _crs_and_tags, tile.allowed, missing=tile.missing)
+                crs, tags = read_raster(path, name, _crs_and_tags, missing=tile.missing)
             except Unreadable:
                 continue
             taken, crs = date_of(tags), crs or (layer.crs if layer else None)

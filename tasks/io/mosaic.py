@@ -209,7 +209,6 @@ def _window(tile: Tile, layer: Layer, file: SourceFile, grid: Grid, core: Grid) 
         _position(file, core),
         layer.crs,
         Resampling.average if heights else Resampling.mode,
-        tile.allowed,
         heights,
         layer.reproject,
         tile.missing,
@@ -232,7 +231,7 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
     # Files of neighbours only touch the tile.
     if not (file.extent and _shared_m2(file.extent, core.bounds)) or (patch and _is_on(patch, core)):
         return
-    found = read_raster(file.path, file.title, header, tile.allowed, kept_raster, tile.missing)
+    found = read_raster(file.path, file.title, header, kept_raster, tile.missing)
     if found.lattice is None:
         return
     bounds = found.lattice.bounds

@@ -102,7 +102,7 @@ def _read(
         scaled = np.rint(colour * (255 / (2**depth - 1)))
         return Orthophoto(pixels, np.clip(scaled, 0, 255).astype(np.uint8), known), lattice
 
-    return read_raster(path, name, read, source.allowed, missing=source.missing)
+    return read_raster(path, name, read, missing=source.missing)
 
 
 def _gsd_m(lattice: RasterGrid, grid: Grid) -> float:

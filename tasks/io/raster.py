@@ -28,7 +28,6 @@ from flexroad.catalog.scan.rasters import heights_fault
 from flexroad.catalog.scan.valid_cells import transparent
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason
-from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.io.raster_header import file_crs, header, place
@@ -101,7 +100,6 @@ def read_window(
     core: Grid,
     crs: str | None,
     resampling: Resampling = Resampling.average,
-    allowed: AllowedFolders | None = None,
     heights: bool = False,
     reproject: bool = False,
     missing: frozenset[str] | None = None,
@@ -116,7 +114,6 @@ def read_window(
     - `core`: position of a file without georeference, if it has as many cells.
     - `crs`: CRS of a file without one.
     - `resampling`: how several cells are read as one: ``average`` of heights, ``mode`` of classes.
-    - `allowed`: where the files that a VRT names may lie; None: anywhere on disk.
     - `heights`: whether the file must have heights: one band of real numbers.
     - `reproject`: whether the file may be in another CRS than the grid; the window is then on its own
       lattice.
@@ -150,11 +147,11 @@ def read_window(
         )
 
     try:
-        return read_raster(path, name, read, allowed, kept_raster, missing)
+        return read_raster(path, name, read, kept_raster, missing)
     except DamagedCells as error:
         if not (isinstance(path, Path) and has_own_blocks(path)):
             raise
-        window = read_raster(path, name, partial(read, damaged=True), allowed, kept_raster, missing)
+        window = read_raster(path, name, partial(read, damaged=True), kept_raster, missing)
         if window is None or window.unreadable is None or window.unreadable.all():
             raise
         return replace(window, fault=error)
@@ -164,8 +161,7 @@ def read_raster(
     path: Location,
     name: str,
     read: Callable[[Any], T],
-    allowed: AllowedFolders | None = None,
-    by: Callable[[Location, AllowedFolders | None], AbstractContextManager[Any]] = open_raster,
+    by: Callable[[Location], AbstractContextManager[Any]] = open_raster,
     missing: frozenset[str] | None = None,
 ) -> T:
     """Return what a function reads from an open raster.
@@ -173,28 +169,27 @@ def read_raster(
     Only a file whose own bytes are at fault is `Unreadable`, so that it may be left out. What is computed
     while a disk or object storage does not give the file must not be stored as if the file had been read.
 
-    - `path`, `name`, `allowed`: as of `read_window`.
+    - `path`, `name`: as of `read_window`.
     - `read`: takes the open raster.
     - `missing`: full names of the files that are known to be missing; None if that is not known.
     """
     try:
-        return _attempt(path, name, read, allowed, by, missing)
+        return _attempt(path, name, read, by, missing)
     except Unreadable:
         # The system may have failed in between, and a damaged file fails again.
-        return _attempt(path, name, read, allowed, by, missing)
+        return _attempt(path, name, read, by, missing)
 
 
 def _attempt(
     path: Location,
     name: str,
     read: Callable[[Any], T],
-    allowed: AllowedFolders | None,
-    by: Callable[[Location, AllowedFolders | None], AbstractContextManager[Any]],
+    by: Callable[[Location], AbstractContextManager[Any]],
     missing: frozenset[str] | None,
 ) -> T:
     src = None
     try:
-        with by(path, allowed) as src:
+        with by(path) as src:
             return read(src)
     except ERRORS as error:
         raise _fault(path, name, error, missing, src is not None) from error

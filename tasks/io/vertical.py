@@ -25,7 +25,7 @@ def vertical_crs(tile: Tile) -> str | None:
         for layer in (layer for layer in tile.layers if layer.name in LAYERS):
             for path in tile.paths(layer):
                 try:
-                    file = read_raster(path, layer.name, header, tile.allowed, kept_raster, tile.missing)
+                    file = read_raster(path, layer.name, header, kept_raster, tile.missing)
                 except Unreadable:
                     continue
                 declared = file.crs or layer.crs

@@ -59,7 +59,7 @@ def _plateaus(tiles: Sequence[Tile]) -> Iterator[Finding]:
         for layer in (layer for layer in tile.layers if layer.name in HEIGHTS):
             files[layer.name].update(zip(layer.files, tile.paths(layer), strict=True))
     for name in (name for name in HEIGHTS if name in files):
-        for note in plateau_notes(name, files[name], tiles[0].allowed):
+        for note in plateau_notes(name, files[name]):
             yield Finding(note)
 
 

@@ -24,7 +24,6 @@ def catalog_from(
     road_values: Sequence[int] = (),
     crs: str | None = None,
     reproject: bool = False,
-    allow: Sequence[str | Path] = (),
     **patterns: str,
 ) -> Path:
     """Cut a folder of rasters into tiles and write their catalog.
@@ -43,8 +42,6 @@ def catalog_from(
         CRS of files without one.
     reproject : bool
         Whether rasters in another CRS, or in feet, are warped when they are read.
-    allow : sequence of str or Path
-        Folders besides ``root`` that the files named by a VRT may lie below.
     **patterns : str
         Files of each layer as patterns relative to the folder: ``dsm="dsm/*.tif"``. Layers are ``dsm``, which
         is required, ``dtm``, ``road_mask``, ``roads`` (vectors), ``road_height``, ``dop``, ``reference`` and
@@ -78,7 +75,6 @@ def catalog_from(
         road_values=tuple(road_values),
         tile_size_m=tile_size_m,
         crs=crs,
-        allow=tuple(map(str, allow)),
         conversion=Conversion(reproject),
     )
     for line in result.left_out:

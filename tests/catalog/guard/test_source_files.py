@@ -8,12 +8,11 @@ from pathlib import Path
 import geopandas
 import numpy as np
 import pytest
-import rasterio.shutil
 from shapely import LineString
 
 from flexroad.catalog.guard import source_files
 from flexroad.catalog.guard.open_vector import vector_name
-from flexroad.catalog.guard.source_files import RecentStates, files_of, source_stat
+from flexroad.catalog.guard.source_files import files_of, source_stat
 from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.tile import Layer, Tile
 from flexroad.pipeline.config.loading import load_config
@@ -96,48 +95,11 @@ def test_state_changes_with_each_part(name, part, settled_ns, tmp_path, monkeypa
     assert list(files_of(path)) == [path]
 
 
-def test_state_of_vrt_changes_with_each_file_that_it_names(tmp_path):
-    member = write(tmp_path / "data" / "a.tif", np.ones((20, 20), np.float32))
-    inner, outer = tmp_path / "inner.vrt", tmp_path / "outer.vrt"
-    rasterio.shutil.copy(member, inner, driver="VRT")
-    # GDAL itself would name the member in both.
-    outer.write_text(inner.read_text().replace("data/a.tif", "inner.vrt"))
-    world = tmp_path / "data" / "a.tfw"
-    states = [source_stat(outer)]
-    touched(member)
-    states.append(source_stat(outer))
-    world.write_text("1\n0\n0\n-1\n0\n0\n")
-    states.append(source_stat(outer))
-    assert set(files_of(outer)) == {outer, inner, member, world}
-    member.unlink()
-    states.append(source_stat(outer))
-    assert len(set(states)) == 4
-    outer.write_text("<VRTDataset damaged")
-    assert source_stat(outer) == stat(outer)
-
-
-@pytest.mark.parametrize("kept_s", [0.0, 3600.0])
-def test_states_of_one_pass_are_current_but_for_the_time_that_a_vrt_is_kept(kept_s, tmp_path, monkeypatch):
-    monkeypatch.setattr(source_files, "KEPT_S", kept_s)
-    member, vrt = write(tmp_path / "a.tif", np.ones((20, 20), np.float32)), tmp_path / "a.vrt"
-    rasterio.shutil.copy(member, vrt, driver="VRT")
-    states = RecentStates()
-    before = {path: states(path) for path in (member, vrt)}
-    assert before == {path: source_stat(path) for path in before}
-    touched(member)
-    assert states(member) == source_stat(member) != before[member]
-    assert source_stat(vrt) != before[vrt]
-    assert states(vrt) == (before[vrt] if kept_s else source_stat(vrt))
-    assert RecentStates()(vrt) == source_stat(vrt)
-
-
 def test_parts_have_the_same_names_by_any_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     member = write(tmp_path / "data" / "a.tif", np.ones((20, 20), np.float32))
     (tmp_path / "data" / "a.tfw").write_text("1\n0\n0\n-1\n0\n0\n")
-    rasterio.shutil.copy(member, tmp_path / "a.vrt", driver="VRT")
-    for name in ("a.vrt", "data/a.tif"):
-        assert source_stat(Path(name)) == source_stat(tmp_path / name)
+    assert source_stat(Path("data/a.tif")) == source_stat(member)
 
 
 def test_empty_wal_that_a_reader_leaves_changes_nothing(tmp_path):
@@ -162,16 +124,10 @@ def test_fingerprint_changes_with_attributes_of_a_shapefile(checksum, tmp_path):
 
 
 @pytest.mark.parametrize("checksum", [False, True])
-@pytest.mark.parametrize("name", ["world", "member"])
-def test_fingerprint_changes_with_world_file_and_with_raster_of_a_vrt(name, checksum, tmp_path):
-    member = write(tmp_path / "a.tif", np.ones((100, 100), np.float32), GRID.west, GRID.north)
-    path = tmp_path / "dsm.vrt"
-    rasterio.shutil.copy(member, path, driver="VRT")
+def test_fingerprint_changes_with_world_file(checksum, tmp_path):
+    path = write(tmp_path / "dsm.tif", np.ones((100, 100), np.float32), GRID.west, GRID.north)
     before = fingerprint("dsm", path, checksum)
-    if name == "world":
-        (tmp_path / "a.tfw").write_text("1\n0\n0\n-1\n0\n0\n")
-    else:
-        write(member, np.full((100, 100), 2, np.float32), GRID.west, GRID.north)
+    (tmp_path / "dsm.tfw").write_text("1\n0\n0\n-1\n0\n0\n")
     assert fingerprint("dsm", path, checksum).fingerprint != before.fingerprint
 
 

@@ -14,11 +14,6 @@ from tests.make_rasters import UTM, write
 
 GRID = Grid(UTM, 295_500.0, 5_629_500.0, 1.0, 20, 20)
 HEIGHTS = np.full((20, 20), 100, np.float32)
-VRT = """<VRTDataset rasterXSize="20" rasterYSize="20">
-<SRS>EPSG:25832</SRS><GeoTransform>{}</GeoTransform>
-<VRTRasterBand dataType="Float32" band="1"><SimpleSource>
-<SourceFilename relativeToVRT="1">dtm.tif</SourceFilename><SourceBand>1</SourceBand>
-</SimpleSource></VRTRasterBand></VRTDataset>"""
 
 
 def bands(path, count, dtype="uint8", **profile):
@@ -95,5 +90,13 @@ def test_bands_described_as_road_height_have_heights(tmp_path):
 )
 def test_raster_at_no_place_is_refused(tmp_path, numbers, match):
     write(tmp_path / "dtm.tif", HEIGHTS)
-    (tmp_path / "a.vrt").write_text(VRT.format(numbers))
-    refused(tmp_path, "a.vrt", match)
+    place = f"<SRS>{UTM}</SRS><GeoTransform>{numbers}</GeoTransform>"
+    write(
+        tmp_path / "a.png",
+        HEIGHTS.astype(np.uint8),
+        driver="PNG",
+        crs=None,
+        transform=rasterio.Affine.identity(),
+    )
+    (tmp_path / "a.png.aux.xml").write_text(f"<PAMDataset>{place}</PAMDataset>")
+    refused(tmp_path, "a.png", match)

@@ -163,11 +163,13 @@ def test_file_in_degrees_with_metres_is_left_out(survey):
     assert len(result.tiles) == 8
 
 
-def test_vrt_that_is_damaged_is_left_out(survey):
-    (survey / "dsm" / "more.vrt").write_text("<VRTDataset><oops")
+def test_vrt_is_left_out_and_the_remedy_named(survey):
+    (survey / "dsm" / "more.vrt").write_text("<VRTDataset></VRTDataset>")
     result = index(survey, {**PATTERNS, "dsm": "dsm/*"}, tile_size_m=SIDE)
     (line,) = result.left_out
-    assert line.startswith("skipped dsm/more.vrt (dsm): it is a damaged VRT")
+    assert line.startswith(
+        "skipped dsm/more.vrt (dsm): it is a VRT, which only names other files; give those"
+    )
     assert len(result.tiles) == 9
 
 

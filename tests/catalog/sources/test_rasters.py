@@ -227,19 +227,11 @@ def test_cell_size_is_rounded(tmp_path):
     assert tile.grid.shape == (250, 250)
 
 
-def test_index_reads_ascii_grid_xyz_and_vrt(tmp_path):
+def test_index_reads_ascii_grid_and_xyz(tmp_path):
     write(tmp_path / "a.asc", FLAT, driver="AAIGrid", crs=None)
     write_xyz(tmp_path / "down.xyz", FLAT[:20, :30], 295500, 5629500)
     write_xyz(tmp_path / "up.xyz", FLAT[:20, :30], 295500, 5629500, northward=True)
-    write(tmp_path / "tif" / "a.tif", FLAT)
-    (tmp_path / "m.vrt").write_text(
-        f'<VRTDataset rasterXSize="250" rasterYSize="250"><SRS>{UTM}</SRS>'
-        "<GeoTransform>295500,1,0,5629500,0,-1</GeoTransform>"
-        '<VRTRasterBand dataType="Float32" band="1"><SimpleSource>'
-        '<SourceFilename relativeToVRT="1">tif/a.tif</SourceFilename><SourceBand>1</SourceBand>'
-        "</SimpleSource></VRTRasterBand></VRTDataset>"
-    )
-    for name in ("a.asc", "down.xyz", "up.xyz", "m.vrt"):
+    for name in ("a.asc", "down.xyz", "up.xyz"):
         (tile,) = index(tmp_path, {"dsm": name}, crs=UTM, min_cover=0).tiles
         assert (tile.id, tile.grid.cell) == ("295500_5629250", 1.0), name
 

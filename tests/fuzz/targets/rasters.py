@@ -7,7 +7,6 @@ import numpy as np
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.scan.rasters import quiet
 from flexroad.catalog.sources.rasters import index
-from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.io.raster import read_window
@@ -17,20 +16,6 @@ from tests.make_rasters import UTM, write, write_xyz
 SIDE = 64
 WEST, NORTH = 295500.0, 5629500.0
 GRID = Grid(UTM, WEST, NORTH, 1.0, SIDE, SIDE)
-VRT = f"""<VRTDataset rasterXSize="{SIDE}" rasterYSize="{SIDE}">
-<SRS>{UTM}</SRS>
-<GeoTransform>{WEST}, 1, 0, {NORTH}, 0, -1</GeoTransform>
-<VRTRasterBand dataType="Float32" band="1">
-<NoDataValue>-9999</NoDataValue>
-<SimpleSource>
-<SourceFilename relativeToVRT="1">plain.tif</SourceFilename>
-<SourceBand>1</SourceBand>
-<SrcRect xOff="0" yOff="0" xSize="{SIDE}" ySize="{SIDE}"/>
-<DstRect xOff="0" yOff="0" xSize="{SIDE}" ySize="{SIDE}"/>
-</SimpleSource>
-</VRTRasterBand>
-</VRTDataset>
-"""
 AUX = """<PAMDataset>
 <Metadata><MDI key="AREA_OR_POINT">Area</MDI></Metadata>
 <PAMRasterBand band="1"><NoDataValue>-9999</NoDataValue><UnitType>m</UnitType></PAMRasterBand>
@@ -53,23 +38,20 @@ def make(folder: Path) -> list[Path]:
         write(folder / "grey.jpg", grey, driver="JPEG", worldfile="yes"),
         write(folder / "grey.jp2", grey, driver="JP2OpenJPEG"),
         write_xyz(folder / "points.xyz", heights, WEST, NORTH),
-        folder / "mosaic.vrt",
         folder / "plain.tif.aux.xml",
     ]
-    (folder / "mosaic.vrt").write_text(VRT)
     (folder / "plain.tif.aux.xml").write_text(AUX)
     return made
 
 
 def read(path: Path) -> None:
     raster = path.with_suffix("").with_suffix("") if path.name.endswith(".aux.xml") else path
-    allowed = AllowedFolders.of(path.parent)
     name = f"dsm {path.name}"
     errors = []
     with quiet():
         for attempt in (
-            lambda: read_window(raster, name, GRID, GRID, UTM, allowed=allowed),
-            lambda: read_photo(Source("dop", (raster,), UTM, allowed=allowed), GRID),
+            lambda: read_window(raster, name, GRID, GRID, UTM),
+            lambda: read_photo(Source("dop", (raster,), UTM), GRID),
             lambda: index(path.parent, {"dsm": raster.name, "dtm": raster.name}, crs=UTM, tile_size_m=SIDE),
         ):
             try:

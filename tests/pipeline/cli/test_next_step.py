@@ -54,36 +54,21 @@ def test_catalog_rasters_next_line_runs_as_printed(words, layer, place, rasters,
 
 
 def test_catalog_of_files_outside_next_line_allows_them_for_all_commands(rasters, flexroad, tmp_path):
-    """The DSM is a VRT of two tiles in a third folder; the photo, which a run does not read, in a fourth."""
-    places = {name: tmp_path / name for name in ("mosaic", "squares", "ground", "photos")}
-    heights = np.full((60, 30), 100, np.float32)
-    for number in range(2):
-        write(places["squares"] / f"{number}.tif", heights, WEST + 30 * number, NORTH)
-    sources = "".join(
-        f'<SimpleSource><SourceFilename relativeToVRT="0">{places["squares"]}/{number}.tif</SourceFilename>'
-        f'<SourceBand>1</SourceBand><DstRect xOff="{30 * number}" yOff="0" xSize="30" ySize="60"/>'
-        f'<SrcRect xOff="0" yOff="0" xSize="30" ySize="60"/></SimpleSource>'
-        for number in range(2)
-    )
-    places["mosaic"].mkdir()
-    (places["mosaic"] / "dsm.vrt").write_text(
-        '<VRTDataset rasterXSize="60" rasterYSize="60"><SRS>EPSG:25832</SRS>'
-        f"<GeoTransform>{WEST}, 1, 0, {NORTH}, 0, -1</GeoTransform>"
-        f'<VRTRasterBand dataType="Float32" band="1">{sources}</VRTRasterBand></VRTDataset>'
-    )
+    """The photo, which a run does not read, lies in a third folder."""
+    places = {name: tmp_path / name for name in ("heights", "ground", "photos")}
+    write(places["heights"] / "dsm.tif", np.full((60, 60), 100, np.float32), WEST, NORTH)
     write(places["ground"] / "dtm.tif", np.full((60, 60), 100, np.float32), WEST, NORTH)
     write(places["photos"] / "dop.tif", np.full((60, 60), 100, np.uint8), WEST, NORTH)
-    command = ("catalog", "rasters", rasters, "--dsm", places["mosaic"] / "*.vrt", "--road-mask", "mask.tif")
+    command = ("catalog", "rasters", rasters, "--dsm", places["heights"] / "*.tif", "--road-mask", "mask.tif")
     command += ("--dtm", "../ground/dtm.tif", "--dop", places["photos"] / "dop.tif", "--tile-size", 60)
     command += ("-o", rasters / "c.parquet")
-    assert "names" in flexroad(*command).expected(2).err
-    said = flexroad(*command, "--allow", places["squares"], "--allow", places["mosaic"]).expected(0)
+    said = flexroad(*command).expected(0)
     arguments = shlex.split(said.out.splitlines()[-1].removeprefix("next: flexroad "))
     allow = arguments[arguments.index("--allow") :]
     assert allow == [word for name in sorted(places) for word in ("--allow", str(places[name]))]
     run = arguments[: -len(allow)]
-    without = [word for name in ("ground", "mosaic", "photos") for word in ("--allow", str(places[name]))]
-    assert f"names {places['squares']}" in flexroad(*run, *without).expected(2).err
+    without = [word for name in ("ground", "photos") for word in ("--allow", str(places[name]))]
+    assert f"names {places['heights']}" in flexroad(*run, *without).expected(2).err
     assert "1 tile: 1 done" in flexroad(*arguments, "--executor", "serial").expected(0).out
     assert "1 tile of" in flexroad("catalog", "check", rasters / "c.parquet", *allow).out
     training = ("train", rasters / "c.parquet", "--labels", "mask", "-o", "model")

@@ -155,7 +155,7 @@ FAULTS = (
     Fault(_truncated, "dsm", "cannot be read: .*; fetch it again"),
     Fault(_a_folder, "dsm", "is not a regular file; replace it by one"),
     Fault(_a_pipe, "dsm", "is not a regular file; replace it by one"),
-    Fault(_a_vrt_of_the_web, "dtm", "is a VRT that names '/vsicurl/.*; only mosaics of local files"),
+    Fault(_a_vrt_of_the_web, "dtm", "is a VRT, which only names other files"),
     Fault(_a_text, "road_mask", "cannot be read: .*; fetch it again"),
     Fault(_elsewhere, "dsm", "does not reach the tile now: it lies at .*; build the catalog again"),
     Fault(_other_crs, "dtm", "is in EPSG:25833, the tile in EPSG:25832; .*gdalwarp -t_srs EPSG:25832"),

@@ -208,46 +208,6 @@ def test_raster_read_at_the_second_attempt_is_used(survey, scratch, tmp_path, mo
     assert_equal(tmp_path / "run", scratch)
 
 
-def vrt_of(survey, name):
-    """Write a mosaic of the files of a layer, as gdalbuildvrt does; return its path."""
-    files = sorted((survey / name).glob("*.tif"))
-    with rasterio.open(files[0]) as first:
-        crs, kind = first.crs.to_wkt(), {"float32": "Float32", "uint8": "Byte"}[first.dtypes[0]]
-    places = {}
-    for file in files:
-        with rasterio.open(file) as raster:
-            places[file] = raster.bounds
-    west, north = min(box.left for box in places.values()), max(box.top for box in places.values())
-    east, south = max(box.right for box in places.values()), min(box.bottom for box in places.values())
-    sources = "".join(
-        f'<SimpleSource><SourceFilename relativeToVRT="1">{name}/{file.name}</SourceFilename>'
-        f'<SourceBand>1</SourceBand><SrcRect xOff="0" yOff="0" xSize="{SIZE_M}" ySize="{SIZE_M}"/>'
-        f'<DstRect xOff="{box.left - west}" yOff="{north - box.top}" xSize="{SIZE_M}" ySize="{SIZE_M}"/>'
-        "</SimpleSource>"
-        for file, box in places.items()
-    )
-    path = survey / f"{name}.vrt"
-    path.write_text(
-        f'<VRTDataset rasterXSize="{east - west:.0f}" rasterYSize="{north - south:.0f}"><SRS>{crs}</SRS>'
-        f"<GeoTransform>{west}, 1, 0, {north}, 0, -1</GeoTransform>"
-        f'<VRTRasterBand dataType="{kind}" band="1">{sources}</VRTRasterBand></VRTDataset>'
-    )
-    return path
-
-
-def test_member_of_vrt_unreadable_for_one_night_leaves_no_trace(survey, tmp_path):
-    path = one_file(survey)
-    catalog = catalog_of(survey, "vrt.json", dsm=vrt_of(survey, "dsm").name)
-    summary, _ = night(tmp_path / "scratch", catalog)
-    assert summary.exit_code == 0
-    with denied(path):
-        summary, failures = night(tmp_path / "run", catalog)
-    assert summary.failed > 0
-    assert all(f"Permission denied ({path})" in failure.message for failure in failures)
-    assert night(tmp_path / "run", catalog)[0].exit_code == 0
-    assert_equal(tmp_path / "run", tmp_path / "scratch")
-
-
 def test_side_car_unreadable_for_one_night_leaves_no_trace(survey, tmp_path):
     """GDAL takes a raster without a side-car file that it may not open: here, without its nodata value."""
     path = one_file(survey, "dtm")
@@ -402,15 +362,6 @@ def test_file_zeroed_for_one_night_leaves_no_trace(name, survey, scratch, tmp_pa
     assert (summary.exit_code, summary.cached) == (0, 0)
     assert_equal(tmp_path / "run", scratch)
     assert night(tmp_path / "run", catalog)[0].cached == 4
-
-
-def test_member_of_vrt_zeroed_for_one_night_leaves_no_trace(survey, tmp_path):
-    catalog = catalog_of(survey, "vrt.json", dsm=vrt_of(survey, "dsm").name)
-    assert night(tmp_path / "scratch", catalog)[0].exit_code == 0
-    with zeroed(one_file(survey)):
-        assert night(tmp_path / "run", catalog)[0].failed > 0
-    assert night(tmp_path / "run", catalog)[0].exit_code == 0
-    assert_equal(tmp_path / "run", tmp_path / "scratch")
 
 
 @pytest.mark.parametrize("end", [".aux.xml", ".msk"])

@@ -17,10 +17,6 @@ SIZE = 60
 GRID = Grid(UTM, 295500.0, 5629500.0, 1.0, SIZE, SIZE)
 HEIGHTS = np.random.default_rng(0).normal(100, 1, (SIZE, SIZE)).round(2)
 NORTH = GRID.north
-VRT = """<VRTDataset rasterXSize="60" rasterYSize="60"><SRS>EPSG:25832</SRS>
-<GeoTransform>{}, 1, 0, {}, 0, -1</GeoTransform><VRTRasterBand dataType="Float64" band="1"><SimpleSource>
-<SourceFilename relativeToVRT="1">good.tif</SourceFilename><SourceBand>1</SourceBand>
-</SimpleSource></VRTRasterBand></VRTDataset>"""
 
 
 def heights(path):
@@ -39,13 +35,6 @@ def tif(folder):
 def with_world_file(folder):
     path = write(folder / "good.tif", HEIGHTS, north=NORTH)
     path.with_suffix(".tfw").write_text(f"1\n0\n0\n-1\n{GRID.west + 0.5}\n{NORTH - 0.5}\n")
-    return lambda: heights(path)
-
-
-def vrt(folder):
-    tif(folder)
-    path = folder / "good.vrt"
-    path.write_text(VRT.format(GRID.west, NORTH))
     return lambda: heights(path)
 
 
@@ -84,7 +73,7 @@ def damaged_raster(folder):
     return path
 
 
-@pytest.mark.parametrize("kind", [tif, with_world_file, vrt, ascii_grid, xyz, photo, roads])
+@pytest.mark.parametrize("kind", [tif, with_world_file, ascii_grid, xyz, photo, roads])
 def test_source_read_after_a_damaged_one_is_as_without_it(kind, tmp_path):
     read, bad = kind(tmp_path), damaged_raster(tmp_path)
     before = read()
