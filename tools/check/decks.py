@@ -22,9 +22,9 @@ from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.options import Options
-from flexroad.tasks.quality.decks import Deck, likely_decks
 from flexroad.tasks.roads import level_numbers, rasterise
 from flexroad.tasks.types import TileData
+from flexroad.tools.check.likely_decks import Deck, likely_decks
 
 FILE = "decks.geojson"
 MAKER = {"generator": "flexroad catalog check"}

@@ -22,7 +22,6 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile, GroundTile, passing
 from flexroad.pipeline.run.tile_steps import LARGEST_M, length_text
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats
@@ -41,6 +40,7 @@ from flexroad.tools.export.along_line import (
     profile_error,
     profiles,
 )
+from flexroad.tools.export.along_route import PlaceLevels, RouteLevels, structures
 from flexroad.tools.export.ground import SMOOTH, Ground, steps_left_out
 from flexroad.tools.export.local_frame import LocalFrame
 from flexroad.tools.export.network import Network, network

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds, Grid
 from flexroad.pipeline.run.finished import GroundTile, estimate, flagged
 from flexroad.pipeline.run.tile_steps import largest_tile_step
-from flexroad.tasks.levels.along_route import PlaceLevels
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Surface
+from flexroad.tools.export.along_route import PlaceLevels
 
 SURFACES = 128
 """Number of tiles of which a process keeps the surface (some 0.4 MB each)."""

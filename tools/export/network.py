@@ -22,9 +22,9 @@ from flexroad.tasks import types
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads import routes as routing
-from flexroad.tasks.roads.centre_lines import CentreLines, read_centre_lines
 from flexroad.tasks.roads.routes import CentreLine, Route
 from flexroad.tasks.segment import vector
+from flexroad.tools.export.centre_lines import CentreLines, read_centre_lines
 from flexroad.tools.export.local_frame import LocalFrame
 from flexroad.tools.export.source import Options, Source
 

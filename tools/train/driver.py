@@ -29,11 +29,11 @@ from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import NOTHING
-from flexroad.tasks.roads.mask_metrics import Quality, judge, together
 from flexroad.tasks.segment.dinov2 import segment as segmenter
 from flexroad.tasks.types import Bools, RoadMask, TileData
 from flexroad.tools.train import fit_head
 from flexroad.tools.train.fit_head import Epoch, Sample, Trained
+from flexroad.tools.train.mask_metrics import Quality, judge, together
 from flexroad.tools.train.spatial_split import Block, Split, inside, split, split_tile
 
 Labels = Literal["mask", "vector"]

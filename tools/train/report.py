@@ -18,10 +18,10 @@ from flexroad.catalog.storage.paths import write
 from flexroad.catalog.text import count
 from flexroad.pipeline.run.record import versions
 from flexroad.pipeline.store.records import no_nan
-from flexroad.tasks.roads.mask_metrics import Quality
 from flexroad.tools.report.pages import template
 from flexroad.tools.report.render import curves, segmentation_map
 from flexroad.tools.train.driver import Evaluation, Outcome
+from flexroad.tools.train.mask_metrics import Quality
 
 SHOWN = 3
 """Number of best and of worst tiles in the report."""

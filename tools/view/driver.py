@@ -36,13 +36,13 @@ from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import glb
 from flexroad.tasks.quality.support import top_support
 from flexroad.tasks.roads import rasterise
-from flexroad.tasks.roads.centre_lines import read_centre_lines
 from flexroad.tasks.roads.rasterise import DEFAULTS
 from flexroad.tasks.roads.rasterise import Options as RoadOptions
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.spline.levelled import LevelledSurface, top_of
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats
+from flexroad.tools.export.centre_lines import read_centre_lines
 from flexroad.tools.export.pieces import Piece, write_pieces
 from flexroad.tools.export.source import TileItem, layer_state
 from flexroad.tools.view import encoding

@@ -6,9 +6,9 @@ import pytest
 import shapely
 
 from flexroad.catalog import Grid, Tile
-from flexroad.tasks.quality.decks import Deck
 from flexroad.tasks.roads.level_numbers import level_numbers
 from flexroad.tools.check import decks
+from flexroad.tools.check.likely_decks import Deck
 from flexroad.tools.synthetic.crossings import Crossings
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests.make_town import make_town

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexroad.tasks.levels.along_route import PlaceLevels
+from flexroad.tools.export.along_route import PlaceLevels
 from flexroad.tools.export.ground import _Patch
 from tests.tasks.spline.test_levelled import GRID, SOUTH, WEST, made_surface
 

@@ -6,7 +6,7 @@ from hypothesis.extra import numpy as arrays
 from sklearn.metrics import f1_score, jaccard_score, precision_score, recall_score
 
 from flexroad.catalog import Grid
-from flexroad.tasks.roads.mask_metrics import edges, judge, together
+from flexroad.tools.train.mask_metrics import edges, judge, together
 
 shapes = st.tuples(st.integers(1, 12), st.integers(1, 12))
 
