@@ -1,4 +1,4 @@
-"""A run that the tests of exports share."""
+"""A run that the tests of tools share."""
 
 from dataclasses import dataclass
 from pathlib import Path
