@@ -1,5 +1,6 @@
 """Point clouds for tests."""
 
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -7,6 +8,17 @@ import laspy
 import numpy as np
 from laspy.header import GpsTimeType
 from pyproj import CRS
+
+from flexroad.catalog import Grid
+from flexroad.tools.prepare.points.binning import Points
+from flexroad.tools.prepare.points.to_rasters import (
+    Options,
+    Rasters,
+    cells_reach_m,
+    of_cells,
+    of_points,
+    points_reach_m,
+)
 
 
 def write_cloud(
@@ -45,3 +57,22 @@ def write_cloud(
     path.parent.mkdir(parents=True, exist_ok=True)
     points.write(path)
     return path
+
+
+def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Rasters:
+    """Make the rasters of a block of ground.
+
+    - `points`: in the grid's CRS (m), including a rim of `reach_m` around the grid; others have no effect.
+    - `dop_cell`: pixel of the orthophoto (m); None makes no orthophoto.
+    - result: NaN without points, and the DTM without ground points; no orthophoto if the points have no
+      colours.
+    """
+    rim = grid.buffered(cells_reach_m(options, grid.cell))
+    pixels = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
+    heights, image = of_points(points, rim, options, pixels)
+    return replace(of_cells(heights, rim, grid, options), photo=image)
+
+
+def reach_m(options: Options, cell: float) -> float:
+    """Return the largest distance from a grid of such cells at which points can change a value in it (m)."""
+    return points_reach_m(options, cell) + cells_reach_m(options, cell)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,15 @@ from rich.progress import track
 
 from flexroad.catalog import Grid
 from flexroad.catalog.text import count
-from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.tasks import memory
 from flexroad.tasks.types import Orthophoto
-from flexroad.tools.prepare.output import disk_errors
+from flexroad.tools.prepare.output import disk_errors, on_failure
 from flexroad.tools.prepare.point_buckets import BlockIndex, PointBuckets
 from flexroad.tools.prepare.point_reading import BucketedPoints
+from flexroad.tools.prepare.points.binning import TopLayer
 from flexroad.tools.prepare.points.to_rasters import (
+    CellHeights,
     Options,
     cells_reach_m,
     of_cells,
@@ -29,7 +30,6 @@ from flexroad.tools.prepare.points.to_rasters import (
     points_reach_m,
 )
 from flexroad.tools.prepare.raster_writer import GROUND, RasterWriter
-from flexroad.tools.prepare.types import CellHeights, TopLayer
 
 POINT_BYTES, CELL_BYTES, PIXEL_BYTES = 200, 200, 20
 """Memory that a block takes per point, cell and pixel of the orthophoto (bytes); measured."""
@@ -86,13 +86,19 @@ def write_blocks(
     second = list(_cells_jobs(writer, bucketed, options, first))
     _check_memory(first, second)
     log(f"{count(len(second), 'block')} of {bucketed.buckets.edge:g} m")
-    read = executor.map(_read_points, first, _fail)
+    fail = on_failure(lambda job: f"block {job.grid.west:.0f}_{job.grid.south:.0f}")
+    read = executor.map(_read_points, first, fail)
     for points_job in track(read, "reading points", len(first), console=Console(stderr=True)):
-        _write_photo(writer, points_job)
+        if points_job.pixels:
+            with np.load(points_job.target) as file:
+                writer.write_photo(Orthophoto(points_job.pixels, file["colour"], file["known"]))
     bucketed.buckets.remove()
-    made = executor.map(_make_rasters, second, _fail)
+    made = executor.map(_make_rasters, second, fail)
     for cells_job in track(made, "making rasters", len(second), console=Console(stderr=True)):
-        _write_block(writer, cells_job)
+        with np.load(cells_job.target) as rasters:
+            for layer, values in rasters.items():
+                writer.write(layer, cells_job.grid, values)
+        cells_job.target.unlink()
 
 
 def _points_jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Options) -> Iterator[_PointsJob]:
@@ -215,21 +221,3 @@ def _heights(sources: Sequence[tuple[Grid, Path]], rim: Grid) -> CellHeights:
 def _save(target: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     with disk_errors(target.parent.parent):
         np.savez(target, allow_pickle=False, **arrays)
-
-
-def _fail(job: _PointsJob | _CellsJob, reason: str) -> NoReturn:
-    raise ConfigError(f"block {job.grid.west:.0f}_{job.grid.south:.0f}: {reason}; use fewer workers")
-
-
-def _write_photo(writer: RasterWriter, job: _PointsJob) -> None:
-    if job.pixels:
-        with np.load(job.target) as file:
-            writer.write_photo(Orthophoto(job.pixels, file["colour"], file["known"]))
-
-
-def _write_block(writer: RasterWriter, job: _CellsJob) -> None:
-    with np.load(job.target) as rasters:
-        for layer in ("dsm", "dtm", "road_height", "bridges", GROUND):
-            if layer in rasters:
-                writer.write(layer, job.grid, rasters[layer])
-    job.target.unlink()

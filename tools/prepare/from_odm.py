@@ -30,8 +30,7 @@ from flexroad.tasks import memory
 from flexroad.tasks.types import Floats, Orthophoto
 from flexroad.tools.prepare.from_mesh import MeshOptions, prepare_mesh
 from flexroad.tools.prepare.from_points import prepare_points
-from flexroad.tools.prepare.limits import SMALLER, prepared_grid
-from flexroad.tools.prepare.options import PrepareOptions, written
+from flexroad.tools.prepare.options import SMALLER, PrepareOptions, prepared_grid, written
 from flexroad.tools.prepare.points import ground_filter, tin, to_rasters
 from flexroad.tools.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.tools.prepare.roads import add_roads, check_roads
@@ -193,12 +192,10 @@ def _warped(source: Any, frame: MetricTransform, grid: Grid, reduction: Resampli
         height=grid.height,
         resampling=reduction if cell < grid.cell * 1.001 else Resampling.bilinear,
         # The alpha band marks pixels outside the source as having no colour.
-        add_alpha=source.count >= 3 and source.nodata is None and not _has_alpha(source),
+        add_alpha=source.count >= 3
+        and source.nodata is None
+        and ColorInterp.alpha not in color_kinds(source),
     )
-
-
-def _has_alpha(source: Any) -> bool:
-    return ColorInterp.alpha in color_kinds(source)
 
 
 def _windows(grid: Grid) -> Iterator[tuple[Grid, Window]]:

@@ -17,8 +17,7 @@ from flexroad.catalog.text import some
 from flexroad.catalog.to_metres import MetricTransform, agreed
 from flexroad.pipeline.execute import Executor
 from flexroad.tools.prepare.blockwise import write_blocks
-from flexroad.tools.prepare.limits import check_disk, prepared_grid
-from flexroad.tools.prepare.options import PrepareOptions, written
+from flexroad.tools.prepare.options import PrepareOptions, check_disk, prepared_grid, written
 from flexroad.tools.prepare.output import scratch_folder
 from flexroad.tools.prepare.point_buckets import RECORD, block_edge_of
 from flexroad.tools.prepare.point_reading import BucketedPoints, bucket_points

@@ -21,7 +21,7 @@ from flexroad.catalog.scan.point_clouds import Cloud
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
-from flexroad.tools.prepare.types import Points
+from flexroad.tools.prepare.points.binning import Points
 
 PER_METRE = 10_000
 """Units of the stored coordinates: tenths of a millimetre."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import groupby
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +15,11 @@ from flexroad.catalog import Bounds, CatalogError
 from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
 from flexroad.catalog.scan.point_clouds import CHUNK, Chunk, Cloud, chunks, survey_dates
 from flexroad.catalog.to_metres import MetricTransform
-from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
-from flexroad.tools.prepare.limits import check_extent
-from flexroad.tools.prepare.output import disk_errors
+from flexroad.tools.prepare.options import check_extent
+from flexroad.tools.prepare.output import disk_errors, on_failure
 from flexroad.tools.prepare.point_buckets import (
     BYTE,
     PER_METRE,
@@ -121,17 +119,21 @@ def bucket_points(
     """
     parts: list[_Part] = []
     bounds: Bounds | None = None
-    for part in executor.map(_read, _jobs(clouds, frame, folder, edge, log), _fail):
+    fail = on_failure(lambda job: job.cloud.path)
+    for part in executor.map(_read, _jobs(clouds, frame, folder, edge, log), fail):
         parts.append(part)
         if part.block_parts:
-            plan = part.outermost / PER_METRE
-            check_extent(str(part.job.cloud.path), plan, bounds)
-            bounds = _joined(plan, bounds)
+            bounds = check_extent(str(part.job.cloud.path), part.outermost / PER_METRE, bounds)
     if bounds is None:
         raise CatalogError(f"{clouds[0].path} has only noise points; leave it out")
     parts.sort(key=lambda part: (part.job.file, part.job.points.start))
     of_files = [list(of_file) for _, of_file in groupby(parts, lambda part: part.job.file)]
-    for _ in executor.map(_read, [job for of_file in of_files for job in _otherwise_shifted(of_file)], _fail):
+    again = list[_Job]()
+    for of_file in of_files:
+        # Whether colours have 8 or 16 bits is decided by the first part of a file that has colours.
+        shift = next((part.shift for part in of_file if part.shift is not None), None)
+        again += [replace(part.job, shift=shift) for part in of_file if part.shift not in (None, shift)]
+    for _ in executor.map(_read, again, fail):
         pass
     dates = [_span(part.dates for part in of_file) for of_file in of_files]
     return BucketedPoints(
@@ -155,20 +157,6 @@ def _jobs(
         log(f"reading {cloud.path} ({number + 1} of {len(clouds)}, {cloud.points:,} points)")
         for points in cloud.parts(CHUNK):
             yield _Job(cloud, number, points, frame, edge, folder / f"{number}_{points.start}.points")
-
-
-def _otherwise_shifted(of_file: Sequence[_Part]) -> list[_Job]:
-    """Return the jobs to be repeated: whether colours have 8 or 16 bits is decided by the first of a file."""
-    shift = next((part.shift for part in of_file if part.shift is not None), None)
-    return [replace(part.job, shift=shift) for part in of_file if part.shift not in (None, shift)]
-
-
-def _joined(plan: Floats, bounds: Bounds | None) -> Bounds:
-    """Return the bounds of points, ``(2, n)``, and of those before."""
-    west, south, east, north = map(float, (*plan.min(axis=1), *plan.max(axis=1)))
-    if bounds is None:
-        return west, south, east, north
-    return min(west, bounds[0]), min(south, bounds[1]), max(east, bounds[2]), max(north, bounds[3])
 
 
 def _span(dates: Iterable[Dates | None]) -> Dates | None:
@@ -195,21 +183,13 @@ def _read(job: _Job) -> _Part:
         out_of_range += len(chunk.z) - len(records)
         if not len(records):
             continue
-        check_extent(str(path), plan / PER_METRE, None)
-        outermost = _outermost(np.concatenate([outermost, plan], axis=1))
+        check_extent(str(path), plan / PER_METRE)
+        points = np.concatenate([outermost, plan], axis=1)
+        outermost = points[:, [*points.argmin(axis=1), *points.argmax(axis=1)]]
         kinds += np.bincount(records["kind"], minlength=256)
         with disk_errors(job.target.parent.parent):
             block_parts += append(job.target, job.edge, plan[0], plan[1], records)
     return _Part(job, block_parts, outermost, kinds, out_of_range, _span(dates), shift)
-
-
-def _outermost(plan: Integers) -> Integers:
-    """Return the outermost points of some, ``(2, 4)``; see `_Part`."""
-    return plan[:, [plan[0].argmin(), plan[1].argmin(), plan[0].argmax(), plan[1].argmax()]]
-
-
-def _fail(job: _Job, reason: str) -> NoReturn:
-    raise ConfigError(f"{job.cloud.path}: {reason}; use fewer workers")
 
 
 def _records(chunk: Chunk, frame: MetricTransform, shift: int) -> tuple[Integers, NDArray[np.void]]:

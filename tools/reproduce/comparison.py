@@ -10,15 +10,18 @@ import pandas as pd
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tools.report.content import FIGURES
-from flexroad.tools.reproduce.bootstrap import LEVEL, RESAMPLES, Means, bootstrap
 from flexroad.tools.reproduce.claims import (
     HELD,
+    LEVEL,
     NOT_DECIDED,
     NOT_HELD,
     NOT_TESTED,
+    RESAMPLES,
     STRONGER,
     WEAKER,
+    Means,
     Verdict,
+    bootstrap,
     check,
     percent,
 )

@@ -13,15 +13,17 @@ import pandas as pd
 
 from flexroad.catalog.text import count
 from flexroad.tools.report.content import FIGURES
-from flexroad.tools.reproduce.bootstrap import LEVEL, Means, bootstrap
 from flexroad.tools.reproduce.claims import (
     HELD,
+    LEVEL,
     NOT_DECIDED,
     NOT_HELD,
     NOT_TESTED,
     STRONGER,
     WEAKER,
+    Means,
     Verdict,
+    bootstrap,
     decided,
     percent,
     strength,

@@ -35,8 +35,7 @@ from flexroad.tools.reproduce.layout import (
     drawable,
     new_figure,
 )
-from flexroad.tools.reproduce.tile_view import Result, Roles, TileView, missing_roles
-from flexroad.tools.reproduce.trajectory import vehicle_trajectory
+from flexroad.tools.reproduce.tile_view import Result, Roles, TileView, missing_roles, vehicle_trajectory
 
 MOST_ERROR_M = 0.5
 """Limit of the error axis of the profile (m)."""

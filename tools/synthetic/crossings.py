@@ -22,10 +22,10 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.centrelines import MAIN, MARGIN_M, SIDE, CentreLine
-from flexroad.tools.synthetic.layout import SOUTH_M, WEST_M
 from flexroad.tools.synthetic.network import Plan
 from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.objects import Car, Crown
+from flexroad.tools.synthetic.options import SOUTH_M, WEST_M
 from flexroad.tools.synthetic.population import Objects, Trace
 from flexroad.tools.synthetic.scene import DTM_BLUR_M, Scene, terrain_model
 from flexroad.tools.synthetic.spoilers import Canvas, surface_model

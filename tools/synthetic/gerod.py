@@ -10,9 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tools.synthetic.layout import SOUTH_M, WEST_M
 from flexroad.tools.synthetic.noise import generator
-from flexroad.tools.synthetic.options import SceneOptions
+from flexroad.tools.synthetic.options import SOUTH_M, WEST_M, SceneOptions
 
 STRATA = {"urban": 168, "suburban": 23, "rural": 49}
 """Tiles of the complete benchmark, as in the paper."""

@@ -13,8 +13,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.prepare.points.binning import bins
-from flexroad.tools.prepare.types import Points
+from flexroad.tools.prepare.points.binning import Points, bins
 from flexroad.tools.synthetic.network import Box, Plan, find_stratum
 from flexroad.tools.synthetic.noise import generator, waves
 from flexroad.tools.synthetic.objects import GroundAt
@@ -23,8 +22,7 @@ from flexroad.tools.synthetic.population import Objects, populate
 from flexroad.tools.synthetic.segmentation import segmentation
 from flexroad.tools.synthetic.spoilers import BARE, Canvas, Kind, surface_model
 from flexroad.tools.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
-from flexroad.tools.synthetic.survey_errors import changes, growth, mixed, rise, scars
-from flexroad.tools.synthetic.voids import hidden, water
+from flexroad.tools.synthetic.survey_errors import changes, growth, hidden, mixed, rise, scars, water
 
 __all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
 

@@ -1,22 +1,27 @@
 """What makes the rasters of a survey differ from the true ground, besides noise and objects.
 
 Changes between two surveys (new road surfaces, new kerbs, excavations), low vegetation that a scan does not
-penetrate, mixed cells at edges and walls, and errors of a terrain model under houses.
+penetrate, mixed cells at edges and walls, errors of a terrain model under houses, and cells without a height:
+
+- ground that crowns hide. The survey sees a crown from one image, so that the ground at its far side is
+  hidden, the farther the nearer the crown is to the image's edge;
+- water, which gives no echo, and has nothing that two images have in common.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.synthetic.network import Street
+from flexroad.tools.synthetic.network import Stream, Street
 from flexroad.tools.synthetic.noise import generator, waves
-from flexroad.tools.synthetic.objects import House
+from flexroad.tools.synthetic.objects import Crown, House, from_middle
 from flexroad.tools.synthetic.spoilers import Canvas
+from flexroad.tools.synthetic.surfaces import BED_M
 
 KINDS = ("surface", "kerb", "excavation")
 LENGTH_M = {"surface": (30.0, 100.0), "kerb": (8.0, 30.0), "excavation": (4.0, 20.0)}
@@ -37,6 +42,8 @@ RIM_M = 1.5
 """Distance beyond the walls to which the ground was removed with the house (m)."""
 TILT = 0.5
 """Tilt of a scar, as a fraction of its depth."""
+SPREAD = 0.5
+"""Greatest deviation of the length of a crown's hidden ground, relative: crowns are not equally dense."""
 
 
 @dataclass(frozen=True)
@@ -132,3 +139,35 @@ def scars(canvas: Canvas, houses: Sequence[House], seed: int, depth_m: float) ->
         plane = level + TILT * tilt * u / house.half_length
         error[window] = np.where(inside, plane, error[window])
     return error
+
+
+def hidden(canvas: Canvas, dsm: Floats, crowns: Sequence[Crown], seed: int, length: float) -> Bools:
+    """Return the cells that crowns hide, ``(H, W)``: beside a crown, and below the middle of its height.
+
+    - `dsm`: surface model (m).
+    - `length`: mean length of the hidden ground at the edge of an image, per height of the crown.
+    """
+    found = np.zeros(dsm.shape, np.bool_)
+    if length <= 0 or not crowns:
+        return found
+    x, y = (np.array([getattr(crown, axis) for crown in crowns]) for axis in ("x", "y"))
+    for crown, away in zip(crowns, from_middle(seed, x, y).T, strict=True):
+        rng = generator(seed, "hidden", int(crown.x // 1), int(crown.y // 1))
+        east, north = away * length * crown.height * rng.uniform(1 - SPREAD, 1 + SPREAD)
+        window = canvas.around(crown.x, crown.y, crown.radius + float(np.hypot(east, north)))
+        dx, dy = canvas.x[window] - crown.x, canvas.y[window] - crown.y
+        # The crown moved along its shift: the nearest of its middles to each cell.
+        part = np.clip((dx * east + dy * north) / (east**2 + north**2), 0, 1)
+        covered = np.hypot(dx - part * east, dy - part * north) < crown.radius
+        beside = np.hypot(dx, dy) > crown.radius
+        found[window] |= covered & beside & (dsm[window] < crown.top - crown.height / 2)
+    return found
+
+
+def water(canvas: Canvas, streams: Iterable[Stream]) -> Bools:
+    """Return the cells in the beds of streams, ``(H, W)``, also those below bridges."""
+    wet = np.zeros(canvas.x.shape, np.bool_)
+    for stream in streams:
+        if not stream.paved:
+            wet |= stream.distance(canvas.x, canvas.y) < BED_M
+    return wet

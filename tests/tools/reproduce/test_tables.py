@@ -19,7 +19,6 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.tables import metrics_frame
 from flexroad.tools.report.content import FIGURES
-from flexroad.tools.reproduce.bootstrap import bootstrap
 from flexroad.tools.reproduce.claims import (
     HELD,
     NOT_DECIDED,
@@ -27,6 +26,7 @@ from flexroad.tools.reproduce.claims import (
     NOT_TESTED,
     STRONGER,
     WEAKER,
+    bootstrap,
     check,
     percent,
 )

@@ -1,4 +1,4 @@
-"""The cell of each point, and what the points of a cell give: means, the highest point and the top layer.
+"""Points, the cell of each, and what the points of a cell give: means, highest point, top layer, colour.
 
 The highest of n points with noise is above the surface, the more so the more points a cell has. The mean of
 the points close below it, the top layer, is not, and still belongs to the uppermost surface: a deck, not the
@@ -8,6 +8,7 @@ ground under it. A single point far above all around it is a spike.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,7 @@ from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Floats
-from flexroad.tools.prepare.types import TopLayer
+from flexroad.tasks.types import Bools, Floats, Orthophoto
 
 Cells = NDArray[np.int64]
 """Row-major index of the cell of each point, ``(n,)``; -1 outside the grid."""
@@ -25,6 +25,45 @@ NUDGE = 1e-6
 """Part of a cell that is more than the rounding error of its edge's coordinates."""
 AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 """The 8 neighbours of a cell."""
+Codes = NDArray[np.int32]
+"""Colours as 24-bit numbers (red, green, blue from the highest byte); -1 if there is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """A point cloud in the metric CRS of the rasters."""
+
+    easting: Floats
+    """``(n,)``, m."""
+    northing: Floats
+    """``(n,)``, m."""
+    height: Floats
+    """``(n,)``, m."""
+    kind: NDArray[np.uint8]
+    """Class by ASPRS, ``(n,)``: 2 is ground, 17 a bridge deck, 0 and 1 are unclassified."""
+    colour: NDArray[np.uint8] | None = None
+    """Red, green, blue, ``(n, 3)``, or None if the source has no colours."""
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.height)
+
+    def __getitem__(self, key: slice | Bools | NDArray[np.intp]) -> Points:
+        """Return a subset of the points, by a slice, a mask or indices."""
+        colour = None if self.colour is None else self.colour[key]
+        return Points(self.easting[key], self.northing[key], self.height[key], self.kind[key], colour)
+
+
+@dataclass(frozen=True, eq=False)
+class TopLayer:
+    """The points of each cell that are close below its highest one."""
+
+    height: Floats
+    """Their mean height, ``(H, W)``, m; NaN where there are none."""
+    count: Floats
+    """Their number, ``(H, W)``."""
+    spread: Floats
+    """Standard deviation of their heights, ``(H, W)``, m; 0 for one point, NaN where there are none."""
 
 
 def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
@@ -145,3 +184,55 @@ def _sums(cells: Cells, height: Floats, highest: Floats, depth_m: float) -> tupl
             below[c] += z
             squared[c] += z * z
     return count, below, squared
+
+
+def photo(points: Points, grid: Grid, fill_m: float) -> Orthophoto:
+    """Return the colour of the highest point in each pixel; voids have that of the nearest valid pixel.
+
+    Of points at the same height, the one with the greatest red, then green, then blue is used; of pixels at
+    the same distance, the northernmost, then the westernmost.
+
+    - `points`: must have colours, and include a rim of ``fill_m`` around the grid.
+    - `fill_m`: pixels whose centre is farther than this from that of a valid pixel stay without colour (m).
+    """
+    assert points.colour is not None
+    rim = grid.buffered(fill_m)
+    red, green, blue = points.colour.T.astype(np.int32)
+    top = _top_codes(
+        bins(points.easting, points.northing, rim), points.height, red << 16 | green << 8 | blue, rim.shape
+    )
+    # Offsets to the pixels within the distance, the nearest first.
+    radius = fill_m / grid.cell
+    reach = int(radius + 1e-9)
+    row, col = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
+    square = row**2 + col**2
+    order = np.lexsort((col, row, square))[: np.count_nonzero(square <= radius**2 + 1e-9)]
+    codes = _nearest(top, np.stack([row, col], axis=1)[order])[rim.window(grid)]
+    colour = np.stack([codes >> 16 & 255, codes >> 8 & 255, codes & 255]).astype(np.uint8)
+    valid = codes >= 0
+    return Orthophoto(grid, np.where(valid, colour, np.uint8(0)), valid)
+
+
+@compiled()
+def _top_codes(cells: Cells, height: Floats, codes: Codes, shape: tuple[int, int]) -> Codes:
+    top = np.full(shape[0] * shape[1], -np.inf)
+    best = np.full(top.size, -1, np.int32)
+    for i in range(cells.size):
+        c = cells[i]
+        if c >= 0 and (height[i] > top[c] or (height[i] == top[c] and codes[i] > best[c])):
+            top[c], best[c] = height[i], codes[i]
+    return best.reshape(shape)
+
+
+@compiled()
+def _nearest(codes: Codes, offsets: NDArray[np.int64]) -> Codes:
+    rows, cols = codes.shape
+    filled = codes.copy()
+    for r in range(rows):
+        for c in range(cols):
+            for k in range(offsets.shape[0]):
+                row, col = r + offsets[k, 0], c + offsets[k, 1]
+                if 0 <= row < rows and 0 <= col < cols and codes[row, col] >= 0:
+                    filled[r, c] = codes[row, col]
+                    break
+    return filled

@@ -1,12 +1,12 @@
 """Rasters from a point cloud: DSM and its top layer, DTM, bridge decks and orthophoto of a block of ground.
 
-Values depend only on the points within `reach_m` of the block, not on the division into blocks or on the
-order of the points; heights agree to 1e-8 m, the rounding error of sums and large coordinates.
+Values depend only on the points near the block (`points_reach_m` + `cells_reach_m`), not on the division into
+blocks or on the order of the points; heights agree to 1e-8 m, the rounding of sums and large coordinates.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -18,9 +18,16 @@ from flexroad.tasks.types import Bools, Floats, Orthophoto
 from flexroad.tools.prepare.points import ground_filter as slope_filter
 from flexroad.tools.prepare.points import morphological as morphological_filter
 from flexroad.tools.prepare.points import tin
-from flexroad.tools.prepare.points.binning import bins, highest, means, spikes, top_layer
-from flexroad.tools.prepare.points.orthophoto import photo
-from flexroad.tools.prepare.types import CellHeights, Points, Rasters, TopLayer
+from flexroad.tools.prepare.points.binning import (
+    Points,
+    TopLayer,
+    bins,
+    highest,
+    means,
+    photo,
+    spikes,
+    top_layer,
+)
 
 BRIDGE_CLASSES = {"asprs": (17,), "ahn": (26,)}
 """Classes of bridge decks by the scheme of a point cloud: ASPRS LAS 1.4, also in Switzerland, Sweden and
@@ -68,18 +75,39 @@ class Options(base.Options):
     )
 
 
-def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Rasters:
-    """Make the rasters of a block of ground.
+@dataclass(frozen=True, eq=False)
+class CellHeights:
+    """What the points of each cell give, without the cells around it."""
 
-    - `points`: in the grid's CRS (m), including a rim of `reach_m` around the grid; others have no effect.
-    - `dop_cell`: pixel of the orthophoto (m); None makes no orthophoto.
-    - result: NaN without points, and the DTM without ground points; no orthophoto if the points have no
-      colours.
-    """
-    rim = grid.buffered(cells_reach_m(options, grid.cell))
-    pixels = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
-    heights, image = of_points(points, rim, options, pixels)
-    return replace(of_cells(heights, rim, grid, options), photo=image)
+    highest: Floats
+    """Highest point, ``(H, W)``, m; NaN where there is none."""
+    top: TopLayer
+    """The points close below the highest one."""
+    ground: Floats
+    """Mean easting from the grid's west, northing from its north, and height of the ground points,
+    ``(3, H, W)``, m; NaN where there are none."""
+    bridges: Floats
+    """Mean height of bridge decks, ``(H, W)``, m; NaN where there are none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rasters:
+    """The rasters of an area."""
+
+    grid: Grid
+    """The cells of the heights."""
+    dsm: Floats
+    """Highest point per cell, ``(H, W)``, m; NaN where there is none."""
+    dtm: Floats
+    """Bare ground, ``(H, W)``, m; NaN where there is none."""
+    top: TopLayer
+    """The points close below the DSM; its height has the same voids filled, with the count 0."""
+    ground: Bools
+    """Cells with ground points, ``(H, W)``; in the others the DTM is interpolated."""
+    bridges: Floats | None = None
+    """Height of bridge decks, ``(H, W)``, m, NaN elsewhere; None if there are none."""
+    photo: Orthophoto | None = None
+    """The orthophoto; None if the points have no colours."""
 
 
 def of_points(
@@ -93,7 +121,11 @@ def of_points(
     - result: no orthophoto if the points have no colours.
     """
     if options.despike_m is not None:
-        points = _without_spikes(points, grid.buffered(points_reach_m(options, grid.cell)), options.despike_m)
+        rim = grid.buffered(points_reach_m(options, grid.cell))
+        cells = bins(points.easting, points.northing, rim)
+        kept = np.ones(len(points), bool)
+        kept[spikes(cells, points.height, rim.shape, options.despike_m)] = False
+        points = points[kept]
     cells = bins(points.easting, points.northing, grid)
     highest_points = highest(cells, points.height, grid.shape)
     top = top_layer(cells, points.height, highest_points, options.top_layer_m, grid.shape)
@@ -120,19 +152,18 @@ def of_cells(heights: CellHeights, rim: Grid, grid: Grid, options: Options) -> R
     top = heights.top
     dsm, road_height = tin.fill_voids(np.stack([heights.highest, top.height]), rim, options.fill_m)
     bridges = heights.bridges[inner]
+    if options.dtm == "mean":
+        dtm = tin.fill_voids(heights.ground[2], rim, options.void_m)
+    else:
+        dtm = tin.triangulated(heights.ground, rim, options.void_m, inner)
     return Rasters(
         grid,
         dsm=dsm[inner],
-        dtm=_dtm(heights.ground, rim, grid, options)[inner],
+        dtm=dtm[inner],
         top=TopLayer(road_height[inner], top.count[inner], top.spread[inner]),
         ground=np.isfinite(heights.ground[2][inner]),
         bridges=bridges if np.isfinite(bridges).any() else None,
     )
-
-
-def reach_m(options: Options, cell: float) -> float:
-    """Return the largest distance from a grid of such cells at which points can change a value in it (m)."""
-    return points_reach_m(options, cell) + cells_reach_m(options, cell)
 
 
 def points_reach_m(options: Options, cell: float) -> float:
@@ -187,13 +218,6 @@ def _classes(classes: tuple[int, ...]) -> str:
     return f"class{'es' if len(classes) > 1 else ''} {', '.join(map(str, classes))}"
 
 
-def _without_spikes(points: Points, grid: Grid, despike_m: float) -> Points:
-    cells = bins(points.easting, points.northing, grid)
-    kept = np.ones(len(points), bool)
-    kept[spikes(cells, points.height, grid.shape, despike_m)] = False
-    return points[kept]
-
-
 def _is_ground(points: Points, asked: Bools, options: Options) -> Bools:
     """Return which of the points that are asked for are ground, ``(n,)``."""
     if options.ground == "classes":
@@ -208,10 +232,3 @@ def _has_class(points: Points, classes: tuple[int, ...]) -> Bools:
     """Return which points have one of some classes, ``(n,)``."""
     chosen = np.isin(np.arange(256), classes)
     return chosen[points.kind]
-
-
-def _dtm(ground: Floats, rim: Grid, grid: Grid, options: Options) -> Floats:
-    """Return the bare ground, ``(H, W)``, m, on the cells of ``rim``; only those of ``grid`` are complete."""
-    if options.dtm == "mean":
-        return tin.fill_voids(ground[2], rim, options.void_m)
-    return tin.triangulated(ground, rim, options.void_m, rim.window(grid))
