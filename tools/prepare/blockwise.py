@@ -16,25 +16,23 @@ from flexroad.catalog import Grid
 from flexroad.catalog.text import count
 from flexroad.pipeline.execute import Executor
 from flexroad.tasks import memory
-from flexroad.tasks.types import Orthophoto
+from flexroad.tasks.types import Floats, Orthophoto
 from flexroad.tools.prepare.output import disk_errors, on_failure
 from flexroad.tools.prepare.point_buckets import BlockIndex, PointBuckets
 from flexroad.tools.prepare.point_reading import BucketedPoints
-from flexroad.tools.prepare.points.binning import TopLayer
 from flexroad.tools.prepare.points.to_rasters import (
-    CellHeights,
+    CELL_LAYERS,
+    GROUND,
     Options,
     cells_reach_m,
     of_cells,
     of_points,
     points_reach_m,
 )
-from flexroad.tools.prepare.raster_writer import GROUND, RasterWriter
+from flexroad.tools.prepare.raster_writer import RasterWriter
 
 POINT_BYTES, CELL_BYTES, PIXEL_BYTES = 200, 200, 20
 """Memory that a block takes per point, cell and pixel of the orthophoto (bytes); measured."""
-LAYERS = 8
-"""Arrays in the file of a block: those of `CellHeights`, in the order of its fields."""
 
 
 @dataclass(frozen=True)
@@ -175,10 +173,8 @@ def _block_grid(whole: Grid, edge: float, index: BlockIndex) -> Grid | None:
 def _read_points(job: _PointsJob) -> _PointsJob:
     reach = points_reach_m(job.options, job.grid.cell)
     points = job.buckets.read(job.grid, reach, with_colours=job.pixels is not None)
-    heights, photo = of_points(points, job.grid, job.options, job.pixels)
-    top = heights.top
-    layers = [heights.highest, top.height, top.count, top.spread, *heights.ground, heights.bridges]
-    arrays: dict[str, NDArray[Any]] = {"heights": np.stack(layers)}
+    cells, photo = of_points(points, job.grid, job.options, job.pixels)
+    arrays: dict[str, NDArray[Any]] = {"cells": cells}
     if photo:
         arrays |= {"colour": photo.colour, "known": photo.known}
     _save(job.target, arrays)
@@ -187,35 +183,29 @@ def _read_points(job: _PointsJob) -> _PointsJob:
 
 def _make_rasters(job: _CellsJob) -> _CellsJob:
     rim = job.grid.buffered(cells_reach_m(job.options, job.grid.cell))
-    rasters = of_cells(_heights(job.sources, rim), rim, job.grid, job.options)
-    top = rasters.top
-    layers = {"dsm": rasters.dsm, "dtm": rasters.dtm}
-    layers["road_height"] = np.stack([top.height, top.count, top.spread])
-    if rasters.bridges is not None:
-        layers["bridges"] = rasters.bridges
-    arrays: dict[str, NDArray[Any]] = {name: heights.astype(np.float32) for name, heights in layers.items()}
-    arrays[GROUND] = rasters.ground
-    _save(job.target, arrays)
+    layers = of_cells(_cells(job.sources, rim), rim, job.grid, job.options)
+    floats = {name: part.astype(np.float32) for name, part in layers.items() if name != GROUND}
+    _save(job.target, floats | {GROUND: layers[GROUND]})
     return job
 
 
-def _heights(sources: Sequence[tuple[Grid, Path]], rim: Grid) -> CellHeights:
-    """Return the heights of the cells of several blocks on one grid; cells of no block have no points."""
-    layers = np.full((LAYERS, *rim.shape), np.nan)
+def _cells(sources: Sequence[tuple[Grid, Path]], rim: Grid) -> Floats:
+    """Return `CELL_LAYERS` of several blocks on one grid; cells of no block have no points."""
+    layers = np.full((len(CELL_LAYERS), *rim.shape), np.nan)
     # The number of points of the top layer.
     layers[2] = 0
     for grid, path in sources:
         with np.load(path) as file:
-            heights = file["heights"]
+            cells = file["cells"]
         east, north = grid.west - rim.west, grid.north - rim.north
         left, top = round(east / rim.cell), round(-north / rim.cell)
         columns = slice(max(left, 0), min(left + grid.width, rim.width))
         rows = slice(max(top, 0), min(top + grid.height, rim.height))
-        part = heights[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+        part = cells[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
         layers[:, rows, columns] = part
         layers[4, rows, columns] += east
         layers[5, rows, columns] += north
-    return CellHeights(layers[0], TopLayer(*layers[1:4]), layers[4:7], layers[7])
+    return layers
 
 
 def _save(target: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

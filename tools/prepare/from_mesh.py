@@ -49,7 +49,7 @@ from flexroad.tools.prepare.point_buckets import (
 )
 from flexroad.tools.prepare.point_reading import BucketedPoints
 from flexroad.tools.prepare.points import tin, to_rasters
-from flexroad.tools.prepare.raster_writer import GROUND, PreparedDataset, RasterWriter
+from flexroad.tools.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.tools.prepare.roads import add_roads, check_roads
 
 BAND = 1024
@@ -149,7 +149,7 @@ def publish_mesh(
         )
         if mesh_options.refine:
             log("refining the terrain")
-            dtm, ground = writer.read("dtm", grid), writer.read(GROUND, grid)
+            dtm, ground = writer.read("dtm", grid), writer.read(to_rasters.GROUND, grid)
             dtm = refine(dtm, ground, grid, options.void_m)
             writer.write("dtm", grid, dtm)
         if mesh_options.dop:

@@ -101,9 +101,10 @@ def on_failure(name: Callable[[Any], object], remedy: str = "use fewer workers")
     """Return what an executor calls with a job whose worker died: it raises a `ConfigError`.
 
     - `name`: returns what a job works on, for the message.
+    - `remedy`: what the user can do; empty if nothing is known.
     """
 
     def fail(job: Any, reason: str) -> NoReturn:
-        raise ConfigError(f"{name(job)}: {reason}; {remedy}")
+        raise ConfigError("; ".join(filter(None, (f"{name(job)}: {reason}", remedy))))
 
     return fail

@@ -9,34 +9,29 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, CatalogError
 from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
 from flexroad.catalog.scan.point_clouds import CHUNK, Chunk, Cloud, chunks, survey_dates
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.execute import Executor
-from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Floats
 from flexroad.tools.prepare.options import check_extent
 from flexroad.tools.prepare.output import disk_errors, on_failure
 from flexroad.tools.prepare.point_buckets import (
-    BYTE,
     PER_METRE,
     RECORD,
-    WORDS,
     BlockIndex,
     BlockPart,
     Integers,
     PointBuckets,
-    Words,
+    Records,
     append,
 )
 
 Dates = tuple[datetime, datetime]
 """When the first and the last point were measured."""
-SHIFT = 8
-"""Number of bits by which colours of 16 bits are moved to the right."""
+SHIFT, BYTE = 8, 255
+"""Number of bits by which colours of 16 bits are moved to the right, and the greatest colour of 8 bits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,39 +187,13 @@ def _read(job: _Job) -> _Part:
     return _Part(job, block_parts, outermost, kinds, out_of_range, _span(dates), shift)
 
 
-def _records(chunk: Chunk, frame: MetricTransform, shift: int) -> tuple[Integers, NDArray[np.void]]:
+def _records(chunk: Chunk, frame: MetricTransform, shift: int) -> tuple[Integers, Records]:
     """Return eastings and northings in stored units, ``(2, n)``, and records with all other fields set."""
     metres = frame.metres(chunk.x, chunk.y, chunk.z)
-    colour = np.zeros((1, 3), np.uint16) if chunk.colour is None else chunk.colour
-    plan, words = _in_units(*metres, chunk.kind, colour, shift)
-    return plan, words.view(RECORD).reshape(-1)
-
-
-@compiled()
-def _in_units(
-    easting: Floats,
-    northing: Floats,
-    height: Floats,
-    kind: NDArray[np.uint8],
-    colour: NDArray[np.uint16],
-    shift: int,
-) -> tuple[Integers, Words]:
-    """Return plan coordinates, ``(2, n)``, and records of the points whose height is in range."""
-    count = 0
-    for i in range(height.size):
-        count += LOWEST_M <= height[i] <= HIGHEST_M
-    plan, words = np.empty((2, count), np.int64), np.zeros((count, WORDS), np.int32)
-    k = 0
-    for i in range(height.size):
-        if LOWEST_M <= height[i] <= HIGHEST_M:
-            plan[0, k] = np.rint(easting[i] * PER_METRE)
-            plan[1, k] = np.rint(northing[i] * PER_METRE)
-            words[k, 2] = np.rint(height[i] * PER_METRE)
-            word = np.uint32(kind[i])
-            if colour.shape[0] == height.size:
-                for band in range(3):
-                    shade = np.uint32(min(colour[i, band] >> shift, BYTE))
-                    word |= shade << np.uint32(8 * (band + 1))
-            words[k, 3] = np.int32(word)
-            k += 1
-    return plan, words
+    in_range = (metres[2] >= LOWEST_M) & (metres[2] <= HIGHEST_M)
+    east, north, height = (np.rint(axis[in_range] * PER_METRE).astype(np.int64) for axis in metres)
+    records = np.zeros(len(height), RECORD)
+    records["height"], records["kind"] = height, chunk.kind[in_range]
+    if chunk.colour is not None:
+        records["colour"] = np.minimum(chunk.colour[in_range] >> shift, BYTE)
+    return np.stack([east, north]), records

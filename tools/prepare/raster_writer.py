@@ -49,8 +49,6 @@ from flexroad.tools.prepare.output import (
 
 SERIAL = SerialExecutor()
 PHOTO = "dop"
-GROUND = "ground"
-"""Cells with ground points: an intermediate layer, not published."""
 UNFINISHED = ".tmp.tif"
 """Ending of a layer's file until it is converted."""
 BLOCK = 256

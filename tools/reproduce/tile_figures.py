@@ -162,7 +162,9 @@ def draw_maps(view: TileView, columns: dict[str, str]) -> Figure:
     for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
         result = view.results[variant]
         artists.append((_errors(upper, view, variant), _angles(lower, result, view.grid)))
-        _titles(upper, lower, label, result)
+        m = result.metrics
+        upper.set_title(f"{label}\nroad {m.l2_road_m:.3f} m, terrain {m.l2_terrain_m:.3f} m")
+        lower.set_title(f"road {m.mad_road_deg:.2f}°, terrain {m.mad_terrain_deg:.2f}°")
     for row, (artist, text) in enumerate(zip(artists[0], ("error (m)", "angle (°)"), strict=True)):
         bar = figure.colorbar(artist, ax=list(axes[row]), extend="both", pad=0.015, aspect=22, shrink=0.85)
         bar.set_label(text)
@@ -195,12 +197,6 @@ def _angles(axes: Axes, result: Result, grid: Grid) -> Collection:
         antialiased=False,
         rasterized=True,
     )
-
-
-def _titles(upper: Axes, lower: Axes, label: str, result: Result) -> None:
-    m = result.metrics
-    upper.set_title(f"{label}\nroad {m.l2_road_m:.3f} m, terrain {m.l2_terrain_m:.3f} m")
-    lower.set_title(f"road {m.mad_road_deg:.2f}°, terrain {m.mad_terrain_deg:.2f}°")
 
 
 def _frame_maps(axes: np.ndarray, grid: Grid) -> None:

@@ -26,7 +26,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks import options as base
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.synthetic.noise import generator, waves
+from flexroad.tools.synthetic.noise import field, generator, waves
 from flexroad.tools.synthetic.options import SOUTH_M, WEST_M, SceneOptions
 from flexroad.tools.synthetic.scene import Scene, true_height
 from flexroad.tools.synthetic.spoilers import Kind
@@ -56,7 +56,7 @@ GHOST = 0.25
 """Fraction of the height of moving objects that remains."""
 
 
-class Faults(base.Options):
+class _Faults(base.Options):
     """Size of the faults of a reconstruction."""
 
     melt_m: float = Field(0.6, ge=0, le=3, description="Gaussian smoothing of all edges (m)")
@@ -74,7 +74,7 @@ class Faults(base.Options):
 
 
 @dataclass(frozen=True)
-class Site:
+class _Site:
     """Properties of one scene, independent of its location."""
 
     name: str
@@ -85,7 +85,7 @@ class Site:
     """Number of triangles of its mesh."""
     options: SceneOptions
     """Slope, humps, embankments and direction are set from the rise and the location."""
-    faults: Faults
+    faults: _Faults
 
 
 TOWN = SceneOptions(
@@ -109,11 +109,11 @@ TOWN = SceneOptions(
 SUBURB = TOWN.model_copy(update={"block_m": 80, "storeys": 2.2})
 
 SITES = (
-    Site("boulevard", "urban", 4.5, 101_000, TOWN.model_copy(update={"block_m": 90.0}), Faults()),
-    Site("courtyards", "urban", 8.0, 78_000, TOWN.model_copy(update={"built": 0.5}), Faults(hidden=0.2)),
-    Site("garden_suburb", "suburban", 14.0, 35_000, SUBURB, Faults()),
-    Site("hillside", "suburban", 23.0, 46_000, SUBURB, Faults()),
-    Site("steep_quarter", "urban", 33.9, 60_000, TOWN, Faults(blank=0.06)),
+    _Site("boulevard", "urban", 4.5, 101_000, TOWN.model_copy(update={"block_m": 90.0}), _Faults()),
+    _Site("courtyards", "urban", 8.0, 78_000, TOWN.model_copy(update={"built": 0.5}), _Faults(hidden=0.2)),
+    _Site("garden_suburb", "suburban", 14.0, 35_000, SUBURB, _Faults()),
+    _Site("hillside", "suburban", 23.0, 46_000, SUBURB, _Faults()),
+    _Site("steep_quarter", "urban", 33.9, 60_000, TOWN, _Faults(blank=0.06)),
 )
 """The ends of the ranges are the paper's; the values between them and their order are assumptions."""
 
@@ -122,7 +122,7 @@ SITES = (
 class Place:
     """A scene at its location in a world."""
 
-    site: Site
+    site: _Site
     grid: Grid
     """Its grid with cells of 1 m."""
     options: SceneOptions
@@ -139,7 +139,7 @@ def survey(scenes: int = len(SITES), seed: int = 0) -> list[Place]:
     return [_locate(row, site, seed) for row, site in enumerate(SITES[:scenes])]
 
 
-def _locate(row: int, site: Site, seed: int) -> Place:
+def _locate(row: int, site: _Site, seed: int) -> Place:
     for number in count():
         west, south = WEST_M + number * APART_M, SOUTH_M - (row + 1) * APART_M
         turn = generator(seed, "dsc3d", row, number).uniform(0, 90)
@@ -153,7 +153,7 @@ def _locate(row: int, site: Site, seed: int) -> Place:
     raise AssertionError("unreachable: the loop has no end")
 
 
-def _excess(site: Site, options: SceneOptions, grid: Grid, seed: int, slope: float) -> float:
+def _excess(site: _Site, options: SceneOptions, grid: Grid, seed: int, slope: float) -> float:
     """Return the rise of the ground at a location minus the rise of the site (m), for a slope."""
     empty = _with(options, slope=slope, density=0.0)
     return float(np.ptp(true_height(grid, seed, site.stratum, empty))) - site.rise_m
@@ -181,7 +181,7 @@ class Reconstruction:
     """Holes without a surface, ``(H, W)``."""
 
 
-def reconstruct(scene: Scene, seed: int, faults: Faults) -> Reconstruction:
+def reconstruct(scene: Scene, seed: int, faults: _Faults) -> Reconstruction:
     """Return a scene's surface with the faults of a reconstruction.
 
     - `scene`: a scene without noise; cells of 0.5 m resolve cars and walls.
@@ -211,8 +211,7 @@ def _static_surface(scene: Scene) -> Floats:
 def _bumps(grid: Grid, seed: int, rms_m: float) -> Floats:
     """Return bumps of root mean square ``rms_m`` (m), higher in some areas than in others."""
     x, y = np.meshgrid(grid.eastings, grid.northings)
-    lengths = np.geomspace(*BUMP_M, 40)
-    bumps = waves(generator(seed, "bumps"), lengths, np.sqrt(2 / lengths.size))(x, y)
+    bumps = field(seed, "bumps", BUMP_M, 40)(x, y)
     patchy = np.exp(waves(generator(seed, "matching"), np.geomspace(15, 80, 9), 0.15)(x, y))
     uneven: Floats = rms_m * patchy / np.sqrt(np.mean(patchy**2)) * bumps
     return uneven
@@ -239,13 +238,11 @@ def _hidden(scene: Scene, seed: int, share: float) -> Bools:
 def _patches(grid: Grid, seed: int, purpose: str, share: float) -> Bools:
     """Return random patches that cover about a fraction ``share`` of the grid, ``(H, W)``."""
     x, y = np.meshgrid(grid.eastings, grid.northings)
-    lengths = np.geomspace(*BLANK_M, 24)
-    field = waves(generator(seed, purpose), lengths, np.sqrt(2 / lengths.size))(x, y)
-    covered: Bools = field > -ndtri(share)
+    covered: Bools = field(seed, purpose, BLANK_M, 24)(x, y) > -ndtri(share)
     return covered
 
 
-def _open_holes(holes: Bools, grid: Grid, seed: int, faults: Faults) -> Bools:
+def _open_holes(holes: Bools, grid: Grid, seed: int, faults: _Faults) -> Bools:
     """Return the holes that stay open: a fraction of the large ones, ``(H, W)``."""
     numbers: NDArray[np.int32]
     numbers, count = ndimage.label(holes)

@@ -85,7 +85,7 @@ def populate(
     bare = fields(farther, seed, ground_at, options.fields * errors)
     built = houses(streets, seed, ground_at, density * options.built, options.storeys)
     built += towers(streets, seed, ground_at, options.towers * density)
-    built = houses_off(built, (*parks, *bare))
+    built = tuple(house for house in built if not any(_overlap(house, area) for area in (*parks, *bare)))
     roofs = roofs_seen(built, seed, ground_at, options.lean * errors, options.facades)
     trees = crowns(streets, seed, ground_at, built, density, options.trees)
     vehicles = [car for street in streets for car in cars(street, seed, density)]
@@ -198,11 +198,6 @@ def _planned(
         x, y = (float(c) for c in street.point(along, lateral))
         planned.append(Area(x, y, float(street.heading(along)), length, width, bool(rng.random() < MISTAKEN)))
     return planned
-
-
-def houses_off(houses: Sequence[House], areas: Sequence[Area]) -> tuple[House, ...]:
-    """Return the houses that overlap none of the areas."""
-    return tuple(house for house in houses if not any(_overlap(house, area) for area in areas))
 
 
 def _overlap(house: House, area: Area) -> bool:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -15,7 +16,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.prepare.points.binning import Points, bins
 from flexroad.tools.synthetic.network import Box, Plan, find_stratum
-from flexroad.tools.synthetic.noise import generator, waves
+from flexroad.tools.synthetic.noise import field, generator
 from flexroad.tools.synthetic.objects import GroundAt
 from flexroad.tools.synthetic.options import DEFAULTS, SceneOptions
 from flexroad.tools.synthetic.population import Objects, populate
@@ -60,7 +61,7 @@ class Scene:
     """True road, ``(H, W)``."""
     kind: NDArray[np.uint8]
     """Object that the surface model shows, a `Kind` per cell, ``(H, W)``."""
-    levels: Mapping[int, Floats] = field(default_factory=dict)
+    levels: Mapping[int, Floats] = dataclasses.field(default_factory=dict)
     """True height of each level, ``(H, W)``, m, NaN where it is not; only of `tools.synthetic.crossings`."""
 
     @property
@@ -101,12 +102,14 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     objects = populate(streets, farther, seed, ground_at, options)
     rng = generator(seed, "survey", *map(int, grid.origin))
     dsm, kind = _survey(canvas, here, truth, objects, options, rng)
-    offset = _flight_offset(canvas, options.flight_offset_m)
+    offset = field(seed, "flights", FLIGHT_WAVES_M, 5, options.flight_offset_m)(canvas.x, canvas.y)
+    west, south, east, north = wide.bounds
+    centre = plan.from_map((west + east) / 2, (south + north) / 2)
     bare = here.bare + scars(canvas, objects.houses, seed, options.scars_m) + offset
     dtm = terrain_model(bare, wide.cell, options.dtm_noise_m, rng)
     return Scene(
         grid=grid,
-        stratum=plan.stratum_at(*_centre(canvas)).name,
+        stratum=plan.stratum_at(*centre).name,
         dsm=dsm[inner],
         dtm=dtm[inner],
         road_mask=segmentation(canvas, here.edge, objects, ground_at, options)[inner],
@@ -202,13 +205,6 @@ def terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Gene
     return smooth
 
 
-def _flight_offset(canvas: Canvas, rms_m: float) -> Floats:
-    """Return the slowly varying offset of the DTM's survey from the DSM's (m), ``(H, W)``."""
-    lengths = np.geomspace(*FLIGHT_WAVES_M, 5)
-    field = waves(generator(canvas.plan.seed, "flights"), lengths, rms_m * np.sqrt(2 / lengths.size))
-    return field(canvas.x, canvas.y)
-
-
 def _box(canvas: Canvas, margin_m: float) -> Box:
     """Return the plan's box around a canvas."""
     x, y = canvas.x, canvas.y
@@ -218,11 +214,6 @@ def _box(canvas: Canvas, margin_m: float) -> Box:
         float(x.max()) + margin_m,
         float(y.max()) + margin_m,
     )
-
-
-def _centre(canvas: Canvas) -> tuple[float, float]:
-    west, south, east, north = canvas.grid.bounds
-    return canvas.plan.from_map((west + east) / 2, (south + north) / 2)
 
 
 def scan(scene: Scene, per_m2: float, noise_m: float, seed: int = 0) -> Points:

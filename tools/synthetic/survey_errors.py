@@ -18,7 +18,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.network import Stream, Street
-from flexroad.tools.synthetic.noise import generator, waves
+from flexroad.tools.synthetic.noise import field, generator
 from flexroad.tools.synthetic.objects import Crown, House, from_middle
 from flexroad.tools.synthetic.spoilers import Canvas
 from flexroad.tools.synthetic.surfaces import BED_M
@@ -47,7 +47,7 @@ SPREAD = 0.5
 
 
 @dataclass(frozen=True)
-class Change:
+class _Change:
     """A stretch of a street whose height changed; lengths in m along and across the centre line."""
 
     street: Street
@@ -59,17 +59,17 @@ class Change:
     """Height of the later survey over the earlier one."""
 
 
-def changes(streets: Sequence[Street], seed: int, mean: float) -> tuple[Change, ...]:
+def changes(streets: Sequence[Street], seed: int, mean: float) -> tuple[_Change, ...]:
     """Return the changes of some streets, ``mean`` per street on average."""
     return tuple(change for street in streets for change in _of(street, seed, mean)) if mean > 0 else ()
 
 
-def _of(street: Street, seed: int, mean: float) -> list[Change]:
+def _of(street: Street, seed: int, mean: float) -> list[_Change]:
     rng = generator(seed, "works", *street.key)
     return [_drawn(street, str(rng.choice(KINDS)), rng) for _ in range(rng.poisson(mean))]
 
 
-def _drawn(street: Street, kind: str, rng: np.random.Generator) -> Change:
+def _drawn(street: Street, kind: str, rng: np.random.Generator) -> _Change:
     half, side = street.half_width_m, rng.choice((-1, 1))
     length, rise = rng.uniform(*LENGTH_M[kind]), rng.uniform(*RISE_M[kind])
     start = rng.uniform(street.start, max(street.end - length, street.start))
@@ -80,10 +80,10 @@ def _drawn(street: Street, kind: str, rng: np.random.Generator) -> Change:
     else:
         middle, width = rng.uniform(-1, 1) * (half + BESIDE_M), rng.uniform(*TRENCH_M)
         left, right = middle - width / 2, middle + width / 2
-    return Change(street, start, min(start + length, street.end), left, right, rise)
+    return _Change(street, start, min(start + length, street.end), left, right, rise)
 
 
-def rise(found: Sequence[Change], x: Floats, y: Floats) -> Floats:
+def rise(found: Sequence[_Change], x: Floats, y: Floats) -> Floats:
     """Return by how much the later survey's ground is higher at points in the plan's frame (m)."""
     total = np.zeros(np.shape(x))
     for change in found:
@@ -117,8 +117,7 @@ def growth(
     - `height_m`: mean height inside a thicket (m).
     - `rng`: draws the height of each cell relative to the mean.
     """
-    lengths = np.geomspace(*THICKET_M, 18)
-    thick = waves(generator(seed, "thickets"), lengths, np.sqrt(2 / lengths.size))(x, y)
+    thick = field(seed, "thickets", THICKET_M, 18)(x, y)
     covered: Bools = (thick > 0) & (edge > CLEAR_M)
     # A skewed distribution of mean 1: most cells are lower than the mean, a few are far higher.
     ragged: Floats = rng.gamma(2.0, 0.5, x.shape)

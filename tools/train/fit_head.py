@@ -256,7 +256,7 @@ def _labels(sample: Sample, window: Grid, covered: Bools) -> Labels:
     return Labels(np.stack([x, y], axis=1)[used].astype(np.float32), road.astype(np.float32))
 
 
-class Regression:
+class _Regression:
     """A linear map trained by AdamW on the weighted cross entropy."""
 
     def __init__(self, windows: Windows, options: Options) -> None:
@@ -310,7 +310,7 @@ def regress(
     train: Windows, validate: Windows, options: Options, progress: Progress | None = None
 ) -> tuple[Line, tuple[Epoch, ...]]:
     """Train; return the map with the lowest loss on ``validate``, and the losses of all epochs."""
-    regression = Regression(train, options)
+    regression = _Regression(train, options)
     rng = np.random.default_rng(options.seed)
     history: list[Epoch] = []
     best = regression.line()

@@ -84,7 +84,7 @@ SIMPLIFIED_M = 0.05
 
 
 @dataclass(frozen=True)
-class Written:
+class _Written:
     """What was written."""
 
     page: Location
@@ -104,7 +104,7 @@ def write_viewer(
     bbox: Bounds | None = None,
     photo_px: int = 1024,
     track: Track = untracked,
-) -> Written:
+) -> _Written:
     """Write the viewer of a run, or of the selected tiles, into a folder."""
     tiles = shown_tiles(run, ids, bbox)
     variant = run.config.export.variants[0]
@@ -112,7 +112,7 @@ def write_viewer(
     index, done = _index(run, tiles, variant)
     options = run.config.chains[variant]["segment"]
     roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
-    look = Look(run.origin, photo_px, roads)
+    look = _Look(run.origin, photo_px, roads)
     finished = track(_finished(run, done, variant), "writing tiles", len(done))
     with ended(finished):
         rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
@@ -128,7 +128,7 @@ def write_viewer(
     write(out / encoding.NAME_RUN, encoding.encode_run(index | {"pictures": bool(pictures)}))
     write(out / PAGE, (_built() / PAGE).read_bytes())
     notes = tuple(f"tile {row['tile']}: {note}" for row in rows for note in row["notes"])
-    return Written(out / PAGE, len(done), len(tiles) - len(done), notes)
+    return _Written(out / PAGE, len(done), len(tiles) - len(done), notes)
 
 
 def shown_tiles(run: Run, ids: Sequence[str], bbox: Bounds | None) -> tuple[Tile, ...]:
@@ -286,7 +286,7 @@ def server(folder: Path, port: int) -> ThreadingHTTPServer:
 
 
 @dataclass(frozen=True)
-class Look:
+class _Look:
     """Options of the tiles' scripts."""
 
     origin: tuple[float, float]
@@ -297,7 +297,7 @@ class Look:
     """Selection of the road lines."""
 
 
-def piece(item: TileItem, look: Look) -> Piece:
+def piece(item: TileItem, look: _Look) -> Piece:
     """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks."""
     tile = item.tile
     source, notes = tile.tile, list[str]()

@@ -31,15 +31,10 @@ from flexroad.tools.reproduce.claims import (
     percent,
 )
 from flexroad.tools.reproduce.comparison import compare
-from flexroad.tools.reproduce.metrics_data import (
-    FIGURE_DTYPE,
-    MetricsData,
-    collect,
-    read_metrics_data,
-    write_metrics_data,
-)
+from flexroad.tools.reproduce.metrics_data import FIGURE_DTYPE, MetricsData, collect, write_metrics_data
 from flexroad.tools.reproduce.published import TABLE_I_DSC3D, TABLE_II, Claim, published
 from flexroad.tools.reproduce.tables import pages, write_comparison
+from tests.stored_metrics import read_metrics_data
 
 VARIANTS = list(load_config("ablation").chains)
 

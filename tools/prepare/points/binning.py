@@ -54,18 +54,6 @@ class Points:
         return Points(self.easting[key], self.northing[key], self.height[key], self.kind[key], colour)
 
 
-@dataclass(frozen=True, eq=False)
-class TopLayer:
-    """The points of each cell that are close below its highest one."""
-
-    height: Floats
-    """Their mean height, ``(H, W)``, m; NaN where there are none."""
-    count: Floats
-    """Their number, ``(H, W)``."""
-    spread: Floats
-    """Standard deviation of their heights, ``(H, W)``, m; 0 for one point, NaN where there are none."""
-
-
 def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
     """Return the cell of each point, ``(n,)``, row-major; -1 outside the grid.
 
@@ -100,20 +88,12 @@ def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats
     - `shape`: rows and columns.
     - `values`: one value per point, ``(n,)``.
     """
-    size = shape[0] * shape[1]
+    # The first number is that of the points outside.
+    numbers, size = cells + 1, shape[0] * shape[1] + 1
+    count = np.bincount(numbers, minlength=size)
     with np.errstate(invalid="ignore"):
-        return tuple(np.divide(*_totals(cells, value, size)).reshape(shape) for value in values)
-
-
-@compiled()
-def _totals(cells: Cells, value: Floats, size: int) -> tuple[Floats, Floats]:
-    """Return the sum of the values and their number, per cell."""
-    total, count = np.zeros(size), np.zeros(size)
-    for i in range(cells.size):
-        if cells[i] >= 0:
-            total[cells[i]] += value[i]
-            count[cells[i]] += 1.0
-    return total, count
+        found = (np.bincount(numbers, value, size) / count for value in values)
+        return tuple(mean[1:].reshape(shape) for mean in found)
 
 
 def highest(cells: Cells, height: Floats, shape: tuple[int, int]) -> Floats:
@@ -154,8 +134,11 @@ def _two_highest(cells: Cells, height: Floats, size: int) -> tuple[Floats, Float
 
 def top_layer(
     cells: Cells, height: Floats, highest: Floats, depth_m: float, shape: tuple[int, int]
-) -> TopLayer:
-    """Return mean, number and spread of the points of each cell's top layer.
+) -> Floats:
+    """Return the top layer of each cell: mean height (m), number and spread of its points, ``(3, H, W)``.
+
+    The spread is the standard deviation of the heights (m): 0 for one point. Where there are no points, it
+    and the mean are NaN.
 
     - `cells`: the cells of the points, ``(n,)``.
     - `height`: the points, ``(n,)``, m.
@@ -163,27 +146,15 @@ def top_layer(
     - `depth_m`: points up to this much below the highest one belong to the top layer (m).
     - `shape`: rows and columns.
     """
-    count, below, squared = _sums(cells, height, highest.ravel(), depth_m)
+    inside = cells >= 0
+    cells = cells[inside]
+    below = height[inside] - highest.ravel()[cells]
+    cells, below = cells[below >= -depth_m], below[below >= -depth_m]
+    count = np.bincount(cells, minlength=highest.size)
     with np.errstate(invalid="ignore"):
-        mean, square = below / count, squared / count
+        mean, square = (np.bincount(cells, values, highest.size) / count for values in (below, below * below))
     spread = np.sqrt(np.maximum(square - mean**2, 0.0))
-    return TopLayer(highest + mean.reshape(shape), count.reshape(shape), spread.reshape(shape))
-
-
-@compiled()
-def _sums(cells: Cells, height: Floats, highest: Floats, depth_m: float) -> tuple[Floats, Floats, Floats]:
-    """Return number, sum and sum of squares of the heights relative to the highest, per cell."""
-    count, below, squared = np.zeros_like(highest), np.zeros_like(highest), np.zeros_like(highest)
-    for i in range(cells.size):
-        c = cells[i]
-        if c < 0:
-            continue
-        z = height[i] - highest[c]
-        if z >= -depth_m:
-            count[c] += 1.0
-            below[c] += z
-            squared[c] += z * z
-    return count, below, squared
+    return np.stack([highest + mean.reshape(shape), count.reshape(shape), spread.reshape(shape)])
 
 
 def photo(points: Points, grid: Grid, fill_m: float) -> Orthophoto:

@@ -6,7 +6,6 @@ blocks or on the order of the points; heights agree to 1e-8 m, the rounding of s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -20,7 +19,6 @@ from flexroad.tools.prepare.points import morphological as morphological_filter
 from flexroad.tools.prepare.points import tin
 from flexroad.tools.prepare.points.binning import (
     Points,
-    TopLayer,
     bins,
     highest,
     means,
@@ -32,6 +30,16 @@ from flexroad.tools.prepare.points.binning import (
 BRIDGE_CLASSES = {"asprs": (17,), "ahn": (26,)}
 """Classes of bridge decks by the scheme of a point cloud: ASPRS LAS 1.4, also in Switzerland, Sweden and
 North Rhine-Westphalia; the Dutch AHN, whose class of structures (kunstwerken) also has locks and weirs."""
+
+
+CELL_LAYERS = (
+    *("highest point (m)", "top layer: mean height (m)", "number of points", "spread (m)"),
+    *("ground: easting from the grid's west (m)", "northing from its north (m)", "height (m)"),
+    "bridge decks: mean height (m)",
+)
+"""What the points of each cell give, without the cells around it; NaN where there are none."""
+GROUND = "ground"
+"""Layer of the cells with ground points, for the refinement of a mesh's DTM; it is not published."""
 
 
 class Options(base.Options):
@@ -75,45 +83,10 @@ class Options(base.Options):
     )
 
 
-@dataclass(frozen=True, eq=False)
-class CellHeights:
-    """What the points of each cell give, without the cells around it."""
-
-    highest: Floats
-    """Highest point, ``(H, W)``, m; NaN where there is none."""
-    top: TopLayer
-    """The points close below the highest one."""
-    ground: Floats
-    """Mean easting from the grid's west, northing from its north, and height of the ground points,
-    ``(3, H, W)``, m; NaN where there are none."""
-    bridges: Floats
-    """Mean height of bridge decks, ``(H, W)``, m; NaN where there are none."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rasters:
-    """The rasters of an area."""
-
-    grid: Grid
-    """The cells of the heights."""
-    dsm: Floats
-    """Highest point per cell, ``(H, W)``, m; NaN where there is none."""
-    dtm: Floats
-    """Bare ground, ``(H, W)``, m; NaN where there is none."""
-    top: TopLayer
-    """The points close below the DSM; its height has the same voids filled, with the count 0."""
-    ground: Bools
-    """Cells with ground points, ``(H, W)``; in the others the DTM is interpolated."""
-    bridges: Floats | None = None
-    """Height of bridge decks, ``(H, W)``, m, NaN elsewhere; None if there are none."""
-    photo: Orthophoto | None = None
-    """The orthophoto; None if the points have no colours."""
-
-
 def of_points(
     points: Points, grid: Grid, options: Options, pixels: Grid | None
-) -> tuple[CellHeights, Orthophoto | None]:
-    """Return what the points of each cell give, and the orthophoto.
+) -> tuple[Floats, Orthophoto | None]:
+    """Return what the points of each cell give, `CELL_LAYERS`, ``(8, H, W)``, and the orthophoto.
 
     - `points`: in the grid's CRS (m), including a rim of `points_reach_m` around the grid; others have no
       effect.
@@ -140,30 +113,30 @@ def of_points(
         points.height,
     )
     image = photo(points, pixels, options.dop_fill_m) if pixels and points.colour is not None else None
-    return CellHeights(highest_points, top, np.stack(of_ground), bridges), image
+    return np.stack([highest_points, *top, *of_ground, bridges]), image
 
 
-def of_cells(heights: CellHeights, rim: Grid, grid: Grid, options: Options) -> Rasters:
-    """Return the rasters of a block of ground, without orthophoto.
+def of_cells(cells: Floats, rim: Grid, grid: Grid, options: Options) -> dict[str, Floats | Bools]:
+    """Return the rasters of a block of ground by layer: heights (m), NaN where there is none, and `GROUND`.
 
-    - `heights`: on the cells of ``rim``: the grid and `cells_reach_m` around it.
+    ``road_height`` has three bands, ``(3, H, W)``: where a void is filled, the number of points is 0. Without
+    decks there is no layer ``bridges``.
+
+    - `cells`: `CELL_LAYERS` on the cells of ``rim``: the grid and `cells_reach_m` around it.
     """
     inner = rim.window(grid)
-    top = heights.top
-    dsm, road_height = tin.fill_voids(np.stack([heights.highest, top.height]), rim, options.fill_m)
-    bridges = heights.bridges[inner]
+    highest, top, ground, bridges = cells[0], cells[1:4], cells[4:7], cells[7][inner]
+    dsm, road_height = tin.fill_voids(np.stack([highest, top[0]]), rim, options.fill_m)
     if options.dtm == "mean":
-        dtm = tin.fill_voids(heights.ground[2], rim, options.void_m)
+        dtm = tin.fill_voids(ground[2], rim, options.void_m)
     else:
-        dtm = tin.triangulated(heights.ground, rim, options.void_m, inner)
-    return Rasters(
-        grid,
-        dsm=dsm[inner],
-        dtm=dtm[inner],
-        top=TopLayer(road_height[inner], top.count[inner], top.spread[inner]),
-        ground=np.isfinite(heights.ground[2][inner]),
-        bridges=bridges if np.isfinite(bridges).any() else None,
-    )
+        dtm = tin.triangulated(ground, rim, options.void_m, inner)
+    layers: dict[str, Floats | Bools] = {"dsm": dsm[inner], "dtm": dtm[inner]}
+    layers["road_height"] = np.stack([road_height[inner], top[1][inner], top[2][inner]])
+    if np.isfinite(bridges).any():
+        layers["bridges"] = bridges
+    layers[GROUND] = np.isfinite(ground[2][inner])
+    return layers
 
 
 def points_reach_m(options: Options, cell: float) -> float:

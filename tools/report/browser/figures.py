@@ -107,7 +107,7 @@ def _line(table: TileTable, before: pd.DataFrame, name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Histogram:
+class _Histogram:
     """One chart."""
 
     title: str
@@ -118,7 +118,7 @@ class Histogram:
 
 def histograms(
     columns: dict[str, tuple[str, str, pd.Series]], limits: dict[str, float]
-) -> Iterator[Histogram]:
+) -> Iterator[_Histogram]:
     """Yield histograms of the main columns (label, unit, values); ``limits`` are the flags' thresholds."""
     shown = 0
     for name in SHOWN:
@@ -131,7 +131,7 @@ def histograms(
             continue
         shown += 1
         median, high = np.percentile(values, [50, 95])
-        yield Histogram(
+        yield _Histogram(
             f"{label} ({unit})" if unit else label,
             _svg(values, limits.get(name), label),
             f"median {short(median)}, 95% below {short(high)}; {count(len(values), 'tile')}",
