@@ -81,7 +81,7 @@ def _shown(content: Content) -> list[str]:
     return list(dict.fromkeys([*content.worst_estimates["tile"], *content.worst["tile"]]))
 
 
-def webp(picture: bytes, width_px: int | None = None, quality: int = QUALITY) -> bytes:
+def webp(picture: bytes, width_px: int | None = None) -> bytes:
     """Return a picture as WebP, smaller if it is wider than ``width_px``."""
     image = Image.open(io.BytesIO(picture)).convert("RGB")
     if width_px is not None and image.width > width_px:
@@ -89,7 +89,7 @@ def webp(picture: bytes, width_px: int | None = None, quality: int = QUALITY) ->
             (width_px, round(image.height * width_px / image.width)), Image.Resampling.LANCZOS
         )
     buffer = io.BytesIO()
-    image.save(buffer, "webp", quality=quality, method=6)
+    image.save(buffer, "webp", quality=QUALITY, method=6)
     return buffer.getvalue()
 
 

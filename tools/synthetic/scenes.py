@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from flexroad.catalog.sources import prepared
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Executor, Jobs, SerialExecutor
+from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Jobs, SerialExecutor
 from flexroad.tasks.io.vectors import vector_date
 from flexroad.tools.prepare.from_mesh import POINTS, MeshOptions, prepare_mesh
 from flexroad.tools.prepare.options import PrepareOptions
@@ -215,7 +214,7 @@ def _with_truth(tile: Tile, folder: str, dataset: str) -> Tile:
     return replace(tile, layers=layers, dataset=dataset)
 
 
-def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Executor | None = None) -> Path:
+def write_stand_in(folder: Path, scenes: int | None, seed: int) -> Path:
     """Write the stand-in for DSC3D; return the path of the catalog with the paper's reference.
 
     The folder of a scene contains ``mesh.glb``, its true layers (``known/<layer>/<scene>.tif``), and the
@@ -224,7 +223,6 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Execut
     - `folder`: output folder.
     - `scenes`: number of scenes; all five if None.
     - `seed`: seed of the world.
-    - `executor`: executor of the scenes; this process if None.
     """
     available = len(dsc3d.SITES)
     if scenes is not None and scenes > available:
@@ -232,12 +230,10 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Execut
             f"--tiles {scenes}: dsc3d has {available} scenes; leave --tiles out for all of them"
         )
     places = dsc3d.survey(scenes or available, seed)
-    write_scene = partial(_write_stand_in, folder, seed)
-    fail = on_failure(lambda place: f"scene {place.site.name}", "")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for _ in (executor or SerialExecutor()).map(write_scene, places, fail):
-            pass
+        for place in places:
+            _write_stand_in(folder, seed, place)
         tiles = [_stand_in_tile(folder, place) for place in places]
         true = f"{STAND_IN.format(seed)}; true reference"
         Catalog(tuple(_with_truth(tile, f"{tile.id}/{KNOWN}", true) for tile in tiles)).write(

@@ -112,7 +112,7 @@ def write_viewer(
     index, done = _index(run, tiles, variant)
     options = run.config.chains[variant]["segment"]
     roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
-    look = _Look(run.origin, photo_px, roads)
+    look = Look(run.origin, photo_px, roads)
     finished = track(_finished(run, done, variant), "writing tiles", len(done))
     with ended(finished):
         rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
@@ -286,7 +286,7 @@ def server(folder: Path, port: int) -> ThreadingHTTPServer:
 
 
 @dataclass(frozen=True)
-class _Look:
+class Look:
     """Options of the tiles' scripts."""
 
     origin: tuple[float, float]
@@ -297,7 +297,7 @@ class _Look:
     """Selection of the road lines."""
 
 
-def piece(item: TileItem, look: _Look) -> Piece:
+def piece(item: TileItem, look: Look) -> Piece:
     """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks."""
     tile = item.tile
     source, notes = tile.tile, list[str]()
