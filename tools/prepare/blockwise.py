@@ -76,9 +76,7 @@ def write_blocks(
 
     - `writer`: writer of the output rasters. Its grid is aligned to the block edges to whole cells.
     - `bucketed`: the points on disk; they are removed.
-    - `options`: how points become rasters.
     - `executor`: runs two worker calls per block, on workers that are held.
-    - `log`: called with a line of progress: the number of blocks.
     """
     first = list(_points_jobs(writer, bucketed, options))
     second = list(_cells_jobs(writer, bucketed, options, first))

@@ -94,12 +94,6 @@ def prepare_mesh(
     """Make the rasters and the catalog of an area from a mesh file.
 
     - `path`: OBJ, PLY or glTF; see `tools.prepare.mesh.read.read_mesh` for colours and georeference.
-    - `out`: output folder.
-    - `common`: options shared by all commands.
-    - `mesh_options`: options of meshes.
-    - `options`: how points become rasters.
-    - `executor`: runs the blocks.
-    - `log`: called with lines of progress.
     """
     check_roads(common)
     log(f"reading {path}")

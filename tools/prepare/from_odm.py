@@ -59,12 +59,8 @@ def prepare_odm(
     """Make the rasters and the catalog of an area from an OpenDroneMap project folder.
 
     - `folder`: the project: the folder that contains ``odm_dem``, ``odm_orthophoto``, ``odm_texturing``.
-    - `out`: output folder.
-    - `common`: options shared by all commands.
     - `mesh_options`: options of meshes; used if the project has no surface model.
     - `options`: ground filter and voids if there is no ``dtm.tif``; all options for a mesh or points.
-    - `executor`: runs the blocks of points.
-    - `log`: called with lines of progress.
     """
     if (folder / DSM).is_file():
         return _from_rasters(folder, out, common, options, log)

@@ -89,13 +89,8 @@ def prepare_photos(
     """Make the rasters and the catalog of an area from overlapping photographs with GNSS tags.
 
     - `images`: photographs, or folders of them.
-    - `out`: output folder.
     - `common`: options shared by all commands. Cells finer than the stereo resolves are made coarser, with a
       note.
-    - `photos_options`: options of photographs.
-    - `options`: how points become rasters.
-    - `executor`: runs photographs and blocks.
-    - `log`: called with lines of progress.
     """
     check_roads(common)
     sfm.colmap()

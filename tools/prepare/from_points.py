@@ -50,11 +50,7 @@ def prepare_points(
     the files and the area. Temporary files take 16 bytes per point.
 
     - `files`: LAS, LAZ or COPC files, and folders of them.
-    - `out`: output folder.
-    - `common`: options shared by all commands.
     - `options`: how points become rasters; its ``ground`` is replaced by the parameter.
-    - `executor`: reads the files, makes the blocks and writes the COGs.
-    - `log`: called with lines of progress.
     - `ground`: how ground points are identified: ``classes``, ``filter``, ``morphological`` or ``auto``. With
       ``auto``, classes are used if in every file at least `MIN_GROUND` of the points, but not all, have a
       ground class.

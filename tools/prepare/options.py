@@ -100,11 +100,8 @@ def prepared_grid(
 ) -> Grid:
     """Return the grid of an area: on multiples of the cell and the pixel, after all limits are checked.
 
-    - `bounds`: bounds of the data (m).
-    - `crs`: CRS of the rasters.
     - `common`: cell, pixel, tile size and roads.
     - `source`: what the data is, for messages: a file.
-    - `out`: output folder.
     - `photo`: whether there is an orthophoto.
     - `per_cell`: memory of the steps that hold the complete area (bytes per cell).
     """
@@ -142,7 +139,6 @@ def check_disk(out: Path, needed: float, what: str, remedy: str) -> None:
     - `out`: the folder; it need not exist.
     - `needed`: estimated size (bytes).
     - `what`: what needs it: the beginning of the message.
-    - `remedy`: what the user can do.
     """
     free = free_bytes(out)
     if needed > free:

@@ -105,12 +105,8 @@ def bucket_points(
 ) -> BucketedPoints:
     """Move the points of all files to metres and sort them into buckets, except noise and withheld points.
 
-    - `clouds`: the input files.
-    - `frame`: transforms their coordinates to metres.
     - `folder`: folder for the files of points; they take 16 bytes per point.
-    - `edge`: edge of a block (m).
     - `executor`: runs a worker call per million points.
-    - `log`: called with one line of progress per file.
     """
     parts: list[_Part] = []
     bounds: Bounds | None = None

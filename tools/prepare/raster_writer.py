@@ -78,10 +78,7 @@ class PreparedDataset:
 class RasterWriter:
     """Writer of the rasters of one area; a context manager that removes its temporary files.
 
-    - `out`: output folder; created if it does not exist.
-    - `grid`: all cells of the area.
     - `dop_cell`: pixel of the orthophoto (m); None if there is no orthophoto.
-    - `tags`: TIFF tags of every file: its source and its processing.
     - `vertical`: vertical CRS of the heights, in metres, if it is known.
     """
 

@@ -100,9 +100,7 @@ def burn(
     """Return the cells whose centre is road, ``(H, W)``, or None if the roads are lines.
 
     - `path`: polygons in any format GDAL reads; a raster that is not 0 on roads; or a mesh of the roads.
-    - `layer`: layer of a vector file; required if it has several.
     - `where`: SQL condition that selects features: ``class = 'road'``.
-    - `grid`: the cells.
     - `notify`: receives one line about text in another encoding than declared.
     """
     mask = _mesh(path, grid) if path.suffix.lower() in MESHES else _raster(path, grid)

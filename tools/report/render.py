@@ -160,9 +160,6 @@ def curves(
     """Draw lines in one chart.
 
     - `lines`: the x and y values of each line by name, ``(n,)`` each.
-    - `labels`: labels of the x and the y axis.
-    - `limits`: limits of the x and the y axis.
-    - `mark`: x, y and name of a point to mark.
     """
     figure = Figure(figsize=(WIDTH_PX / DPI, 3.4), dpi=DPI, layout="constrained")
     axes = figure.add_subplot()
@@ -290,7 +287,6 @@ def estimate_picture(
     - `height`: the DSM (m), ``(H, W)``.
     - `estimate`: estimated error of the surface (m), ``(H, W)``.
     - `road`: road cells before the filter, ``(H, W)``.
-    - `grid`: where the cells lie.
     - `places`: place by flag; each has a circle, with the names of its flags.
     """
     norm = Normalize(0, LIMIT_M, clip=True)

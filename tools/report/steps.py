@@ -72,7 +72,6 @@ def edge_steps(
     - `run`: the run; pairs whose surfaces are not in its store are left out.
     - `results`: the results of all finished tiles; by default the tiles to be compared are checked.
     - `most`: largest number of tiles compared with their neighbours.
-    - `track`: shows the progress.
     """
     tiles = run.catalog.usable
     every = math.ceil(len(tiles) / most)

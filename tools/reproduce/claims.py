@@ -48,8 +48,6 @@ def check(claim: Claim, means: Means, dataset: str = GEROD) -> Verdict:
     weaker, above it stronger. Whatever the verdict, it is "not decided" if fewer than `LEVEL` percent of the
     resamples give it.
 
-    - `claim`: a claim of the paper.
-    - `means`: means of the run.
     - `dataset`: the paper's dataset that the run is compared with; claims about other datasets are not
       tested.
     """

@@ -44,7 +44,6 @@ def write_figures(
 ) -> list[str]:
     """Draw every figure whose variants are in the run, and write ``figures.md`` with the captions.
 
-    - `run`: a run with finished tiles.
     - `folder`: folder for NAME.pdf, NAME.png, NAME.webp and figures.md.
     - `tile_id`: the tile of the maps, renders and profile; by default the tile with the median road L2.
     - `roles`: which variant is which method; by default derived from the variants' options.

@@ -42,7 +42,6 @@ def write_comparison(
     """Write the paper's tables with a run's figures beside them; return the paths of the files.
 
     - `run`: a run with variants named as in configs/ablation.yaml; missing variants are left out.
-    - `folder`: folder for the files.
     - `true`, `dsc3d`, `dsc3d_true`, `literal`, `dsm`: the runs that `collect` takes.
     """
     data = collect(run, true, dsc3d, dsc3d_true, literal, dsm)

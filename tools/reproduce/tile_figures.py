@@ -77,7 +77,6 @@ def along(raster: Floats, row: Floats, col: Floats) -> Floats:
 def draw_profile(view: TileView, row: Floats, col: Floats, heights: dict[str, Floats]) -> Figure:
     """Draw a map of the path, the heights along it and their errors.
 
-    - `view`: the tile.
     - `row`, `col`: the path, in cells.
     - `heights`: heights along the path (m) by label: ``raw DSM``, ``Plane``, ``FlexRoad`` and ``truth``.
     """

@@ -129,10 +129,7 @@ DEFAULTS = SceneOptions()
 
 
 def block(tiles: int, size_m: int = 250) -> list[tuple[str, Grid]]:
-    """Return the ids and grids of a near-square block of neighbouring tiles; the last row may be incomplete.
-
-    - `size_m`: side of a tile on the absolute grid (m).
-    """
+    """Return the ids and grids of a near-square block of neighbouring tiles; the last row may be partial."""
     columns = math.ceil(math.sqrt(tiles))
     rows = math.ceil(tiles / max(columns, 1))
     west, south = WEST_M // size_m * size_m, SOUTH_M // size_m * size_m

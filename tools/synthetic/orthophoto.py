@@ -71,9 +71,6 @@ def orthophoto(
 ) -> NDArray[np.uint8]:
     """Return the orthophoto of the scene that `make_scene` gives for the same arguments.
 
-    - `seed`: seed of the world, 0 or more.
-    - `stratum`: see `make_scene`.
-    - `gsd`: ground sampling distance (m).
     - result: red, green and blue, 0 to 255, over the grid's bounds.
     """
     pixels = _pixel_grid(grid, gsd)

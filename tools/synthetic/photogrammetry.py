@@ -53,7 +53,6 @@ class _PhotogrammetryScene:
 def photogrammetry(place: Place, seed: int) -> _PhotogrammetryScene:
     """Make one scene of the stand-in for DSC3D.
 
-    - `place`: a place from `tools.synthetic.dsc3d.survey`.
     - result: equal input gives equal scenes. The mesh fills the square of the place, except for open holes.
     """
     site, grid = place.site, place.grid

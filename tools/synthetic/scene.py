@@ -82,7 +82,6 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     Ground, streets, objects and errors of the mask are functions of seed and absolute coordinates, so tiles
     of one seed join without a step. The noise of the heights is drawn per tile.
 
-    - `seed`: seed of the world, 0 or more.
     - `stratum`: stratum of the complete world: ``urban``, ``suburban`` or ``rural``; by default a mix of
       districts.
     """
@@ -222,8 +221,6 @@ def scan(scene: Scene, per_m2: float, noise_m: float, seed: int = 0) -> Points:
     Heights are those of the true ground, linear between cell centres, plus what stands on the point's cell.
 
     - `scene`: a scene without noise of its own (`SceneOptions.dsm_noise_m`).
-    - `per_m2`: number of points per m2.
-    - `noise_m`: standard deviation of their heights (m).
     """
     grid, rng = scene.grid, generator(seed, "scan", *map(int, scene.grid.origin))
     west, south, east, north = grid.bounds

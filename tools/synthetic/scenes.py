@@ -80,9 +80,7 @@ def write_scenes(
     reference of a preset's tiles is the one that the paper describes. Beside their catalog,
     ``catalog_true.parquet`` lists them with the truth as reference.
 
-    - `folder`: output folder.
     - `tiles`: number of tiles; if None, 4, or all of the preset.
-    - `seed`: seed of the world.
     - `size_m`: side of a tile (m); 250 if None. The size of a preset's tiles is fixed.
     - `dop`: whether to write orthophotos; the preset dsc3d always has them.
     - `preset`: one of `PRESETS`; None for a block of neighbouring tiles.
@@ -220,9 +218,7 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int) -> Path:
     The folder of a scene contains ``mesh.glb``, its true layers (``known/<layer>/<scene>.tif``), and the
     rasters and catalog that ``prepare mesh`` writes. In the folder above are the catalogs of all scenes.
 
-    - `folder`: output folder.
     - `scenes`: number of scenes; all five if None.
-    - `seed`: seed of the world.
     """
     available = len(dsc3d.SITES)
     if scenes is not None and scenes > available:

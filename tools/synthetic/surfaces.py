@@ -48,7 +48,6 @@ class Relief:
 def relief(seed: int, slope: float, roughness_m: float, datum_m: float, embankment_m: float = 0.0) -> Relief:
     """Return the relief of a world.
 
-    - `slope`: root mean square slope of the hills.
     - `roughness_m`: root mean square height of the humps (m).
     - `datum_m`: mean height of the world (m).
     - `embankment_m`: root mean square height of streets above or below the hills (m).

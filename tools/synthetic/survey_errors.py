@@ -143,7 +143,6 @@ def scars(canvas: Canvas, houses: Sequence[House], seed: int, depth_m: float) ->
 def hidden(canvas: Canvas, dsm: Floats, crowns: Sequence[Crown], seed: int, length: float) -> Bools:
     """Return the cells that crowns hide, ``(H, W)``: beside a crown, and below the middle of its height.
 
-    - `dsm`: surface model (m).
     - `length`: mean length of the hidden ground at the edge of an image, per height of the crown.
     """
     found = np.zeros(dsm.shape, np.bool_)

@@ -46,7 +46,6 @@ MEANING = (
 def write_model(outcome: Outcome, path: Path) -> tuple[Path, ...]:
     """Write the report and the model; return the paths, the model first.
 
-    - `outcome`: the result of the training.
     - `path`: path of the model; without a suffix, ``.safetensors`` is added.
     """
     path = path if path.suffix else path.with_suffix(outcome.trained.suffix)

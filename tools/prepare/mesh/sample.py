@@ -88,7 +88,6 @@ def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
     input gives equal points.
 
     - `mesh`: in a CRS in metres.
-    - `density`: points per m2 of surface.
     - result: at most `CHUNK` points, with colours if all faces have a colour.
     """
     rng = np.random.default_rng(seed)

@@ -142,7 +142,6 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct the poses of photographs and sparse points from their features and GNSS positions.
 
-    - `placed`: the photographs and their GNSS positions.
     - `work`: empty folder for the database and the model.
     - `options`: options. The same seed and number of threads give the same result up to rounding.
     - `control`: ground control points. If 3 or more are marked in at least 2 placed photographs each, they

@@ -46,7 +46,6 @@ def poisson(
     """Return the surface of a cloud as a mesh with vertex colours.
 
     - `cloud`: points about ``spacing_m`` apart, with normals.
-    - `spacing_m`: distance between neighbouring points (m).
     - `crs`, `origin`: CRS, and the position of the cloud's origin in it: easting, northing, height, ``(3,)``,
       m.
     - `work`: folder for two temporary PLY files.

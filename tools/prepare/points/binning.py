@@ -85,8 +85,6 @@ def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats
     Values are summed in the order of the points: another order changes only the last digits.
 
     - `cells`: the cells of the points, ``(n,)``; points outside the grid are left out.
-    - `shape`: rows and columns.
-    - `values`: one value per point, ``(n,)``.
     """
     # The first number is that of the points outside.
     numbers, size = cells + 1, shape[0] * shape[1] + 1
@@ -140,11 +138,8 @@ def top_layer(
     The spread is the standard deviation of the heights (m): 0 for one point. Where there are no points, it
     and the mean are NaN.
 
-    - `cells`: the cells of the points, ``(n,)``.
-    - `height`: the points, ``(n,)``, m.
     - `highest`: highest point per cell, ``(H, W)``, m; NaN where there is none.
     - `depth_m`: points up to this much below the highest one belong to the top layer (m).
-    - `shape`: rows and columns.
     """
     inside = cells >= 0
     cells = cells[inside]

@@ -53,9 +53,7 @@ class Comparison:
 def compare(table: TileTable, before: pd.DataFrame, variant: str, name: str) -> Comparison:
     """Compare the tiles of a run with the rows of another one, called ``name``.
 
-    - `table`: the tiles of this run.
     - `before`: the other run's metrics.parquet.
-    - `variant`: the variant that is compared.
     - `name`: name of the other run in the text.
     """
     own = before[(before.variant == variant) & (before.status == "done")].drop_duplicates("tile_id")

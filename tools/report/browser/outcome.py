@@ -128,7 +128,6 @@ def reasons(
     """Return a tile's flags in words.
 
     - `row`: the tile's row of metrics.parquet.
-    - `options`: the thresholds of the flags.
     - `places`: place of each flag, as far as known (`flexroad.tasks.quality.places.places`).
     - `notes`: notes on the sources of the tile: a DSM that lies off the DTM as a whole is why roads are
       dropped.
@@ -224,10 +223,7 @@ def cards(table: TileTable) -> list[tuple[str, int, str]]:
 def statements(content: Content, table: TileTable, failed: Mapping[str, str], run: str) -> list[_Statement]:
     """Return what is to be known of a run, the most urgent first.
 
-    - `content`: the tables of the run.
-    - `table`: its tiles.
     - `failed`: the error of each failed tile by id.
-    - `run`: path of the run, for commands.
     """
     run = shlex.quote(run)
     return [

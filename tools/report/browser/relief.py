@@ -51,8 +51,6 @@ def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = unt
     """Draw the surfaces of tiles as a shaded relief with their roads; None if none is in the store.
 
     - `tiles`: the tiles to draw; those whose surface is not in the store are left out.
-    - `results`: the results of all finished tiles.
-    - `track`: shows the progress.
     """
     tiles = list(tiles)
     if not tiles:
