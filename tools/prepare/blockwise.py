@@ -164,8 +164,7 @@ def _block_grid(whole: Grid, edge: float, index: BlockIndex) -> Grid | None:
     top, bottom = max(top, 0), min(bottom, whole.height)
     if left >= right or top >= bottom:
         return None
-    west, north = whole.west + left * whole.cell, whole.north - top * whole.cell
-    return Grid(whole.crs, west, north, whole.cell, right - left, bottom - top)
+    return whole.part(slice(top, bottom), slice(left, right))
 
 
 def _read_points(job: _PointsJob) -> _PointsJob:

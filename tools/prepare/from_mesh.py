@@ -148,7 +148,11 @@ def publish_mesh(
             writer.write("dtm", grid, dtm)
         if mesh_options.dop:
             log("drawing the orthophoto")
-            _draw_photo(writer, mesh)
+            whole = writer.photo_grid
+            assert whole is not None
+            for row in range(0, whole.height, BAND):
+                rows = slice(row, min(row + BAND, whole.height))
+                writer.write_photo(orthophoto(mesh, whole.part(rows, slice(0, whole.width))))
         dataset = common.dataset or name
         if has_mask:
             dsm, dtm, road = (writer.read(layer, grid) for layer in ("dsm", "dtm", "road_mask"))
@@ -197,17 +201,6 @@ def _sample_points(
             records["height"] = height
             block_parts += append(writer.scratch / "points", edge, easting, northing, records)
     return BucketedPoints(PointBuckets.of(edge, block_parts), mesh.bounds, (), (), 0)
-
-
-def _draw_photo(writer: RasterWriter, mesh: TexturedMesh) -> None:
-    whole = writer.photo_grid
-    assert whole is not None
-    for row in range(0, whole.height, BAND):
-        rows = min(BAND, whole.height - row)
-        north = whole.north - row * whole.cell
-        writer.write_photo(
-            orthophoto(mesh, Grid(whole.crs, whole.west, north, whole.cell, whole.width, rows))
-        )
 
 
 def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float) -> Floats:

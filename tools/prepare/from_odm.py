@@ -198,9 +198,8 @@ def _windows(grid: Grid) -> Iterator[tuple[Grid, Window]]:
     """Yield windows of `BLOCK` x `BLOCK` cells that cover a grid."""
     for row in range(0, grid.height, BLOCK):
         for col in range(0, grid.width, BLOCK):
-            height, width = min(BLOCK, grid.height - row), min(BLOCK, grid.width - col)
-            west, north = grid.west + col * grid.cell, grid.north - row * grid.cell
-            yield Grid(grid.crs, west, north, grid.cell, width, height), Window(col, row, width, height)
+            rows, cols = slice(row, min(row + BLOCK, grid.height)), slice(col, min(col + BLOCK, grid.width))
+            yield grid.part(rows, cols), Window.from_slices(rows, cols)
 
 
 def _clipped(part: Grid, whole: Grid) -> Grid:

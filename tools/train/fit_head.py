@@ -228,9 +228,7 @@ def _batches(sample: Sample, options: Options) -> Iterator[tuple[NDArray[np.floa
     images, labels = [], []
     for row, col in corners(photo.known.shape, size):
         window = np.s_[row : row + size, col : col + size]
-        west, north = photo.grid.west + col * options.gsd_m, photo.grid.north - row * options.gsd_m
-        ground = Grid(photo.grid.crs, west, north, options.gsd_m, size, size)
-        window_labels = _labels(sample, ground, photo.known[window])
+        window_labels = _labels(sample, photo.grid.part(*window), photo.known[window])
         if len(window_labels.road):
             images.append(image[(slice(None), *window)])
             labels.append(window_labels)

@@ -40,6 +40,43 @@ end_header
 """
 
 
+def has_gpu() -> bool:
+    """Return whether pycolmap was built with CUDA and finds a GPU; raises TaskError if it is missing."""
+    pycolmap = colmap()
+    return bool(pycolmap.has_cuda) and pycolmap.get_num_cuda_devices() > 0
+
+
+def patchmatch(reconstruction: Reconstruction, work: Path, size: int) -> Cloud:
+    """Return the fused cloud of all photographs, relative to the reconstruction's origin.
+
+    - `reconstruction`: its model and photographs are read from their files.
+    - `work`: folder for undistorted photographs and depth maps: about 20 bytes per pixel of each photograph.
+    - `size`: photographs are reduced to this width or height (pixels).
+    """
+    pycolmap = colmap()
+    workspace, fused = work / "stereo", work / "fused.ply"
+    undistorting = pycolmap.UndistortCameraOptions(max_image_size=size)
+    pycolmap.undistort_images(
+        workspace, reconstruction.model, reconstruction.root, undistort_options=undistorting
+    )
+    pycolmap.patch_match_stereo(workspace, options=pycolmap.PatchMatchOptions(max_image_size=size))
+    pycolmap.stereo_fusion(fused, workspace, output_type="PLY")
+    return read_ply(fused)
+
+
+def read_ply(path: Path) -> Cloud:
+    """Read the points from the PLY file of COLMAP's fusion."""
+    _, _, body = path.read_bytes().partition(b"end_header\n")
+    records = np.frombuffer(body, RECORD)
+    if not len(records):
+        raise TaskError("dense stereo gave no points; use photographs that overlap by 60 % or more")
+    points, normals, colours = (
+        np.column_stack([records[name] for name in names])
+        for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
+    )
+    return Cloud(points.astype(np.float64), normals.astype(np.float64), colours)
+
+
 def poisson(
     cloud: Cloud, spacing_m: float, crs: str, origin: Floats, work: Path, threads: int | None = None
 ) -> TexturedMesh:
@@ -87,40 +124,3 @@ def write_ply(path: Path, cloud: Cloud) -> None:
     kinds = {"<f4": "float", "|u1": "uchar"}
     lines = "\n".join(f"property {kinds[RECORD[name].str]} {name}" for name in RECORD.names or ())
     path.write_bytes(HEADER.format(len(cloud), lines).encode() + records.tobytes())
-
-
-def has_gpu() -> bool:
-    """Return whether pycolmap was built with CUDA and finds a GPU; raises TaskError if it is missing."""
-    pycolmap = colmap()
-    return bool(pycolmap.has_cuda) and pycolmap.get_num_cuda_devices() > 0
-
-
-def patchmatch(reconstruction: Reconstruction, work: Path, size: int) -> Cloud:
-    """Return the fused cloud of all photographs, relative to the reconstruction's origin.
-
-    - `reconstruction`: its model and photographs are read from their files.
-    - `work`: folder for undistorted photographs and depth maps: about 20 bytes per pixel of each photograph.
-    - `size`: photographs are reduced to this width or height (pixels).
-    """
-    pycolmap = colmap()
-    workspace, fused = work / "stereo", work / "fused.ply"
-    undistorting = pycolmap.UndistortCameraOptions(max_image_size=size)
-    pycolmap.undistort_images(
-        workspace, reconstruction.model, reconstruction.root, undistort_options=undistorting
-    )
-    pycolmap.patch_match_stereo(workspace, options=pycolmap.PatchMatchOptions(max_image_size=size))
-    pycolmap.stereo_fusion(fused, workspace, output_type="PLY")
-    return read_ply(fused)
-
-
-def read_ply(path: Path) -> Cloud:
-    """Read the points from the PLY file of COLMAP's fusion."""
-    _, _, body = path.read_bytes().partition(b"end_header\n")
-    records = np.frombuffer(body, RECORD)
-    if not len(records):
-        raise TaskError("dense stereo gave no points; use photographs that overlap by 60 % or more")
-    points, normals, colours = (
-        np.column_stack([records[name] for name in names])
-        for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
-    )
-    return Cloud(points.astype(np.float64), normals.astype(np.float64), colours)

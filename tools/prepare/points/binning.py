@@ -7,7 +7,6 @@ ground under it. A single point far above all around it is a spike.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,23 +59,10 @@ def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
     A point on the border of two cells belongs to the eastern or southern one. Rounding does not change that,
     so all grids of the same lattice give the same result.
     """
-    cells: Cells = _bins(
-        np.asarray(easting), np.asarray(northing), grid.west, grid.north, grid.cell, grid.height, grid.width
-    )
-    return cells
-
-
-@compiled()
-def _bins(
-    easting: Floats, northing: Floats, west: float, north: float, cell: float, rows: int, cols: int
-) -> Cells:
-    cells = np.full(easting.size, -1, np.int64)
-    for i in range(easting.size):
-        col = math.floor((easting[i] - west) / cell + NUDGE)
-        row = math.floor((north - northing[i]) / cell + NUDGE)
-        if 0 <= row < rows and 0 <= col < cols:
-            cells[i] = row * cols + col
-    return cells
+    row = np.floor((grid.north - northing) / grid.cell + NUDGE)
+    col = np.floor((easting - grid.west) / grid.cell + NUDGE)
+    inside = (row >= 0) & (row < grid.height) & (col >= 0) & (col < grid.width)
+    return np.where(inside, row * grid.width + col, -1).astype(np.int64)
 
 
 def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats, ...]:
