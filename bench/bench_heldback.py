@@ -41,9 +41,10 @@ from flexroad.pipeline.cli.main import main as command
 from flexroad.tasks.quality.estimate import INTERVAL
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.export.source import select
-from flexroad.tools.prepare.points.to_rasters import Options, rasterise
+from flexroad.tools.prepare.points.to_rasters import Options
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from flexroad.tools.synthetic.scene import DECK, GROUND, scan
+from tests.make_clouds import rasterise
 
 SIDE_M, SHARE, FIRST = 5.0, 0.06, 7
 """Side of the squares, the share of them that is withheld, and the number of the first draw."""

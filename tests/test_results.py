@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from flexroad.tools.report.content import FIGURES
-from flexroad.tools.reproduce.metrics_data import FIGURE_DTYPE, FILE, read_metrics_data, write_metrics_data
+from flexroad.tools.reproduce.metrics_data import FIGURE_DTYPE, FILE, write_metrics_data
 from flexroad.tools.reproduce.tables import pages
+from tests.stored_metrics import read_metrics_data
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"

@@ -105,8 +105,14 @@ def look(folder: Path) -> tuple[list[Download], bool]:
         if number == MAX_FILES:
             return found, True
         kind = kinds.get(path.suffix.lower())
-        if kind and (download := _looked(path, folder, kind)):
-            found.append(download)
+        if kind == "raster":
+            found += _raster(path, folder)
+        elif kind == "cloud":
+            found.append(_cloud(path))
+        elif kind == "vector":
+            found.append(_vectors(path))
+        elif kind:
+            found.append(Download(path, kind, question=QUESTIONS.get(kind, "")))
     return found, False
 
 
@@ -140,35 +146,23 @@ def _files(folder: Path) -> Iterator[Path]:
         yield from (Path(parent, name) for name in sorted(names) if not name.startswith("."))
 
 
-def _looked(path: Path, folder: Path, kind: str) -> Download | None:
-    if kind == "raster":
-        return _raster(path, folder)
-    if kind == "cloud":
-        return _cloud(path)
-    if kind == "vector":
-        return _vectors(path)
-    return Download(path, kind, question=QUESTIONS.get(kind, ""))
-
-
-def _raster(path: Path, folder: Path) -> Download | None:
+def _raster(path: Path, folder: Path) -> Iterator[Download]:
+    """Yield a raster as a download; nothing for a text to read."""
     try:
         with quiet(), open_raster(path) as raster:
             bands, dtype, size = raster.count, raster.dtypes[0], f"{raster.width} x {raster.height}"
             crs = in_plan(raster.crs.to_wkt()) if raster.crs else None
             values = _values(raster)
     except (*ERRORS, CatalogError) as error:
-        if path.suffix.lower() == ".txt":
-            # A text to read.
-            return None
-        return Download(path, "raster", question=f"it cannot be read as a raster: {error}")
+        if path.suffix.lower() != ".txt":
+            yield Download(path, "raster", question=f"it cannot be read as a raster: {error}")
+        return
     kind = layouts.layer_of(path.relative_to(folder).as_posix()) or "raster"
     about = f"{count(bands, 'band')} {dtype}, {size}, {values[0]}, {short(crs) if crs else 'no CRS'}"
     question = QUESTIONS.get(kind, "")
     if bands >= 3 and kind in ("dsm", "dtm", "raster"):
-        kind, question = (
-            "dop",
-            "" if kind == "raster" else f"it is named like a {kind}, but has {bands} bands",
-        )
+        question = "" if kind == "raster" else f"it is named like a {kind}, but has {bands} bands"
+        kind = "dop"
     elif bands == 1 and kind == "dop":
         question = "it is named like an orthophoto, but has one band"
     elif kind == "road_mask":
@@ -176,7 +170,7 @@ def _raster(path: Path, folder: Path) -> Download | None:
     metric = crs is None or plan_unit(crs)[1] == 1.0
     if crs is None:
         question = question or NO_CRS
-    return Download(path, kind, about, short(crs) if crs else None, question, metric)
+    yield Download(path, kind, about, short(crs) if crs else None, question, metric)
 
 
 def _of_mask(values: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,27 +14,25 @@ from rich.progress import track
 
 from flexroad.catalog import Grid
 from flexroad.catalog.text import count
-from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.tasks import memory
-from flexroad.tasks.types import Orthophoto
-from flexroad.tools.prepare.output import disk_errors
+from flexroad.tasks.types import Floats, Orthophoto
+from flexroad.tools.prepare.output import disk_errors, on_failure
 from flexroad.tools.prepare.point_buckets import BlockIndex, PointBuckets
 from flexroad.tools.prepare.point_reading import BucketedPoints
 from flexroad.tools.prepare.points.to_rasters import (
+    CELL_LAYERS,
+    GROUND,
     Options,
     cells_reach_m,
     of_cells,
     of_points,
     points_reach_m,
 )
-from flexroad.tools.prepare.raster_writer import GROUND, RasterWriter
-from flexroad.tools.prepare.types import CellHeights, TopLayer
+from flexroad.tools.prepare.raster_writer import RasterWriter
 
 POINT_BYTES, CELL_BYTES, PIXEL_BYTES = 200, 200, 20
 """Memory that a block takes per point, cell and pixel of the orthophoto (bytes); measured."""
-LAYERS = 8
-"""Arrays in the file of a block: those of `CellHeights`, in the order of its fields."""
 
 
 @dataclass(frozen=True)
@@ -78,21 +76,25 @@ def write_blocks(
 
     - `writer`: writer of the output rasters. Its grid is aligned to the block edges to whole cells.
     - `bucketed`: the points on disk; they are removed.
-    - `options`: how points become rasters.
     - `executor`: runs two worker calls per block, on workers that are held.
-    - `log`: called with a line of progress: the number of blocks.
     """
     first = list(_points_jobs(writer, bucketed, options))
     second = list(_cells_jobs(writer, bucketed, options, first))
     _check_memory(first, second)
     log(f"{count(len(second), 'block')} of {bucketed.buckets.edge:g} m")
-    read = executor.map(_read_points, first, _fail)
+    fail = on_failure(lambda job: f"block {job.grid.west:.0f}_{job.grid.south:.0f}")
+    read = executor.map(_read_points, first, fail)
     for points_job in track(read, "reading points", len(first), console=Console(stderr=True)):
-        _write_photo(writer, points_job)
+        if points_job.pixels:
+            with np.load(points_job.target) as file:
+                writer.write_photo(Orthophoto(points_job.pixels, file["colour"], file["known"]))
     bucketed.buckets.remove()
-    made = executor.map(_make_rasters, second, _fail)
+    made = executor.map(_make_rasters, second, fail)
     for cells_job in track(made, "making rasters", len(second), console=Console(stderr=True)):
-        _write_block(writer, cells_job)
+        with np.load(cells_job.target) as rasters:
+            for layer, values in rasters.items():
+                writer.write(layer, cells_job.grid, values)
+        cells_job.target.unlink()
 
 
 def _points_jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Options) -> Iterator[_PointsJob]:
@@ -162,17 +164,14 @@ def _block_grid(whole: Grid, edge: float, index: BlockIndex) -> Grid | None:
     top, bottom = max(top, 0), min(bottom, whole.height)
     if left >= right or top >= bottom:
         return None
-    west, north = whole.west + left * whole.cell, whole.north - top * whole.cell
-    return Grid(whole.crs, west, north, whole.cell, right - left, bottom - top)
+    return whole.part(slice(top, bottom), slice(left, right))
 
 
 def _read_points(job: _PointsJob) -> _PointsJob:
     reach = points_reach_m(job.options, job.grid.cell)
     points = job.buckets.read(job.grid, reach, with_colours=job.pixels is not None)
-    heights, photo = of_points(points, job.grid, job.options, job.pixels)
-    top = heights.top
-    layers = [heights.highest, top.height, top.count, top.spread, *heights.ground, heights.bridges]
-    arrays: dict[str, NDArray[Any]] = {"heights": np.stack(layers)}
+    cells, photo = of_points(points, job.grid, job.options, job.pixels)
+    arrays: dict[str, NDArray[Any]] = {"cells": cells}
     if photo:
         arrays |= {"colour": photo.colour, "known": photo.known}
     _save(job.target, arrays)
@@ -181,55 +180,31 @@ def _read_points(job: _PointsJob) -> _PointsJob:
 
 def _make_rasters(job: _CellsJob) -> _CellsJob:
     rim = job.grid.buffered(cells_reach_m(job.options, job.grid.cell))
-    rasters = of_cells(_heights(job.sources, rim), rim, job.grid, job.options)
-    top = rasters.top
-    layers = {"dsm": rasters.dsm, "dtm": rasters.dtm}
-    layers["road_height"] = np.stack([top.height, top.count, top.spread])
-    if rasters.bridges is not None:
-        layers["bridges"] = rasters.bridges
-    arrays: dict[str, NDArray[Any]] = {name: heights.astype(np.float32) for name, heights in layers.items()}
-    arrays[GROUND] = rasters.ground
-    _save(job.target, arrays)
+    layers = of_cells(_cells(job.sources, rim), rim, job.grid, job.options)
+    floats = {name: part.astype(np.float32) for name, part in layers.items() if name != GROUND}
+    _save(job.target, floats | {GROUND: layers[GROUND]})
     return job
 
 
-def _heights(sources: Sequence[tuple[Grid, Path]], rim: Grid) -> CellHeights:
-    """Return the heights of the cells of several blocks on one grid; cells of no block have no points."""
-    layers = np.full((LAYERS, *rim.shape), np.nan)
+def _cells(sources: Sequence[tuple[Grid, Path]], rim: Grid) -> Floats:
+    """Return `CELL_LAYERS` of several blocks on one grid; cells of no block have no points."""
+    layers = np.full((len(CELL_LAYERS), *rim.shape), np.nan)
     # The number of points of the top layer.
     layers[2] = 0
     for grid, path in sources:
         with np.load(path) as file:
-            heights = file["heights"]
+            cells = file["cells"]
         east, north = grid.west - rim.west, grid.north - rim.north
         left, top = round(east / rim.cell), round(-north / rim.cell)
         columns = slice(max(left, 0), min(left + grid.width, rim.width))
         rows = slice(max(top, 0), min(top + grid.height, rim.height))
-        part = heights[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+        part = cells[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
         layers[:, rows, columns] = part
         layers[4, rows, columns] += east
         layers[5, rows, columns] += north
-    return CellHeights(layers[0], TopLayer(*layers[1:4]), layers[4:7], layers[7])
+    return layers
 
 
 def _save(target: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     with disk_errors(target.parent.parent):
         np.savez(target, allow_pickle=False, **arrays)
-
-
-def _fail(job: _PointsJob | _CellsJob, reason: str) -> NoReturn:
-    raise ConfigError(f"block {job.grid.west:.0f}_{job.grid.south:.0f}: {reason}; use fewer workers")
-
-
-def _write_photo(writer: RasterWriter, job: _PointsJob) -> None:
-    if job.pixels:
-        with np.load(job.target) as file:
-            writer.write_photo(Orthophoto(job.pixels, file["colour"], file["known"]))
-
-
-def _write_block(writer: RasterWriter, job: _CellsJob) -> None:
-    with np.load(job.target) as rasters:
-        for layer in ("dsm", "dtm", "road_height", "bridges", GROUND):
-            if layer in rasters:
-                writer.write(layer, job.grid, rasters[layer])
-    job.target.unlink()

@@ -26,7 +26,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tools.prepare import from_mesh, from_odm, from_photos, from_points
 from flexroad.tools.prepare.options import PrepareOptions
 from flexroad.tools.prepare.output import check_replaced, disk_errors
-from flexroad.tools.prepare.photos import mvs_cpu, mvs_gpu, sfm
+from flexroad.tools.prepare.photos import mvs_cpu, sfm
 from flexroad.tools.prepare.points import ground_filter, morphological
 from flexroad.tools.prepare.points.to_rasters import BRIDGE_CLASSES, Options
 from flexroad.tools.prepare.raster_writer import PreparedDataset
@@ -268,7 +268,7 @@ def prepare_photos(
         photos_options,
         sfm=sfm.Options(**_given(image_size=image_size, seed=seed)),
         stereo=mvs_cpu.Options(**_given(size=stereo_size)),
-        patchmatch=mvs_gpu.Options(**_given(size=stereo_size)),
+        **_given(patchmatch_size=stereo_size),
     )
     options = rasters.of(ground="filter")
     _run(

@@ -1,4 +1,20 @@
-"""``flexroad prepare mesh``: rasters of a textured mesh, from points sampled on its surface."""
+"""``flexroad prepare mesh``: rasters of a textured mesh, from points sampled on its surface.
+
+With a road mask, the ground truth of the paper's DSC3D section is made, too. The paper says that the DTM is
+refined "via our ECSRC algorithm" and that "road masks, enhanced through ECSRC", take "ground truth terrain
+from DTM and road from DSM", and no more. Here
+
+- *refined* means: cells with ground points are clustered like road cells, by their heights. Cells outside
+  all clusters of `min_area_m2` differ from the surrounding ground by more than `theta_z_m`: the ground filter
+  accepted them wrongly (roofs, hedges, floating fragments), and they are interpolated from their
+  surroundings. Cells without ground points are not clustered: interpolated slopes would connect a roof to
+  its garden;
+- *enhanced* means: the road mask is clustered by the DSM, as in the stage `ecsrc`; cells that are not kept
+  (crowns, vehicles, roofs) count as terrain.
+
+This reference has passed the same filter as the method to be evaluated, so it cannot show errors of the
+filter. Reports of figures against it must say so (`CIRCULAR`).
+"""
 
 from __future__ import annotations
 
@@ -8,19 +24,20 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import label
 
 from flexroad.catalog import Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.config.options import INPUTS, RASTERS, option
 from flexroad.pipeline.execute import Executor
+from flexroad.tasks.filter import ecsrc
+from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
 from flexroad.tools.prepare.blockwise import write_blocks
-from flexroad.tools.prepare.limits import check_disk, prepared_grid
-from flexroad.tools.prepare.mesh import reference
 from flexroad.tools.prepare.mesh.georeference import Offset
 from flexroad.tools.prepare.mesh.read import read_mesh
 from flexroad.tools.prepare.mesh.sample import TexturedMesh, in_metres, orthophoto, sample
-from flexroad.tools.prepare.options import PrepareOptions, written
+from flexroad.tools.prepare.options import PrepareOptions, check_disk, prepared_grid, written
 from flexroad.tools.prepare.output import disk_errors
 from flexroad.tools.prepare.point_buckets import (
     PER_METRE,
@@ -31,8 +48,8 @@ from flexroad.tools.prepare.point_buckets import (
     block_edge,
 )
 from flexroad.tools.prepare.point_reading import BucketedPoints
-from flexroad.tools.prepare.points import to_rasters
-from flexroad.tools.prepare.raster_writer import GROUND, PreparedDataset, RasterWriter
+from flexroad.tools.prepare.points import tin, to_rasters
+from flexroad.tools.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.tools.prepare.roads import add_roads, check_roads
 
 BAND = 1024
@@ -41,6 +58,10 @@ REFINE_BYTES, REFERENCE_BYTES = 300, 50
 """Memory of the refinement and of the reference per cell of the area (bytes); measured."""
 POINTS = to_rasters.Options(ground="filter")
 """Default options for points of a mesh: they have no classes, so the ground filter is used."""
+CIRCULAR = "reference by ECSRC itself (circular)"
+"""Text that is added to the name of data with this reference."""
+ECSRC = ecsrc.Options(keep_largest=None)
+"""The paper's thresholds; all clusters of enough area are kept, as their number grows with the area."""
 
 
 @dataclass(frozen=True)
@@ -73,12 +94,6 @@ def prepare_mesh(
     """Make the rasters and the catalog of an area from a mesh file.
 
     - `path`: OBJ, PLY or glTF; see `tools.prepare.mesh.read.read_mesh` for colours and georeference.
-    - `out`: output folder.
-    - `common`: options shared by all commands.
-    - `mesh_options`: options of meshes.
-    - `options`: how points become rasters.
-    - `executor`: runs the blocks.
-    - `log`: called with lines of progress.
     """
     check_roads(common)
     log(f"reading {path}")
@@ -107,7 +122,9 @@ def publish_mesh(
         name,
         out,
         photo=mesh_options.dop,
-        per_cell=_whole(mesh_options, common),
+        per_cell=max(
+            REFERENCE_BYTES if common.roads is not None else 0, REFINE_BYTES if mesh_options.refine else 0
+        ),
     )
     points = mesh_options.density * mesh.area
     remedy = "use a lower --density, or a part of the mesh"
@@ -120,34 +137,33 @@ def publish_mesh(
     ):
         has_mask = add_roads(writer, common)
         if has_mask:
-            writer.tags["REFERENCE"] = (
-                f"DSM on the road mask that ECSRC keeps, DTM elsewhere: {reference.CIRCULAR}"
-            )
+            writer.tags["REFERENCE"] = f"DSM on the road mask that ECSRC keeps, DTM elsewhere: {CIRCULAR}"
         write_blocks(
             writer, _sample_points(writer, mesh, mesh_options, options, common.step_m), options, held, log
         )
         if mesh_options.refine:
             log("refining the terrain")
-            dtm, ground = writer.read("dtm", grid), writer.read(GROUND, grid)
-            dtm = reference.refine(dtm, ground, grid, options.void_m)
+            dtm, ground = writer.read("dtm", grid), writer.read(to_rasters.GROUND, grid)
+            dtm = refine(dtm, ground, grid, options.void_m)
             writer.write("dtm", grid, dtm)
         if mesh_options.dop:
             log("drawing the orthophoto")
-            _draw_photo(writer, mesh)
+            whole = writer.photo_grid
+            assert whole is not None
+            for row in range(0, whole.height, BAND):
+                rows = slice(row, min(row + BAND, whole.height))
+                writer.write_photo(orthophoto(mesh, whole.part(rows, slice(0, whole.width))))
         dataset = common.dataset or name
         if has_mask:
-            _write_reference(writer)
-            dataset = f"{dataset}; {reference.CIRCULAR}"
+            dsm, dtm, road = (writer.read(layer, grid) for layer in ("dsm", "dtm", "road_mask"))
+            heights, kept = reference(dsm, dtm, road, grid)
+            writer.write("reference", grid, heights)
+            writer.write("reference_road", grid, kept)
+            dataset = f"{dataset}; {CIRCULAR}"
         published = writer.publish(
             common.tile_size_m, common.date, dataset, common.min_cover, common.assumed_date, held
         )
     return published.with_notes(*mesh.notes, *frame.notes)
-
-
-def _whole(mesh_options: MeshOptions, common: PrepareOptions) -> int:
-    """Return the memory of the steps that hold the complete area (bytes per cell)."""
-    needed = REFERENCE_BYTES if common.roads is not None else 0
-    return max(needed, REFINE_BYTES) if mesh_options.refine else needed
 
 
 def _tags(name: str, mesh_options: MeshOptions, options: to_rasters.Options) -> dict[str, str]:
@@ -187,19 +203,34 @@ def _sample_points(
     return BucketedPoints(PointBuckets.of(edge, block_parts), mesh.bounds, (), (), 0)
 
 
-def _draw_photo(writer: RasterWriter, mesh: TexturedMesh) -> None:
-    whole = writer.photo_grid
-    assert whole is not None
-    for row in range(0, whole.height, BAND):
-        rows = min(BAND, whole.height - row)
-        north = whole.north - row * whole.cell
-        writer.write_photo(
-            orthophoto(mesh, Grid(whole.crs, whole.west, north, whole.cell, whole.width, rows))
-        )
+def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float) -> Floats:
+    """Interpolate the ground cells of a DTM that ECSRC does not keep.
+
+    - `dtm` ``(H, W)``: bare ground as given by a ground filter, m; NaN where there is none.
+    - `ground` ``(H, W)``: cells with ground points; the heights of the others are interpolated.
+    - `fill_m`: gaps up to this width are interpolated linearly (m), wider ones become NaN.
+    - result ``(H, W)``: m; cells without a height in ``dtm`` have none in the result.
+    """
+    ground = ground & np.isfinite(dtm)
+    kept = _kept(dtm, ground, grid)
+    voids, _ = label(~kept, np.ones((3, 3)))
+    # Voids without a removed ground cell keep their interpolated heights.
+    replaced = np.isin(voids, voids[ground & ~kept]) & ~kept
+    interpolated = tin.fill_voids(np.where(kept, dtm, np.nan), grid, fill_m)
+    return np.where(replaced & np.isfinite(dtm), interpolated, dtm)
 
 
-def _write_reference(writer: RasterWriter) -> None:
-    dsm, dtm, road = (writer.read(layer, writer.grid) for layer in ("dsm", "dtm", "road_mask"))
-    heights, kept = reference.reference(dsm, dtm, road, writer.grid)
-    writer.write("reference", writer.grid, heights)
-    writer.write("reference_road", writer.grid, kept)
+def reference(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> tuple[Floats, Bools]:
+    """Return the paper's ground truth: heights of road and terrain, and the road mask, ``(H, W)`` each.
+
+    - `dsm`, `dtm` ``(H, W)``: highest surface and refined bare ground, m; NaN where there is none.
+    - `road` ``(H, W)``: the raw road mask.
+    """
+    kept = _kept(dsm, road, grid)
+    return np.where(kept, dsm, dtm), kept
+
+
+def _kept(heights: Floats, cells: Bools, grid: Grid) -> Bools:
+    """Return the cells that ECSRC keeps when they are clustered by these heights."""
+    data = TileData("", grid, grid, heights, heights)
+    return ecsrc.ecsrc(data, RoadMask(grid, grid, cells, np.zeros_like(cells)), ECSRC).mask

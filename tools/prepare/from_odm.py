@@ -30,8 +30,7 @@ from flexroad.tasks import memory
 from flexroad.tasks.types import Floats, Orthophoto
 from flexroad.tools.prepare.from_mesh import MeshOptions, prepare_mesh
 from flexroad.tools.prepare.from_points import prepare_points
-from flexroad.tools.prepare.limits import SMALLER, prepared_grid
-from flexroad.tools.prepare.options import PrepareOptions, written
+from flexroad.tools.prepare.options import SMALLER, PrepareOptions, prepared_grid, written
 from flexroad.tools.prepare.points import ground_filter, tin, to_rasters
 from flexroad.tools.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.tools.prepare.roads import add_roads, check_roads
@@ -60,12 +59,8 @@ def prepare_odm(
     """Make the rasters and the catalog of an area from an OpenDroneMap project folder.
 
     - `folder`: the project: the folder that contains ``odm_dem``, ``odm_orthophoto``, ``odm_texturing``.
-    - `out`: output folder.
-    - `common`: options shared by all commands.
     - `mesh_options`: options of meshes; used if the project has no surface model.
     - `options`: ground filter and voids if there is no ``dtm.tif``; all options for a mesh or points.
-    - `executor`: runs the blocks of points.
-    - `log`: called with lines of progress.
     """
     if (folder / DSM).is_file():
         return _from_rasters(folder, out, common, options, log)
@@ -193,21 +188,18 @@ def _warped(source: Any, frame: MetricTransform, grid: Grid, reduction: Resampli
         height=grid.height,
         resampling=reduction if cell < grid.cell * 1.001 else Resampling.bilinear,
         # The alpha band marks pixels outside the source as having no colour.
-        add_alpha=source.count >= 3 and source.nodata is None and not _has_alpha(source),
+        add_alpha=source.count >= 3
+        and source.nodata is None
+        and ColorInterp.alpha not in color_kinds(source),
     )
-
-
-def _has_alpha(source: Any) -> bool:
-    return ColorInterp.alpha in color_kinds(source)
 
 
 def _windows(grid: Grid) -> Iterator[tuple[Grid, Window]]:
     """Yield windows of `BLOCK` x `BLOCK` cells that cover a grid."""
     for row in range(0, grid.height, BLOCK):
         for col in range(0, grid.width, BLOCK):
-            height, width = min(BLOCK, grid.height - row), min(BLOCK, grid.width - col)
-            west, north = grid.west + col * grid.cell, grid.north - row * grid.cell
-            yield Grid(grid.crs, west, north, grid.cell, width, height), Window(col, row, width, height)
+            rows, cols = slice(row, min(row + BLOCK, grid.height)), slice(col, min(col + BLOCK, grid.width))
+            yield grid.part(rows, cols), Window.from_slices(rows, cols)
 
 
 def _clipped(part: Grid, whole: Grid) -> Grid:

@@ -23,11 +23,10 @@ from flexroad.tasks import TaskError
 from flexroad.tasks.types import Floats
 from flexroad.tools.prepare.from_mesh import MeshOptions, publish_mesh
 from flexroad.tools.prepare.options import PrepareOptions, written
-from flexroad.tools.prepare.output import disk_errors, scratch_folder
-from flexroad.tools.prepare.photos import mvs_cpu, mvs_gpu, sfm
+from flexroad.tools.prepare.output import disk_errors, on_failure, scratch_folder
+from flexroad.tools.prepare.photos import mvs_cpu, sfm, surface
 from flexroad.tools.prepare.photos.exif import PlacedPhotos, place_photos, read_control, read_shot
 from flexroad.tools.prepare.photos.mvs_cpu import Cloud
-from flexroad.tools.prepare.photos.poisson import poisson
 from flexroad.tools.prepare.photos.sfm import Reconstruction, View
 from flexroad.tools.prepare.points import to_rasters
 from flexroad.tools.prepare.raster_writer import PreparedDataset
@@ -57,8 +56,8 @@ class PhotosOptions:
     sfm: sfm.Options = field(default_factory=sfm.Options)
     stereo: mvs_cpu.Options = field(default_factory=mvs_cpu.Options)
     """Dense stereo on the CPU."""
-    patchmatch: mvs_gpu.Options = field(default_factory=mvs_gpu.Options)
-    """Dense stereo on a GPU."""
+    patchmatch_size: int = 2000
+    """Dense stereo on a GPU: photographs are reduced to this width or height (pixels)."""
     refine: bool = option(True, RASTERS, "Do not refine the DTM by ECSRC.")
     """Whether the DTM is refined by ECSRC, as in the paper."""
 
@@ -90,13 +89,8 @@ def prepare_photos(
     """Make the rasters and the catalog of an area from overlapping photographs with GNSS tags.
 
     - `images`: photographs, or folders of them.
-    - `out`: output folder.
     - `common`: options shared by all commands. Cells finer than the stereo resolves are made coarser, with a
       note.
-    - `photos_options`: options of photographs.
-    - `options`: how points become rasters.
-    - `executor`: runs photographs and blocks.
-    - `log`: called with lines of progress.
     """
     check_roads(common)
     sfm.colmap()
@@ -109,9 +103,9 @@ def prepare_photos(
         log(f"matching {len(placed.shots)} photographs ({_cameras(placed)})")
         reconstruction = sfm.reconstruct(placed, work, photos_options.sfm, control or None)
         notes = _notes(reconstruction, placed, control is not None)
-        gpu = mvs_gpu.available()
+        gpu = surface.has_gpu()
         pixel = mvs_cpu.ground_pixel_m(
-            reconstruction, photos_options.patchmatch.size if gpu else photos_options.stereo.size
+            reconstruction, photos_options.patchmatch_size if gpu else photos_options.stereo.size
         )
         method = f"dense stereo: {ON_GPU if gpu else ON_CPU}, {pixel:.3f} m per pixel"
         common, coarser = _coarsened(common, pixel)
@@ -120,14 +114,13 @@ def prepare_photos(
             log(note)
         spacing = max(2 * pixel, min(common.cell_m, common.dop_cell_m) / 3)
         if gpu:
-            cloud = mvs_cpu.merge(
-                [mvs_gpu.patchmatch(reconstruction, work, photos_options.patchmatch)], spacing
-            )
+            cloud = surface.patchmatch(reconstruction, work, photos_options.patchmatch_size)
+            cloud = mvs_cpu.merge([cloud], spacing)
         else:
             cloud = _stereo(reconstruction, work, photos_options.stereo, spacing, executor, log)
         log(f"Poisson surface of {len(cloud):,} points")
         with disk_errors(out):
-            mesh = poisson(
+            mesh = surface.poisson(
                 cloud, spacing, reconstruction.crs, reconstruction.origin, work, photos_options.sfm.threads
             )
         name = f"{len(reconstruction.views)} photographs ({_cameras(placed)})"
@@ -230,7 +223,8 @@ def _stereo(
     with disk_errors(work.parent):
         folder.mkdir()
     jobs = list(_jobs(reconstruction, folder, options, spacing))
-    for number, _ in enumerate(executor.map(_match, jobs, _fail), 1):
+    fail = on_failure(lambda job: job.view.path, "use fewer workers or a smaller --stereo-size")
+    for number, _ in enumerate(executor.map(_match, jobs, fail), 1):
         log(f"matched {number} of {len(jobs)} photographs pixel by pixel")
     merged: list[Cloud] = []
     for job in jobs:
@@ -265,7 +259,3 @@ def _match(job: _DepthJob) -> Path:
     with disk_errors(job.target.parent.parent.parent):
         np.savez(job.target, points=cloud.points, normals=cloud.normals, colours=cloud.colours)
     return job.target
-
-
-def _fail(job: _DepthJob, reason: str) -> Path:
-    raise ConfigError(f"{job.view.path}: {reason}; use fewer workers or a smaller --stereo-size")

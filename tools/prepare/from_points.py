@@ -17,8 +17,7 @@ from flexroad.catalog.text import some
 from flexroad.catalog.to_metres import MetricTransform, agreed
 from flexroad.pipeline.execute import Executor
 from flexroad.tools.prepare.blockwise import write_blocks
-from flexroad.tools.prepare.limits import check_disk, prepared_grid
-from flexroad.tools.prepare.options import PrepareOptions, written
+from flexroad.tools.prepare.options import PrepareOptions, check_disk, prepared_grid, written
 from flexroad.tools.prepare.output import scratch_folder
 from flexroad.tools.prepare.point_buckets import RECORD, block_edge_of
 from flexroad.tools.prepare.point_reading import BucketedPoints, bucket_points
@@ -51,11 +50,7 @@ def prepare_points(
     the files and the area. Temporary files take 16 bytes per point.
 
     - `files`: LAS, LAZ or COPC files, and folders of them.
-    - `out`: output folder.
-    - `common`: options shared by all commands.
     - `options`: how points become rasters; its ``ground`` is replaced by the parameter.
-    - `executor`: reads the files, makes the blocks and writes the COGs.
-    - `log`: called with lines of progress.
     - `ground`: how ground points are identified: ``classes``, ``filter``, ``morphological`` or ``auto``. With
       ``auto``, classes are used if in every file at least `MIN_GROUND` of the points, but not all, have a
       ground class.

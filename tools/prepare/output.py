@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import errno
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, NoReturn
 
 from flexroad.catalog import LAYERS
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
@@ -84,15 +85,26 @@ def scratch_folder(out: Path) -> Iterator[Path]:
 
 def write_error(where: Path, error: Exception) -> ConfigError:
     """Return the error of a file or folder that cannot be written: one line with reason and remedy."""
-    remedy = "correct that or choose another folder with -o"
-    if _is_full(where, getattr(error, "errno", None)):
-        remedy = "free disk space and repeat"
+    number = getattr(error, "errno", None)
+    is_full = free_bytes(where) < FULL_BYTES if number is None else number in FULL
+    remedy = "free disk space and repeat" if is_full else "correct that or choose another folder with -o"
     return ConfigError(f"cannot write to {where}: {write_reason(error)}; {remedy}")
 
 
-def _is_full(where: Path, number: int | None) -> bool:
-    """Return whether an error means a full disk; ``number`` is its errno, None if it has none."""
-    if number is not None:
-        return number in FULL
+def free_bytes(where: Path) -> int:
+    """Return the free space on the disk of a file or folder, which need not exist."""
     existing = next(folder for folder in (where.absolute(), *where.absolute().parents) if folder.exists())
-    return shutil.disk_usage(existing).free < FULL_BYTES
+    return shutil.disk_usage(existing).free
+
+
+def on_failure(name: Callable[[Any], object], remedy: str = "use fewer workers") -> Callable[[Any, str], Any]:
+    """Return what an executor calls with a job whose worker died: it raises a `ConfigError`.
+
+    - `name`: returns what a job works on, for the message.
+    - `remedy`: what the user can do; empty if nothing is known.
+    """
+
+    def fail(job: Any, reason: str) -> NoReturn:
+        raise ConfigError("; ".join(filter(None, (f"{name(job)}: {reason}", remedy))))
+
+    return fail

@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds, Grid
 from flexroad.catalog.scan.point_clouds import Cloud
 from flexroad.catalog.to_metres import MetricTransform
-from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Floats
-from flexroad.tools.prepare.types import Points
+from flexroad.tools.prepare.points.binning import Points
 
 PER_METRE = 10_000
 """Units of the stored coordinates: tenths of a millimetre."""
@@ -33,13 +31,10 @@ POINTS_PER_BLOCK = 2_000_000
 """Target number of points that a worker holds in memory, including the rim around its block."""
 SHORTEST_EDGE_M, LONGEST_EDGE_M = 50.0, 500.0
 """Limits of the edge of a block (m)."""
-WORDS = 4
-"""Number of 32-bit words of a record; the last one has the class in its lowest byte, then the colour."""
-BYTE, BYTE_BITS = 255, 8
 
 Integers = NDArray[np.int64]
-Words = NDArray[np.int32]
-"""Records as 32-bit words, ``(n, 4)``, or some of these words."""
+Records = NDArray[np.void]
+"""Points as `RECORD`, ``(n,)``."""
 BlockIndex = tuple[int, int]
 """Column and row of a block: easting and northing of its south-west corner, in multiples of the edge."""
 
@@ -74,11 +69,9 @@ class BlockPart:
     """Number of records before them."""
     count: int
 
-    def read(self, count: int = -1) -> Words:
-        """Return the records as words, ``(n, 4)``, at most ``count`` if that is not negative."""
-        number = self.count if count < 0 else min(count, self.count)
-        words = np.fromfile(self.path, "<i4", number * WORDS, offset=self.first * RECORD.itemsize)
-        return words.reshape(-1, WORDS)
+    def read(self) -> Records:
+        """Return the points."""
+        return np.fromfile(self.path, RECORD, self.count, offset=self.first * RECORD.itemsize)
 
 
 @dataclass(frozen=True)
@@ -117,8 +110,8 @@ class PointBuckets:
 
     def first_point(self, index: BlockIndex) -> tuple[float, float]:
         """Return easting and northing (m) of a point of a block."""
-        ((east, north, *_),), (x, y) = self.parts[index][0].read(1), _corner(index, self.edge)
-        return (int(east) + x) / PER_METRE, (int(north) + y) / PER_METRE
+        point, (x, y) = self.parts[index][0].read()[0], _corner(index, self.edge)
+        return (int(point["east"]) + x) / PER_METRE, (int(point["north"]) + y) / PER_METRE
 
     def count(self, index: BlockIndex) -> int:
         """Return the number of points of a block."""
@@ -135,37 +128,49 @@ class PointBuckets:
     def read(self, grid: Grid, reach_m: float, with_colours: bool) -> Points:
         """Return the points on a grid and a rim around it, in an order that depends only on the points."""
         west, south, east, north = (round(side * PER_METRE) for side in grid.buffered(reach_m).bounds)
-        keys, rest = [np.zeros(0, np.int64)], [np.zeros((0, 2), np.int32)]
+        # Northing and easting from the south-west corner, as one number.
+        plans, found = [np.zeros(0, np.int64)], [np.zeros(0, RECORD)]
         for index in self.overlapping(grid, reach_m):
             x, y = _corner(index, self.edge)
             for part in self.parts.get(index, ()):
-                inside = _inside(part.read(), west - x, south - y, east - x, north - y)
-                keys.append(inside[0])
-                rest.append(inside[1])
-        plan, words = np.concatenate(keys), np.concatenate(rest)
-        columns = _columns(plan, words, _order(plan, words), west, south, with_colours)
-        return Points(*columns[:4], colour=columns[4] if with_colours else None)
+                records = part.read()
+                right, up = (records[axis].astype(np.int64) for axis in ("east", "north"))
+                right, up = right + (x - west), up + (y - south)
+                inside = (right >= 0) & (right <= east - west) & (up >= 0) & (up <= north - south)
+                plans.append(up[inside] << 32 | right[inside])
+                found.append(records[inside])
+        plan, points = np.concatenate(plans), np.concatenate(found)
+        order = _order(plan, points)
+        plan, points = plan[order], points[order]
+        return Points(
+            # Division, not multiplication by 1e-4: whole centimetres are restored exactly.
+            ((plan & 0xFFFFFFFF) + west) / PER_METRE,
+            ((plan >> 32) + south) / PER_METRE,
+            points["height"] / PER_METRE,
+            np.ascontiguousarray(points["kind"]),
+            np.ascontiguousarray(points["colour"]) if with_colours else None,
+        )
 
 
-def append(
-    path: Path, edge: float, east: Integers, north: Integers, records: NDArray[np.void]
-) -> list[BlockPart]:
+def append(path: Path, edge: float, east: Integers, north: Integers, records: Records) -> list[BlockPart]:
     """Add points, ``(n,)``, with coordinates in stored units, to a file; return where they are."""
     side = edge * PER_METRE
     west, south = math.floor(east.min() / side), math.ceil(north.min() / side) - 1
     width = math.floor(east.max() / side) - west + 1
-    block = _block_numbers(east, north, side, west, south, width)
+    row, column = np.ceil(north / side) - 1 - south, np.floor(east / side) - west
+    block = (row * width + column).astype(np.int64)
     # NumPy sorts integers of one or two bytes by radix, which is faster.
     order = np.argsort(block.astype(np.min_scalar_type(int(block.max()))), kind="stable")
     ends = np.flatnonzero(np.diff(block[order])) + 1
-    words = records.view("<i4").reshape(-1, WORDS)
     parts = []
     with path.open("ab") as file:
         for members in np.split(order, ends):
-            row, col = divmod(int(block[members[0]]), width)
-            index = west + col, south + row
+            up, right = divmod(int(block[members[0]]), width)
+            index = west + right, south + up
+            (x, y), part = _corner(index, edge), records[members]
+            part["east"], part["north"] = east[members] - x, north[members] - y
             parts.append(BlockPart(index, path, file.tell() // RECORD.itemsize, members.size))
-            file.write(_relative(words, east, north, members, *_corner(index, edge)).tobytes())
+            file.write(part.tobytes())
     return parts
 
 
@@ -174,76 +179,12 @@ def _corner(index: BlockIndex, edge: float) -> tuple[int, int]:
     return round(index[0] * edge * PER_METRE), round(index[1] * edge * PER_METRE)
 
 
-def _order(plan: Integers, words: Words) -> NDArray[np.intp]:
+def _order(plan: Integers, records: Records) -> NDArray[np.intp]:
     """Return the order by plan coordinates and, where they are equal, by height, class and colour."""
     order = np.argsort(plan)
     ties = np.flatnonzero(np.diff(plan[order]) == 0)
     ties = np.union1d(ties, ties + 1)
     tied = order[ties]
-    kind_and_colour = words[tied, 1].view(np.uint32)
-    keys = kind_and_colour >> BYTE_BITS, kind_and_colour & BYTE, words[tied, 0], plan[tied]
-    order[ties] = tied[np.lexsort(keys)]
+    same = records[tied]
+    order[ties] = tied[np.lexsort((*same["colour"].T, same["kind"], same["height"], plan[tied]))]
     return order
-
-
-@compiled()
-def _block_numbers(
-    east: Integers, north: Integers, edge: float, west: int, south: int, width: int
-) -> Integers:
-    """Return the row-major number of each point's block, from column ``west`` and row ``south``."""
-    numbers = np.empty(east.size, np.int64)
-    for i in range(east.size):
-        row = math.ceil(north[i] / edge) - 1 - south
-        numbers[i] = row * width + math.floor(east[i] / edge) - west
-    return numbers
-
-
-@compiled()
-def _relative(
-    words: Words, east: Integers, north: Integers, members: NDArray[np.intp], west: int, south: int
-) -> Words:
-    """Return some records, with plan coordinates from the corner of their block."""
-    part = np.empty((members.size, words.shape[1]), np.int32)
-    for k in range(members.size):
-        i = members[k]
-        part[k, 0], part[k, 1] = east[i] - west, north[i] - south
-        part[k, 2], part[k, 3] = words[i, 2], words[i, 3]
-    return part
-
-
-@compiled()
-def _inside(words: Words, west: int, south: int, east: int, north: int) -> tuple[Integers, Words]:
-    """Return the plan coordinates of the records in an area, as one number each, and their other words."""
-    count = 0
-    for i in range(words.shape[0]):
-        count += west <= words[i, 0] <= east and south <= words[i, 1] <= north
-    plan, rest = np.empty(count, np.int64), np.empty((count, 2), np.int32)
-    k = 0
-    for i in range(words.shape[0]):
-        x, y = words[i, 0], words[i, 1]
-        if west <= x <= east and south <= y <= north:
-            plan[k] = (np.int64(y) - south) << 32 | (np.int64(x) - west)
-            rest[k, 0], rest[k, 1] = words[i, 2], words[i, 3]
-            k += 1
-    return plan, rest
-
-
-@compiled()
-def _columns(
-    plan: Integers, words: Words, order: NDArray[np.intp], west: int, south: int, with_colours: bool
-) -> tuple[Floats, Floats, Floats, NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return eastings, northings and heights (m), classes and colours in an order."""
-    n = order.size
-    easting, northing, height = np.empty(n), np.empty(n), np.empty(n)
-    kind, colour = np.empty(n, np.uint8), np.empty((n if with_colours else 0, 3), np.uint8)
-    for k in range(n):
-        i = order[k]
-        # Division, not multiplication by 1e-4: whole centimetres are restored exactly.
-        easting[k] = ((plan[i] & 0xFFFFFFFF) + west) / PER_METRE
-        northing[k] = ((plan[i] >> 32) + south) / PER_METRE
-        height[k] = words[i, 0] / PER_METRE
-        kind[k] = words[i, 1] & 255
-        if with_colours:
-            for band in range(3):
-                colour[k, band] = words[i, 1] >> 8 * (band + 1) & 255
-    return easting, northing, height, kind, colour

@@ -7,38 +7,31 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import groupby
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, CatalogError
 from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
 from flexroad.catalog.scan.point_clouds import CHUNK, Chunk, Cloud, chunks, survey_dates
 from flexroad.catalog.to_metres import MetricTransform
-from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Floats
-from flexroad.tools.prepare.limits import check_extent
-from flexroad.tools.prepare.output import disk_errors
+from flexroad.tools.prepare.options import check_extent
+from flexroad.tools.prepare.output import disk_errors, on_failure
 from flexroad.tools.prepare.point_buckets import (
-    BYTE,
     PER_METRE,
     RECORD,
-    WORDS,
     BlockIndex,
     BlockPart,
     Integers,
     PointBuckets,
-    Words,
+    Records,
     append,
 )
 
 Dates = tuple[datetime, datetime]
 """When the first and the last point were measured."""
-SHIFT = 8
-"""Number of bits by which colours of 16 bits are moved to the right."""
+SHIFT, BYTE = 8, 255
+"""Number of bits by which colours of 16 bits are moved to the right, and the greatest colour of 8 bits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,26 +105,26 @@ def bucket_points(
 ) -> BucketedPoints:
     """Move the points of all files to metres and sort them into buckets, except noise and withheld points.
 
-    - `clouds`: the input files.
-    - `frame`: transforms their coordinates to metres.
     - `folder`: folder for the files of points; they take 16 bytes per point.
-    - `edge`: edge of a block (m).
     - `executor`: runs a worker call per million points.
-    - `log`: called with one line of progress per file.
     """
     parts: list[_Part] = []
     bounds: Bounds | None = None
-    for part in executor.map(_read, _jobs(clouds, frame, folder, edge, log), _fail):
+    fail = on_failure(lambda job: job.cloud.path)
+    for part in executor.map(_read, _jobs(clouds, frame, folder, edge, log), fail):
         parts.append(part)
         if part.block_parts:
-            plan = part.outermost / PER_METRE
-            check_extent(str(part.job.cloud.path), plan, bounds)
-            bounds = _joined(plan, bounds)
+            bounds = check_extent(str(part.job.cloud.path), part.outermost / PER_METRE, bounds)
     if bounds is None:
         raise CatalogError(f"{clouds[0].path} has only noise points; leave it out")
     parts.sort(key=lambda part: (part.job.file, part.job.points.start))
     of_files = [list(of_file) for _, of_file in groupby(parts, lambda part: part.job.file)]
-    for _ in executor.map(_read, [job for of_file in of_files for job in _otherwise_shifted(of_file)], _fail):
+    again = list[_Job]()
+    for of_file in of_files:
+        # Whether colours have 8 or 16 bits is decided by the first part of a file that has colours.
+        shift = next((part.shift for part in of_file if part.shift is not None), None)
+        again += [replace(part.job, shift=shift) for part in of_file if part.shift not in (None, shift)]
+    for _ in executor.map(_read, again, fail):
         pass
     dates = [_span(part.dates for part in of_file) for of_file in of_files]
     return BucketedPoints(
@@ -155,20 +148,6 @@ def _jobs(
         log(f"reading {cloud.path} ({number + 1} of {len(clouds)}, {cloud.points:,} points)")
         for points in cloud.parts(CHUNK):
             yield _Job(cloud, number, points, frame, edge, folder / f"{number}_{points.start}.points")
-
-
-def _otherwise_shifted(of_file: Sequence[_Part]) -> list[_Job]:
-    """Return the jobs to be repeated: whether colours have 8 or 16 bits is decided by the first of a file."""
-    shift = next((part.shift for part in of_file if part.shift is not None), None)
-    return [replace(part.job, shift=shift) for part in of_file if part.shift not in (None, shift)]
-
-
-def _joined(plan: Floats, bounds: Bounds | None) -> Bounds:
-    """Return the bounds of points, ``(2, n)``, and of those before."""
-    west, south, east, north = map(float, (*plan.min(axis=1), *plan.max(axis=1)))
-    if bounds is None:
-        return west, south, east, north
-    return min(west, bounds[0]), min(south, bounds[1]), max(east, bounds[2]), max(north, bounds[3])
 
 
 def _span(dates: Iterable[Dates | None]) -> Dates | None:
@@ -195,56 +174,22 @@ def _read(job: _Job) -> _Part:
         out_of_range += len(chunk.z) - len(records)
         if not len(records):
             continue
-        check_extent(str(path), plan / PER_METRE, None)
-        outermost = _outermost(np.concatenate([outermost, plan], axis=1))
+        check_extent(str(path), plan / PER_METRE)
+        points = np.concatenate([outermost, plan], axis=1)
+        outermost = points[:, [*points.argmin(axis=1), *points.argmax(axis=1)]]
         kinds += np.bincount(records["kind"], minlength=256)
         with disk_errors(job.target.parent.parent):
             block_parts += append(job.target, job.edge, plan[0], plan[1], records)
     return _Part(job, block_parts, outermost, kinds, out_of_range, _span(dates), shift)
 
 
-def _outermost(plan: Integers) -> Integers:
-    """Return the outermost points of some, ``(2, 4)``; see `_Part`."""
-    return plan[:, [plan[0].argmin(), plan[1].argmin(), plan[0].argmax(), plan[1].argmax()]]
-
-
-def _fail(job: _Job, reason: str) -> NoReturn:
-    raise ConfigError(f"{job.cloud.path}: {reason}; use fewer workers")
-
-
-def _records(chunk: Chunk, frame: MetricTransform, shift: int) -> tuple[Integers, NDArray[np.void]]:
+def _records(chunk: Chunk, frame: MetricTransform, shift: int) -> tuple[Integers, Records]:
     """Return eastings and northings in stored units, ``(2, n)``, and records with all other fields set."""
     metres = frame.metres(chunk.x, chunk.y, chunk.z)
-    colour = np.zeros((1, 3), np.uint16) if chunk.colour is None else chunk.colour
-    plan, words = _in_units(*metres, chunk.kind, colour, shift)
-    return plan, words.view(RECORD).reshape(-1)
-
-
-@compiled()
-def _in_units(
-    easting: Floats,
-    northing: Floats,
-    height: Floats,
-    kind: NDArray[np.uint8],
-    colour: NDArray[np.uint16],
-    shift: int,
-) -> tuple[Integers, Words]:
-    """Return plan coordinates, ``(2, n)``, and records of the points whose height is in range."""
-    count = 0
-    for i in range(height.size):
-        count += LOWEST_M <= height[i] <= HIGHEST_M
-    plan, words = np.empty((2, count), np.int64), np.zeros((count, WORDS), np.int32)
-    k = 0
-    for i in range(height.size):
-        if LOWEST_M <= height[i] <= HIGHEST_M:
-            plan[0, k] = np.rint(easting[i] * PER_METRE)
-            plan[1, k] = np.rint(northing[i] * PER_METRE)
-            words[k, 2] = np.rint(height[i] * PER_METRE)
-            word = np.uint32(kind[i])
-            if colour.shape[0] == height.size:
-                for band in range(3):
-                    shade = np.uint32(min(colour[i, band] >> shift, BYTE))
-                    word |= shade << np.uint32(8 * (band + 1))
-            words[k, 3] = np.int32(word)
-            k += 1
-    return plan, words
+    in_range = (metres[2] >= LOWEST_M) & (metres[2] <= HIGHEST_M)
+    east, north, height = (np.rint(axis[in_range] * PER_METRE).astype(np.int64) for axis in metres)
+    records = np.zeros(len(height), RECORD)
+    records["height"], records["kind"] = height, chunk.kind[in_range]
+    if chunk.colour is not None:
+        records["colour"] = np.minimum(chunk.colour[in_range] >> shift, BYTE)
+    return np.stack([east, north]), records

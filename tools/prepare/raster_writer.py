@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from itertools import compress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NoReturn, Self
+from typing import Any, Self
 
 import numpy as np
 import rasterio
@@ -37,12 +37,20 @@ from flexroad.catalog.tiling import cut
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, SerialExecutor
 from flexroad.tasks.types import Orthophoto
-from flexroad.tools.prepare.output import CATALOG, LAYER_TAG, NAMES, disk_errors, scratch_folder, write_error
+from flexroad.tools.prepare.output import (
+    CATALOG,
+    LAYER_TAG,
+    NAMES,
+    disk_errors,
+    on_failure,
+    scratch_folder,
+    write_error,
+)
 
 SERIAL = SerialExecutor()
 PHOTO = "dop"
-GROUND = "ground"
-"""Cells with ground points: an intermediate layer, not published."""
+UNFINISHED = ".tmp.tif"
+"""Ending of a layer's file until it is converted."""
 BLOCK = 256
 """Side of the internal tiles of the temporary GeoTIFFs (cells)."""
 HEIGHT_PROFILE = {"dtype": "float32", "nodata": np.nan, "count": 1}
@@ -70,25 +78,8 @@ class PreparedDataset:
 class RasterWriter:
     """Writer of the rasters of one area; a context manager that removes its temporary files.
 
-    Parameters
-    ----------
-    out : Path
-        Output folder; created if it does not exist.
-    grid : Grid
-        All cells of the area.
-    dop_cell : float, optional
-        Pixel of the orthophoto (m), None if there is no orthophoto.
-    tags : Mapping[str, str]
-        TIFF tags of every file: its source and its processing.
-    vertical : str, optional
-        Vertical CRS of the heights, in metres, if it is known.
-
-    Raises
-    ------
-    ConfigError
-        If the folder cannot be written.
-    CatalogError
-        If a metre of the CRS is none on the ground.
+    - `dop_cell`: pixel of the orthophoto (m); None if there is no orthophoto.
+    - `vertical`: vertical CRS of the heights, in metres, if it is known.
     """
 
     def __init__(
@@ -135,7 +126,10 @@ class RasterWriter:
         """
         heights = layer in HEIGHTS
         with self._writing(layer):
-            raster = self._raster(layer, self.grid, _profile(layer))
+            profile = HEIGHT_PROFILE if heights else MASK_PROFILE
+            if layer == "road_height":
+                profile = ROAD_HEIGHT_PROFILE
+            raster = self._raster(layer, self.grid, profile)
             cells = values.astype(np.float32 if heights else np.uint8)
             bands = cells if cells.ndim > 2 else cells[None]
             raster.write(bands, window=_window(self.grid, part))
@@ -183,16 +177,19 @@ class RasterWriter:
         for layer in names:
             with self._writing(layer):
                 self._open[layer].close()
-        jobs = [_CogJob(self.scratch / f"{layer}.tmp.tif", layer, self.out) for layer in names]
         # The largest layers first, so that no worker has one of them at the end.
-        jobs.sort(key=lambda job: -job.source.stat().st_size)
-        for job in executor.map(_to_cog, jobs, _fail):
-            job.source.unlink()
+        files = sorted((self._file(layer) for layer in names), key=lambda file: -file.stat().st_size)
+        for file in executor.map(_to_cog, files, on_failure(_published)):
+            file.unlink()
         survey = zoned(date or assumed or datetime.now(UTC))
         tiles, notes = self._tiles(names, tile_size_m, survey, dataset, min_cover)
         tiles = tuple(replace(tile, datetime_assumed=date is None) for tile in tiles)
         tiles, far = with_roads(tiles, self._roads, None)
-        self._replace(names)
+        # A catalog must only exist beside complete rasters: removed first, written last.
+        for name in NAMES:
+            output_file(self.out / name).unlink(missing_ok=True)
+        for layer in names:
+            (self.scratch / f"{layer}.tif").replace(output_file(self.out / f"{layer}.tif"))
         Catalog(tiles).write(self.out / CATALOG)
         undated = (
             f"the date of the survey is not known: {survey:%Y-%m-%d}, when its files were written, is used "
@@ -200,13 +197,6 @@ class RasterWriter:
         )
         notes = (*self._notes, *notes, *lines(far), *([undated] if date is None else []))
         return PreparedDataset(self.out / CATALOG, len(tiles), notes)
-
-    def _replace(self, names: list[str]) -> None:
-        # A catalog must only exist beside complete rasters: removed first, written last.
-        for name in NAMES:
-            output_file(self.out / name).unlink(missing_ok=True)
-        for layer in names:
-            (self.scratch / f"{layer}.tif").replace(output_file(self.out / f"{layer}.tif"))
 
     def _tiles(
         self, names: list[str], size_m: float, date: datetime, dataset: str, min_cover: float
@@ -246,7 +236,7 @@ class RasterWriter:
     def _raster(self, layer: str, grid: Grid, profile: Mapping[str, Any]) -> Any:
         if layer not in self._open:
             raster = rasterio.open(
-                self.scratch / f"{layer}.tmp.tif",
+                self._file(layer),
                 "w+",
                 driver="GTiff",
                 crs=self._crs_of_heights if layer in HEIGHTS else grid.crs,
@@ -265,6 +255,9 @@ class RasterWriter:
             self._open[layer] = raster
         return self._open[layer]
 
+    def _file(self, layer: str) -> Path:
+        return self.scratch / f"{layer}{UNFINISHED}"
+
     def _writing(self, layer: str) -> contextlib.AbstractContextManager[None]:
         return _raster_errors(self.out / f"{layer}.tif")
 
@@ -280,42 +273,29 @@ def _raster_errors(where: Path) -> Iterator[None]:
         raise write_error(where, error) from error
 
 
-def _profile(layer: str) -> Mapping[str, Any]:
-    if layer == "road_height":
-        return ROAD_HEIGHT_PROFILE
-    return HEIGHT_PROFILE if layer in HEIGHTS else MASK_PROFILE
-
-
-@dataclass(frozen=True)
-class _CogJob:
-    """The input of a worker call that converts a layer."""
-
-    source: Path
-    layer: str
-    out: Path
-    """Output folder, for messages."""
-
-
-def _to_cog(job: _CogJob) -> _CogJob:
-    smooth = job.layer in HEIGHTS or job.layer == PHOTO
-    with _raster_errors(job.out / f"{job.layer}.tif"):
+def _to_cog(source: Path) -> Path:
+    """Convert a layer to a COG beside it; return the layer's file."""
+    layer = source.name.removesuffix(UNFINISHED)
+    smooth = layer in HEIGHTS or layer == PHOTO
+    with _raster_errors(_published(source)):
         rasterio.shutil.copy(
-            job.source,
-            job.source.parent / f"{job.layer}.tif",
+            source,
+            source.with_name(f"{layer}.tif"),
             driver="COG",
             compress="deflate",
             # The default, 6, takes 1.4 times as long; the files are 2% smaller.
             level=1,
-            predictor="floating_point" if job.layer in HEIGHTS else "standard",
+            predictor="floating_point" if layer in HEIGHTS else "standard",
             overview_resampling="average" if smooth else "mode",
             statistics="yes",
             bigtiff="if_safer",
         )
-    return job
+    return source
 
 
-def _fail(job: _CogJob, reason: str) -> NoReturn:
-    raise ConfigError(f"{job.out / job.layer}.tif: {reason}; use fewer workers")
+def _published(source: Path) -> Path:
+    """Return where a layer is published, by its file in the temporary folder."""
+    return source.parents[1] / f"{source.name.removesuffix(UNFINISHED)}.tif"
 
 
 def _window(whole: Grid, part: Grid) -> Window:

@@ -31,7 +31,7 @@ from flexroad.tasks.io.vectors import ENCODING, has_place
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import Bools
 from flexroad.tools.prepare.mesh.read import read_mesh
-from flexroad.tools.prepare.mesh.sample import covered_cells, in_metres
+from flexroad.tools.prepare.mesh.sample import in_metres, project_down
 from flexroad.tools.prepare.options import PrepareOptions
 from flexroad.tools.prepare.raster_writer import RasterWriter
 
@@ -71,7 +71,14 @@ def add_roads(writer: RasterWriter, common: PrepareOptions) -> bool:
         writer.write("road_mask", writer.grid, mask)
     vectors = _vectors(common.roads, common.roads_layer)
     if vectors is not None:
-        writer.attach_roads(vectors, *notes, *([] if mask is not None else [_lines_note(common)]))
+        if mask is None:
+            # The catalog has the layer.
+            chosen = f", where: {json.dumps(common.roads_where)}" if common.roads_where else ""
+            notes.append(
+                f"{common.roads} has lines, so no road mask is made; run with a configuration that has "
+                f"segment: {{method: vector{chosen}}}"
+            )
+        writer.attach_roads(vectors, *notes)
     return mask is not None
 
 
@@ -81,15 +88,6 @@ def _vectors(path: Path, layer: str | None) -> VectorFile | None:
         return opened(path, None, layer)
     except CatalogError:
         return None
-
-
-def _lines_note(common: PrepareOptions) -> str:
-    # The catalog has the layer.
-    chosen = f", where: {json.dumps(common.roads_where)}" if common.roads_where else ""
-    return (
-        f"{common.roads} has lines, so no road mask is made; run with a configuration that has "
-        f"segment: {{method: vector{chosen}}}"
-    )
 
 
 def burn(
@@ -102,9 +100,7 @@ def burn(
     """Return the cells whose centre is road, ``(H, W)``, or None if the roads are lines.
 
     - `path`: polygons in any format GDAL reads; a raster that is not 0 on roads; or a mesh of the roads.
-    - `layer`: layer of a vector file; required if it has several.
     - `where`: SQL condition that selects features: ``class = 'road'``.
-    - `grid`: the cells.
     - `notify`: receives one line about text in another encoding than declared.
     """
     mask = _mesh(path, grid) if path.suffix.lower() in MESHES else _raster(path, grid)
@@ -127,7 +123,8 @@ def _no_overlap(path: Path, grid: Grid) -> ConfigError:
 
 def _mesh(path: Path, grid: Grid) -> Bools:
     mesh = read_mesh(path, colours=False)
-    return covered_cells(in_metres(mesh, MetricTransform.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)
+    mesh = in_metres(mesh, MetricTransform.of(mesh.crs, mesh.bounds[:2], grid.crs))
+    return project_down(mesh, grid)[1] >= 0
 
 
 def _is_raster(path: Path) -> bool:

@@ -37,7 +37,6 @@ def write_report(
 ) -> Location:
     """Write RUN/report.<form> and return its path.
 
-    - `track`: shows the progress of each step.
     - `viewer`: folder of `flexroad view`, to which an HTML report links; by default RUN/viewer if there is
       one.
     - `compared`: another run over the same tiles, with which an HTML report compares the figures; by default

@@ -60,7 +60,6 @@ def draw(
     - `colours`: red, green and blue at the vertices, ``(V, 3)``; by default road and terrain have one colour
       each.
     - `within`: west, south, east and north of the part to draw, in the vertices' coordinates (m).
-    - `size_px`: width and height of the picture.
     """
     whole = pv.PolyData.from_regular_faces(vertices * [1, 1, EXAGGERATION], faces)
     # Normals are computed on the complete mesh, so that there is no seam between road and terrain.

@@ -52,9 +52,7 @@ def tile_pictures(
 ) -> list[TilePictures]:
     """Draw the exported variant of every tile, or of a large run that of the worst tiles.
 
-    - `content`: its tables.
     - `first`: ids of finished tiles that are drawn in any case, and come first.
-    - `track`: shows the progress.
     """
     variant = run.config.export.variants[0]
     tile_ids = list(dict.fromkeys([*first, *_shown(content)]))
@@ -81,7 +79,7 @@ def _shown(content: Content) -> list[str]:
     return list(dict.fromkeys([*content.worst_estimates["tile"], *content.worst["tile"]]))
 
 
-def webp(picture: bytes, width_px: int | None = None, quality: int = QUALITY) -> bytes:
+def webp(picture: bytes, width_px: int | None = None) -> bytes:
     """Return a picture as WebP, smaller if it is wider than ``width_px``."""
     image = Image.open(io.BytesIO(picture)).convert("RGB")
     if width_px is not None and image.width > width_px:
@@ -89,7 +87,7 @@ def webp(picture: bytes, width_px: int | None = None, quality: int = QUALITY) ->
             (width_px, round(image.height * width_px / image.width)), Image.Resampling.LANCZOS
         )
     buffer = io.BytesIO()
-    image.save(buffer, "webp", quality=quality, method=6)
+    image.save(buffer, "webp", quality=QUALITY, method=6)
     return buffer.getvalue()
 
 
@@ -135,11 +133,9 @@ def render_meshes(
 ) -> dict[str, bytes | None]:
     """Draw oblique views of meshes from the south, all in one child process.
 
-    - `meshes`: meshes by name.
     - `colours`: red, green and blue at the vertices of each mesh, ``(V, 3)``; by default road and terrain
       have one colour each.
     - `within`: the part to draw (m, in the meshes' CRS); by default the complete mesh.
-    - `size_px`: width and height of a picture.
     - result: a PNG by name, or None if it could not be drawn; the reason is logged as a warning. Heights are
       exaggerated by the factor given in the picture.
     """

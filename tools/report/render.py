@@ -1,7 +1,7 @@
 """Pictures for reports, as PNG bytes 480 pixels wide: maps of one tile, and line charts.
 
-Maps have north up and metres on the axes. Their ``grid`` says where the cells lie; their ``title`` stands
-above the map. Pictures of meshes are in `pictures`.
+Maps have north up and metres on the axes. Their ``grid`` says where the cells lie. Pictures of meshes are in
+`pictures`.
 """
 
 from __future__ import annotations
@@ -58,34 +58,26 @@ NEAR, LINE = 0.3, 0.04
 """Distance across which labels may overlap, and that of their lines, as shares of the width of the map."""
 
 
-def hillshade(height: Floats, grid: Grid, title: str = "", road: Bools | None = None) -> bytes:
-    """Draw heights as a shaded relief with a colour bar.
-
-    - `height`: heights (m), ``(H, W)``; NaN stays empty.
-    - `road`: road cells, drawn over the relief.
-    """
+def hillshade(height: Floats, grid: Grid) -> bytes:
+    """Draw heights (m), ``(H, W)``, as a shaded relief with a colour bar; NaN stays empty."""
     low, high = _limits(height)
     norm = Normalize(low, high)
     rgb = _shaded(RELIEF(norm(height))[..., :3], height, grid.cell)
-    if road is not None:
-        rgb = _laid_over(rgb, road, ROAD, 0.55)
-    figure, axes = _map(rgb, grid, title)
+    figure, axes = _map(rgb, grid)
     _colour_bar(figure, axes, RELIEF, norm, "height (m)")
     return _png(figure)
 
 
-def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: str = "") -> bytes:
+def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid) -> bytes:
     """Draw the kept and the dropped part of a road mask over the relief; the legend gives both areas.
 
     - `height`: the DSM (m), ``(H, W)``.
     - `raw`, `kept`: road before and after the filter (the paper's M^r and M^{r+}), ``(H, W)``.
     """
-    return _parts_picture(height, (("kept", kept, KEPT), ("dropped", raw & ~kept, DROPPED)), grid, title)
+    return _parts_picture(height, (("kept", kept, KEPT), ("dropped", raw & ~kept, DROPPED)), grid)
 
 
-def support_picture(
-    height: Floats, support: NDArray[np.uint8], road: Bools, grid: Grid, title: str = ""
-) -> bytes:
+def support_picture(height: Floats, support: NDArray[np.uint8], road: Bools, grid: Grid) -> bytes:
     """Draw the support of the surface on road cells over the relief; the legend gives the areas.
 
     - `height`: the DSM (m), ``(H, W)``.
@@ -95,16 +87,16 @@ def support_picture(
     kinds = (Support.MEASURED, KEPT), (Support.DTM, BY_DTM), (Support.INFERRED, DROPPED)
     names = {Support.MEASURED: "measured", Support.DTM: "DTM", Support.INFERRED: "inferred"}
     parts = [(names[kind], road & (support == kind), colour) for kind, colour in kinds]
-    return _parts_picture(height, parts, grid, title)
+    return _parts_picture(height, parts, grid)
 
 
-def _parts_picture(height: Floats, parts: Sequence[tuple[str, Bools, str]], grid: Grid, title: str) -> bytes:
+def _parts_picture(height: Floats, parts: Sequence[tuple[str, Bools, str]], grid: Grid) -> bytes:
     """Draw areas (name, cells, colour) over a grey relief, with a legend."""
     grey = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*height.shape, 3))
     rgb = _shaded(grey, height, grid.cell)
     for _, mask, colour in parts:
         rgb = _laid_over(rgb, mask, colour, OVERLAY)
-    figure, axes = _map(rgb, grid, title)
+    figure, axes = _map(rgb, grid)
     entries = [
         Patch(color=colour, alpha=OVERLAY, label=f"{name}\n{mask.sum() * grid.cell**2:,.0f} m²")
         for name, mask, colour in parts
@@ -123,9 +115,7 @@ def _parts_picture(height: Floats, parts: Sequence[tuple[str, Bools, str]], grid
     return _png(figure)
 
 
-def error_map(
-    error: Floats, grid: Grid, title: str = "", road: Bools | None = None, limit_m: float | None = None
-) -> bytes:
+def error_map(error: Floats, grid: Grid, road: Bools | None = None, limit_m: float | None = None) -> bytes:
     """Draw signed vertical errors: red is too high, blue too low, arrows say that some exceed the limit.
 
     - `error`: mesh or surface minus reference (m), ``(H, W)``; NaN stays empty.
@@ -134,7 +124,7 @@ def error_map(
       error, rounded up to 1, 2 or 5 times a power of ten; set it to compare pictures.
     """
     limit = limit_m if limit_m is not None else _round_limit(error)
-    figure, axes = _map(error, grid, title, "RdBu_r", Normalize(-limit, limit))
+    figure, axes = _map(error, grid, "RdBu_r", Normalize(-limit, limit))
     if road is not None:
         _outline(axes, road, grid, "#222222", 0.6)
     beyond = bool(np.nanmax(np.abs(error), initial=0.0) > limit)
@@ -143,15 +133,13 @@ def error_map(
     return _png(figure)
 
 
-def segmentation_map(
-    photo: NDArray[np.uint8], truth: Bools, segmented: Bools, grid: Grid, title: str = ""
-) -> bytes:
+def segmentation_map(photo: NDArray[np.uint8], truth: Bools, segmented: Bools, grid: Grid) -> bytes:
     """Draw the outlines of labelled and segmented road over an orthophoto.
 
     - `photo`: an orthophoto of the grid (red, green, blue), ``(3, h, w)``.
     - `truth`, `segmented`: road by the labels and by the segmenter, ``(H, W)``.
     """
-    figure, axes = _map(np.moveaxis(photo, 0, -1) / 255, grid, title)
+    figure, axes = _map(np.moveaxis(photo, 0, -1) / 255, grid)
     # The first line is wider, so that it is visible below the second where both agree.
     parts = (("labels", truth, TRUE, 2.4), ("segmented", segmented, DROPPED, 0.9))
     for _, mask, colour, width in parts:
@@ -172,9 +160,6 @@ def curves(
     """Draw lines in one chart.
 
     - `lines`: the x and y values of each line by name, ``(n,)`` each.
-    - `labels`: labels of the x and the y axis.
-    - `limits`: limits of the x and the y axis.
-    - `mark`: x, y and name of a point to mark.
     """
     figure = Figure(figsize=(WIDTH_PX / DPI, 3.4), dpi=DPI, layout="constrained")
     axes = figure.add_subplot()
@@ -229,12 +214,12 @@ def _laid_over(rgb: Floats, mask: Bools, colour: str, opacity: float) -> Floats:
 
 
 def _map(
-    values: Floats, grid: Grid, title: str, colours: str | None = None, norm: Normalize | None = None
+    values: Floats, grid: Grid, colours: str | None = None, norm: Normalize | None = None
 ) -> tuple[Figure, Axes]:
     """Return a figure with a map of colours or numbers; axes in metres from the tile's south-west corner."""
     scale = min(MAP_PX / grid.width, 2 * MAP_PX / grid.height)
     width, height = max(scale * grid.width, 60), max(scale * grid.height, 60)
-    size = WIDTH_PX, BELOW_PX + height + (24 if title else 8)
+    size = WIDTH_PX, BELOW_PX + height + 8
     figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI)
     axes = figure.add_axes((LEFT_PX / size[0], BELOW_PX / size[1], width / size[0], height / size[1]))
     axes.set_facecolor(UNKNOWN)
@@ -243,7 +228,6 @@ def _map(
     axes.set_xlabel(f"m east of {grid.west:,.10g}", fontsize=8)
     axes.set_ylabel(f"m north of {grid.south:,.10g}", fontsize=8)
     axes.tick_params(labelsize=7, length=2)
-    axes.set_title(title, fontsize=9)
     return figure, axes
 
 
@@ -296,23 +280,21 @@ def _encoded(picture: Image.Image) -> bytes:
 
 
 def estimate_picture(
-    height: Floats, estimate: Floats, road: Bools, grid: Grid, places: Mapping[str, Place], title: str = ""
+    height: Floats, estimate: Floats, road: Bools, grid: Grid, places: Mapping[str, Place]
 ) -> bytes:
     """Draw the error estimate of the road over the relief.
 
     - `height`: the DSM (m), ``(H, W)``.
     - `estimate`: estimated error of the surface (m), ``(H, W)``.
     - `road`: road cells before the filter, ``(H, W)``.
-    - `grid`: where the cells lie.
     - `places`: place by flag; each has a circle, with the names of its flags.
-    - `title`: what is drawn, above the map.
     """
     norm = Normalize(0, LIMIT_M, clip=True)
     grey = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*height.shape, 3))
     relief = _shaded(grey, height, grid.cell)
     coloured = colormaps[COLOURS](norm(np.nan_to_num(estimate)))[..., :3]
     rgb = np.where((road & np.isfinite(estimate))[..., None], coloured, relief)
-    figure, axes = _map(rgb, grid, title)
+    figure, axes = _map(rgb, grid)
     _circles(axes, grid, places)
     _colour_bar(figure, axes, COLOURS, norm, "error estimate (m)", "max")
     return _png(figure)

@@ -72,7 +72,6 @@ def edge_steps(
     - `run`: the run; pairs whose surfaces are not in its store are left out.
     - `results`: the results of all finished tiles; by default the tiles to be compared are checked.
     - `most`: largest number of tiles compared with their neighbours.
-    - `track`: shows the progress.
     """
     tiles = run.catalog.usable
     every = math.ceil(len(tiles) / most)
@@ -150,7 +149,10 @@ def _step(
     grid: Grid, other: Grid, a: Surface, road: RoadMask, b: Surface
 ) -> tuple[float, float, float, float]:
     """Return mean and largest step, mean step on roads (m), and largest angle of the normals (degrees)."""
-    east, north = _shared_edge(grid, other)
+    if other.west > grid.west + grid.cell:
+        east, north = np.full(grid.height, grid.east), grid.northings
+    else:
+        east, north = grid.eastings, np.full(grid.width, grid.north)
     cells = road.grid.cells(east, north)
     inside = ~road.outside[cells]
     step = np.abs(a.height(east, north) - b.height(east, north))
@@ -173,10 +175,3 @@ def _mean(values: Floats) -> float:
 def _largest(values: Floats) -> float:
     values = values[np.isfinite(values)]
     return float(values.max()) if values.size else math.nan
-
-
-def _shared_edge(grid: Grid, other: Grid) -> tuple[Floats, Floats]:
-    """Return eastings and northings of points along the shared edge, one per cell."""
-    if other.west > grid.west + grid.cell:
-        return np.full(grid.height, grid.east), grid.northings
-    return grid.eastings, np.full(grid.width, grid.north)

@@ -1,4 +1,8 @@
-"""The test of the paper's claims on a run."""
+"""The test of the paper's claims on a run, and the bootstrap confidence intervals that it takes.
+
+Tiles are drawn with replacement, the same tiles for every variant, so that intervals of differences and
+ratios between variants use the pairing (Efron & Tibshirani, An Introduction to the Bootstrap, 1993).
+"""
 
 from __future__ import annotations
 
@@ -7,15 +11,75 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 
 from flexroad.tasks.types import Floats
-from flexroad.tools.reproduce.bootstrap import LEVEL, Means, interval
 from flexroad.tools.reproduce.published import GEROD, Claim, T, published
 
 HELD, WEAKER, STRONGER, NOT_HELD = "held", "weaker", "stronger", "not held"
 NOT_DECIDED, NOT_TESTED = "not decided", "not tested"
 REACH = 2.0
 """A change is stronger if its log ratio is more than `REACH` times the paper's, weaker below 1 / `REACH`."""
+RESAMPLES = 2000
+SEED = 0
+LEVEL = 95
+"""Confidence level of the intervals (percent)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Means:
+    """Means over tiles and over resampled tiles."""
+
+    mean: dict[tuple[str, str], float]
+    """By (variant, figure); NaN if no tile has the figure."""
+    resampled: dict[tuple[str, str], Floats]
+    """Means of the resamples by (variant, figure), ``(RESAMPLES,)``."""
+
+    @property
+    def variants(self) -> frozenset[str]:
+        """Names of the variants."""
+        return frozenset(variant for variant, _ in self.mean)
+
+    def interval(self, variant: str, figure: str) -> tuple[float, float]:
+        """Return the percentile interval of a mean."""
+        return interval(self.resampled[variant, figure])
+
+    def ratio(self, variant: str, base: str, figure: str) -> tuple[float, Floats]:
+        """Return the ratio of two variants' means and its resamples; NaN or infinite if `base` is 0."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mean_ratio = np.divide(self.mean[variant, figure], self.mean[base, figure])
+            return float(mean_ratio), self.resampled[variant, figure] / self.resampled[base, figure]
+
+
+def interval(values: Floats) -> tuple[float, float]:
+    """Return the percentile interval of resampled values; NaN if none is finite."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return float("nan"), float("nan")
+    tail = (100 - LEVEL) / 2
+    low, high = np.percentile(finite, [tail, 100 - tail])
+    return float(low), float(high)
+
+
+def bootstrap(figures: pd.DataFrame) -> Means:
+    """Average the figures over the tiles and over resamples of the tiles.
+
+    - `figures`: one row per ``(tile_id, variant)``, every tile with every variant. NaN figures (a tile
+      without road) are left out of the mean.
+    """
+    table = figures.reset_index().pivot(index="tile_id", columns="variant", values=list(figures))
+    values = table.to_numpy(dtype=np.float64)
+    valid = np.isfinite(values)
+    # How often each resample contains each tile.
+    draws = np.random.default_rng(SEED).multinomial(
+        len(values), np.full(len(values), 1 / len(values)), size=RESAMPLES
+    )
+    draws = draws.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        means = np.where(valid, values, 0).sum(axis=0) / valid.sum(axis=0)
+        resampled = (draws @ np.where(valid, values, 0)) / (draws @ valid)
+    names = [(str(pair[1]), str(pair[0])) for pair in table.columns.to_list()]
+    return Means(dict(zip(names, means.tolist(), strict=True)), dict(zip(names, resampled.T, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -40,8 +104,6 @@ def check(claim: Claim, means: Means, dataset: str = GEROD) -> Verdict:
     weaker, above it stronger. Whatever the verdict, it is "not decided" if fewer than `LEVEL` percent of the
     resamples give it.
 
-    - `claim`: a claim of the paper.
-    - `means`: means of the run.
     - `dataset`: the paper's dataset that the run is compared with; claims about other datasets are not
       tested.
     """

@@ -10,15 +10,18 @@ import pandas as pd
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tools.report.content import FIGURES
-from flexroad.tools.reproduce.bootstrap import LEVEL, RESAMPLES, Means, bootstrap
 from flexroad.tools.reproduce.claims import (
     HELD,
+    LEVEL,
     NOT_DECIDED,
     NOT_HELD,
     NOT_TESTED,
+    RESAMPLES,
     STRONGER,
     WEAKER,
+    Means,
     Verdict,
+    bootstrap,
     check,
     percent,
 )
@@ -99,7 +102,7 @@ def compare(data: MetricsData) -> Comparison:
     claims = verdicts_table({MASKS[classes]: results for classes, results in verdicts.items()})
     sections = [
         *(section for name, rows in tables.items() for section in side_by_side(name, rows, ours)),
-        *(_changes(tables["Table II"], head) if BASE in head.variants and "Table II" in tables else []),
+        *(_relative(tables["Table II"], head) if BASE in head.variants and "Table II" in tables else []),
         *(literal_sections(tables.get("Table II", ()), data)),
         *road_sections(_union(tables), head, data),
         Section("The paper's claims", claims),
@@ -155,12 +158,7 @@ def _union(tables: dict[str, tuple[Row, ...]]) -> tuple[Row, ...]:
     return tuple({row.variant: row for rows in tables.values() for row in rows}.values())
 
 
-def _changes(rows: tuple[Row, ...], means: Means) -> Iterator[Section]:
-    yield _relative(rows, means)
-    yield from score_sections(rows, means)
-
-
-def _relative(rows: tuple[Row, ...], means: Means) -> Section:
+def _relative(rows: tuple[Row, ...], means: Means) -> Iterator[Section]:
     base = next(row for row in rows if row.variant == BASE)
     others = [row for row in rows if row is not base]
     table = pd.DataFrame({"variant": [row.label for row in others]})
@@ -171,7 +169,8 @@ def _relative(rows: tuple[Row, ...], means: Means) -> Section:
         table[f"{label_without_unit(figure)}, ours"] = [
             percent(means.ratio(row.variant, BASE, figure)[0]) for row in others
         ]
-    return Section("Table II: changes from the full pipeline", table)
+    yield Section("Table II: changes from the full pipeline", table)
+    yield from score_sections(rows, means)
 
 
 def _other_masks(rows: tuple[Row, ...], means: dict[str, Means]) -> Iterator[Section]:

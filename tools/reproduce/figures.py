@@ -24,7 +24,6 @@ from flexroad.tools.reproduce.layout import FLEXROAD, PATH, STRATA, STYLE, TRUTH
 from flexroad.tools.reproduce.metrics_data import collect
 from flexroad.tools.reproduce.tile_view import (
     Roles,
-    TileView,
     changes,
     read_tile_view,
     roles_of,
@@ -45,7 +44,6 @@ def write_figures(
 ) -> list[str]:
     """Draw every figure whose variants are in the run, and write ``figures.md`` with the captions.
 
-    - `run`: a run with finished tiles.
     - `folder`: folder for NAME.pdf, NAME.png, NAME.webp and figures.md.
     - `tile_id`: the tile of the maps, renders and profile; by default the tile with the median road L2.
     - `roles`: which variant is which method; by default derived from the variants' options.
@@ -57,25 +55,20 @@ def write_figures(
     # As in the tables: only tiles with every variant.
     done = rows[rows.tile_id.isin(data.tiles.index[data.tiles.complete])]
     with rc_context(STYLE):
-        files = _figure_files(
-            run, roles, read_tile_view(run, tile_id or typical_tile(done, roles.full), roles), done
-        )
+        view = read_tile_view(run, tile_id or typical_tile(done, roles.full), roles)
+        files = [
+            tile_figures.road_profile(view, roles),
+            tile_figures.error_maps(view, roles),
+            tile_figures.ablation_renders(view, roles),
+            trade_off(run.config, roles.full, done),
+            dataset(statistics(run, roles.full, done)),
+        ]
         missing = [f"no figure {file.name}: {file.missing}" for file in files if file.figure is None]
         for file in files:
             if file.figure is not None:
                 save(file.figure, folder, file.name)
     write(folder / "figures.md", _page(data.line, files).encode())
     return missing
-
-
-def _figure_files(run: Run, roles: Roles, view: TileView, done: pd.DataFrame) -> list[FigureFile]:
-    return [
-        tile_figures.road_profile(view, roles),
-        tile_figures.error_maps(view, roles),
-        tile_figures.ablation_renders(view, roles),
-        trade_off(run.config, roles.full, done),
-        dataset(statistics(run, roles.full, done)),
-    ]
 
 
 def _page(data: str, files: list[FigureFile]) -> str:
@@ -205,7 +198,9 @@ def draw_dataset(table: pd.DataFrame) -> Figure:
     """Draw a table as returned by `statistics`."""
     figure = new_figure(2.1)
     bars, roads, heights = figure.subplots(1, 3, width_ratios=[1, 1.5, 1.5])
-    groups = _groups(table)
+    named = {str(name): part for name, part in table.groupby("stratum")}
+    order = [*STRATA, *sorted(set(named) - set(STRATA))]
+    groups = {name or "tiles": named[name] for name in order if name in named}
     rectangles = bars.bar(
         list(groups), [len(part) for part in groups.values()], color=[_colour(name) for name in groups]
     )
@@ -217,12 +212,6 @@ def draw_dataset(table: pd.DataFrame) -> Figure:
     if len(groups) > 1:
         roads.legend(loc="upper right", handlelength=1)
     return figure
-
-
-def _groups(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    named = {str(name): part for name, part in table.groupby("stratum")}
-    order = [*STRATA, *sorted(set(named) - set(STRATA))]
-    return {name or "tiles": named[name] for name in order if name in named}
 
 
 def _colour(name: str) -> str:

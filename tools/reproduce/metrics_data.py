@@ -13,7 +13,7 @@ from flexroad.catalog.storage.paths import Location, write
 from flexroad.catalog.text import count, printable
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.store.tables import frame_of, read_metrics
+from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tools.report.content import FIGURES
 
 FILE, DSC3D_FILE = "metrics.parquet", "metrics_dsc3d.parquet"
@@ -115,10 +115,7 @@ def collect(
             f"{run.path} and {true.path} both class by the {first.classes.iloc[0]} mask; "
             "--true needs a run with evaluate.classes: reference"
         )
-    if _tile_variants(first) != _tile_variants(second) or {*first.dataset} != {*second.dataset}:
-        raise ConfigError(
-            f"{true.path} has other data, tiles or variants than {run.path}; run both over the same catalog"
-        )
+    _check_same(run, first, true, second)
     return _checked(pd.concat([first, second], ignore_index=True), run.path, scenes, column, other)
 
 
@@ -135,11 +132,15 @@ def _checked_dsm(dsm: Run, run: Run, first: pd.DataFrame) -> MetricsData:
     if any(chain["evaluate"].truth != "dsm" for chain in dsm.config.chains.values()):
         raise ConfigError(f"{dsm.path} is not measured against the DSM; --dsm needs --config ablation_dsm")
     rows = _rows(dsm)
-    if _tile_variants(first) != _tile_variants(rows) or {*first.dataset} != {*rows.dataset}:
-        raise ConfigError(
-            f"{dsm.path} has other data, tiles or variants than {run.path}; run both over the same catalog"
-        )
+    _check_same(run, first, dsm, rows)
     return _checked(rows, dsm.path)
+
+
+def _check_same(run: Run, first: pd.DataFrame, other: Run, second: pd.DataFrame) -> None:
+    if _tile_variants(first) != _tile_variants(second) or {*first.dataset} != {*second.dataset}:
+        raise ConfigError(
+            f"{other.path} has other data, tiles or variants than {run.path}; run both over the same catalog"
+        )
 
 
 def _check_twins(run: Run, true: Run, first: pd.DataFrame, second: pd.DataFrame) -> None:
@@ -160,33 +161,18 @@ def _tile_variants(rows: pd.DataFrame) -> set[tuple[str, str]]:
 
 
 def write_metrics_data(data: MetricsData, folder: Path) -> None:
-    """Write the figures, those for DSC3D to a separate file if there are any."""
-    write(folder / FILE, _parquet(data.rows))
-    if data.dsc3d:
-        rows = pd.concat([scenes.rows for scenes in data.dsc3d], ignore_index=True)
-        write(folder / DSC3D_FILE, _parquet(rows))
-    else:
-        (folder / DSC3D_FILE).unlink(missing_ok=True)
-    if data.literal:
-        write(folder / LITERAL_FILE, _parquet(data.literal.rows))
-    else:
-        (folder / LITERAL_FILE).unlink(missing_ok=True)
-    if data.dsm:
-        write(folder / DSM_FILE, _parquet(data.dsm.rows))
-    else:
-        (folder / DSM_FILE).unlink(missing_ok=True)
-
-
-def read_metrics_data(folder: Path) -> MetricsData:
-    """Read the files of `write_metrics_data`."""
-    dsc3d = _read(folder / DSC3D_FILE) if (folder / DSC3D_FILE).exists() else pd.DataFrame({"dataset": []})
-    parts = [rows for _, rows in dsc3d.groupby("dataset", sort=False)]
-    literal, dsm = (
-        MetricsData(_read(folder / name)) if (folder / name).exists() else None
-        for name in (LITERAL_FILE, DSM_FILE)
-    )
-    scenes = tuple(MetricsData(rows.reset_index(drop=True)) for rows in parts)
-    return MetricsData(_read(folder / FILE), scenes, literal, dsm)
+    """Write the figures, those of each kind of runs to a file of its own; files without figures go."""
+    kinds = {
+        FILE: (data,),
+        DSC3D_FILE: data.dsc3d,
+        LITERAL_FILE: (data.literal,) if data.literal else (),
+        DSM_FILE: (data.dsm,) if data.dsm else (),
+    }
+    for name, runs in kinds.items():
+        if runs:
+            write(folder / name, _parquet(pd.concat([run.rows for run in runs], ignore_index=True)))
+        else:
+            (folder / name).unlink(missing_ok=True)
 
 
 def _parquet(rows: pd.DataFrame) -> bytes:
@@ -194,10 +180,6 @@ def _parquet(rows: pd.DataFrame) -> bytes:
     table = rows.astype(dict.fromkeys(KEYS, "category") | dict.fromkeys(FIGURES, FIGURE_DTYPE))
     table.to_parquet(buffer, index=False, compression="zstd")
     return buffer.getvalue()
-
-
-def _read(path: Path) -> pd.DataFrame:
-    return frame_of(path.read_bytes()).astype(dict.fromkeys(KEYS, "str"))
 
 
 def _rows(run: Run) -> pd.DataFrame:

@@ -13,15 +13,17 @@ import pandas as pd
 
 from flexroad.catalog.text import count
 from flexroad.tools.report.content import FIGURES
-from flexroad.tools.reproduce.bootstrap import LEVEL, Means, bootstrap
 from flexroad.tools.reproduce.claims import (
     HELD,
+    LEVEL,
     NOT_DECIDED,
     NOT_HELD,
     NOT_TESTED,
     STRONGER,
     WEAKER,
+    Means,
     Verdict,
+    bootstrap,
     decided,
     percent,
     strength,
@@ -304,7 +306,6 @@ def distances_of(rows: tuple[Row, ...], means: Means, relative: bool) -> np.ndar
     """Return the absolute logarithms of the ratios of our figures to the paper's, ``(rows, 4)``.
 
     - `rows`: rows of Table II with the full pipeline.
-    - `means`: our means.
     - `relative`: whether to compare the ratios to the full pipeline in place of the figures.
     """
     paper = np.array([[row.value(figure) for figure in FIGURES_SCORED] for row in rows])

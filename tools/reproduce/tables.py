@@ -42,7 +42,6 @@ def write_comparison(
     """Write the paper's tables with a run's figures beside them; return the paths of the files.
 
     - `run`: a run with variants named as in configs/ablation.yaml; missing variants are left out.
-    - `folder`: folder for the files.
     - `true`, `dsc3d`, `dsc3d_true`, `literal`, `dsm`: the runs that `collect` takes.
     """
     data = collect(run, true, dsc3d, dsc3d_true, literal, dsm)
@@ -108,7 +107,12 @@ def _latex(table: pd.DataFrame, caption: str) -> str:
         "r" if number else "l" if length <= widest else "p{0.12\\linewidth}"
         for number, length in zip(are_numbers(table), lengths, strict=True)
     )
-    body = _grouped(table).to_latex(index=False, escape=True, column_format=kinds, multicolumn_format="c")
+    first, *others = [str(column).split(", ") for column in table.columns]
+    if all(len(parts) == 2 for parts in others):
+        # "L2 road (m), paper" and "L2 road (m), ours" stand under one heading "L2 road (m)".
+        pairs = [("", *first), *((parts[0], parts[1]) for parts in others)]
+        table = table.set_axis(pd.MultiIndex.from_tuples(pairs), axis="columns")
+    body = table.to_latex(index=False, escape=True, column_format=kinds, multicolumn_format="c")
     caption = caption.replace("_", r"\_").replace("%", r"\%")
     for plain, printed in LATEX.items():
         body, caption = body.replace(plain, printed), caption.replace(plain, printed)
@@ -116,12 +120,3 @@ def _latex(table: pd.DataFrame, caption: str) -> str:
         "\\begin{table*}\n\\centering\\scriptsize\\setlength{\\tabcolsep}{3pt}\n"
         f"\\caption{{{caption}}}\n{body}\\end{{table*}}"
     )
-
-
-def _grouped(table: pd.DataFrame) -> pd.DataFrame:
-    """Put "L2 road (m), paper" and "L2 road (m), ours" under one heading "L2 road (m)"."""
-    first, *others = [str(column).split(", ") for column in table.columns]
-    if any(len(parts) != 2 for parts in others):
-        return table
-    pairs = [("", *first), *((parts[0], parts[1]) for parts in others)]
-    return table.set_axis(pd.MultiIndex.from_tuples(pairs), axis="columns")

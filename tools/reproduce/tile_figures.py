@@ -35,8 +35,7 @@ from flexroad.tools.reproduce.layout import (
     drawable,
     new_figure,
 )
-from flexroad.tools.reproduce.tile_view import Result, Roles, TileView, missing_roles
-from flexroad.tools.reproduce.trajectory import vehicle_trajectory
+from flexroad.tools.reproduce.tile_view import Result, Roles, TileView, missing_roles, vehicle_trajectory
 
 MOST_ERROR_M = 0.5
 """Limit of the error axis of the profile (m)."""
@@ -78,7 +77,6 @@ def along(raster: Floats, row: Floats, col: Floats) -> Floats:
 def draw_profile(view: TileView, row: Floats, col: Floats, heights: dict[str, Floats]) -> Figure:
     """Draw a map of the path, the heights along it and their errors.
 
-    - `view`: the tile.
     - `row`, `col`: the path, in cells.
     - `heights`: heights along the path (m) by label: ``raw DSM``, ``Plane``, ``FlexRoad`` and ``truth``.
     """
@@ -163,7 +161,9 @@ def draw_maps(view: TileView, columns: dict[str, str]) -> Figure:
     for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
         result = view.results[variant]
         artists.append((_errors(upper, view, variant), _angles(lower, result, view.grid)))
-        _titles(upper, lower, label, result)
+        m = result.metrics
+        upper.set_title(f"{label}\nroad {m.l2_road_m:.3f} m, terrain {m.l2_terrain_m:.3f} m")
+        lower.set_title(f"road {m.mad_road_deg:.2f}°, terrain {m.mad_terrain_deg:.2f}°")
     for row, (artist, text) in enumerate(zip(artists[0], ("error (m)", "angle (°)"), strict=True)):
         bar = figure.colorbar(artist, ax=list(axes[row]), extend="both", pad=0.015, aspect=22, shrink=0.85)
         bar.set_label(text)
@@ -196,12 +196,6 @@ def _angles(axes: Axes, result: Result, grid: Grid) -> Collection:
         antialiased=False,
         rasterized=True,
     )
-
-
-def _titles(upper: Axes, lower: Axes, label: str, result: Result) -> None:
-    m = result.metrics
-    upper.set_title(f"{label}\nroad {m.l2_road_m:.3f} m, terrain {m.l2_terrain_m:.3f} m")
-    lower.set_title(f"road {m.mad_road_deg:.2f}°, terrain {m.mad_terrain_deg:.2f}°")
 
 
 def _frame_maps(axes: np.ndarray, grid: Grid) -> None:

@@ -22,10 +22,10 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.centrelines import MAIN, MARGIN_M, SIDE, CentreLine
-from flexroad.tools.synthetic.layout import SOUTH_M, WEST_M
 from flexroad.tools.synthetic.network import Plan
 from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.objects import Car, Crown
+from flexroad.tools.synthetic.options import SOUTH_M, WEST_M
 from flexroad.tools.synthetic.population import Objects, Trace
 from flexroad.tools.synthetic.scene import DTM_BLUR_M, Scene, terrain_model
 from flexroad.tools.synthetic.spoilers import Canvas, surface_model
@@ -85,7 +85,7 @@ DEFAULTS = CrossingOptions()
 
 
 @dataclass(frozen=True)
-class Crossing:
+class _Crossing:
     """One crossing: positions along the main road, lengths in m."""
 
     number: int
@@ -225,7 +225,7 @@ class Crossings:
     def _land(self) -> Relief:
         return relief(self.seed, 0.02, 0.15, self.options.datum_m)
 
-    def _crossing(self, number: int) -> Crossing:
+    def _crossing(self, number: int) -> _Crossing:
         rng, options = generator(self.seed, "crossing", number), self.options
         skew = math.radians(rng.uniform(*options.skew_deg)) * rng.choice((-1, 1))
         clearance, wall, slopes = (
@@ -234,20 +234,20 @@ class Crossings:
             rng.random(),
         )
         tube = math.floor((number + 1) * options.tubes) > math.floor(number * options.tubes)
-        return Crossing(number, float(skew), float(clearance), float(wall), slopes < options.slopes, tube)
+        return _Crossing(number, float(skew), float(clearance), float(wall), slopes < options.slopes, tube)
 
     def _along(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
         """Return coordinates along and across the main road (m)."""
         x, y = self.plan.from_map(np.asarray(easting, float), np.asarray(northing, float))
         return x - self._origin[0], y - self._origin[1]
 
-    def _near(self, s: Floats) -> Iterator[tuple[Crossing, Bools]]:
+    def _near(self, s: Floats) -> Iterator[tuple[_Crossing, Bools]]:
         """Yield the crossings, each with the points that are nearest to it along the main road."""
         number = np.rint(s / SPACING_M).astype(np.int64)
         for k in np.unique(number):
             yield self._crossing(int(k)), number == k
 
-    def _at(self, bounds: Bounds) -> list[Crossing]:
+    def _at(self, bounds: Bounds) -> list[_Crossing]:
         """Return the crossings of which a part may lie within `MARGIN_M` of some bounds."""
         west, south, east, north = bounds
         s, v = self._along(np.array([west, west, east, east]), np.array([south, north, south, north]))
@@ -260,19 +260,19 @@ class Crossings:
     def _hills(self, s: Floats, v: Floats) -> Floats:
         return self._land.large(s + self._origin[0], v + self._origin[1]) + self._land.datum_m
 
-    def _main(self, crossing: Crossing, s: Floats, v: Floats) -> Floats:
+    def _main(self, crossing: _Crossing, s: Floats, v: Floats) -> Floats:
         """Return the height of the main road, continued level beyond its edges (m)."""
         fall = CROSSFALL * np.hypot(np.clip(v, -MAIN_M, MAIN_M), 0.5)
         return self._hills(s, np.zeros_like(v)) + crossing.rise(s) - fall
 
-    def _cross(self, crossing: Crossing, t: Floats, u: Floats) -> Floats:
+    def _cross(self, crossing: _Crossing, t: Floats, u: Floats) -> Floats:
         """Return the height of the crossing road, continued level beyond its edges and ends (m)."""
         t = np.clip(t, -REACH_M, REACH_M)
         on_s = crossing.along + t * math.sin(crossing.skew)
         fall = CROSSFALL * np.hypot(np.clip(u, -CROSS_M, CROSS_M), 0.5)
         return self._hills(on_s, t * math.cos(crossing.skew)) - crossing.dip(t) - fall
 
-    def _ground(self, crossing: Crossing, s: Floats, v: Floats) -> Floats:
+    def _ground(self, crossing: _Crossing, s: Floats, v: Floats) -> Floats:
         """Return the height of level 0 at points that are nearest to a crossing (m)."""
         t, u = crossing.across(s, v)
         terrain = self._hills(s, v) + self._land.small(s + self._origin[0], v + self._origin[1])
@@ -294,18 +294,18 @@ class Crossings:
         bank = np.where((inside <= 0) & (aside <= CREST_M), bank, cut)
         return np.maximum(z, bank)
 
-    def _line(self, crossing: Crossing, low: float, high: float) -> Floats:
+    def _line(self, crossing: _Crossing, low: float, high: float) -> Floats:
         """Return the ends of a piece of the main road, ``(2, 2)``, by distances from the crossing (m)."""
         return self._on_map(crossing.along + np.array([low, high]), np.zeros(2))
 
-    def _cross_line(self, crossing: Crossing) -> Floats:
+    def _cross_line(self, crossing: _Crossing) -> Floats:
         t = np.array([-REACH_M, REACH_M])
         return self._on_map(crossing.along + t * math.sin(crossing.skew), t * math.cos(crossing.skew))
 
     def _on_map(self, s: Floats, v: Floats) -> Floats:
         return np.column_stack(self.plan.to_map(s + self._origin[0], v + self._origin[1]))
 
-    def _cars(self, crossing: Crossing, rng: np.random.Generator) -> Iterator[Car]:
+    def _cars(self, crossing: _Crossing, rng: np.random.Generator) -> Iterator[Car]:
         """Yield cars on both roads, none below a deck or in a tube."""
         for main, reach in ((True, SPACING_M / 2), (False, REACH_M)):
             for along in np.arange(4 - reach, reach - 4, 23.0) + rng.uniform(0, 10):
@@ -317,7 +317,7 @@ class Crossings:
                     x, y = s + self._origin[0], v + self._origin[1]
                     yield Car(float(x), float(y), math.atan2(cos, sin), 2.2, 0.9, 1.5, moving=False)
 
-    def _crowns(self, crossing: Crossing, rng: np.random.Generator) -> Iterator[Crown]:
+    def _crowns(self, crossing: _Crossing, rng: np.random.Generator) -> Iterator[Crown]:
         """Yield trees away from roads, banks and cuttings."""
         for _ in range(TREES):
             s, v = crossing.along + rng.uniform(-0.5, 0.5) * SPACING_M, rng.uniform(-REACH_M, REACH_M)
@@ -329,14 +329,14 @@ class Crossings:
                 top = float(self._ground(crossing, *at)[0]) + height
                 yield Crown(float(x), float(y), float(radius), top, float(height), hides=False)
 
-    def _rails(self, crossing: Crossing) -> Floats:
+    def _rails(self, crossing: _Crossing) -> Floats:
         """Return x, y and height of points along both parapets of a deck, ``(3, n)``."""
         along = crossing.along + np.arange(-crossing.half_length_m, crossing.half_length_m, 0.25)
         s, v = np.tile(along, 2), np.repeat([-RAIL_OFFSET_M, RAIL_OFFSET_M], along.size)
         return np.stack([s + self._origin[0], v + self._origin[1], self._main(crossing, s, v) + RAIL_M])
 
 
-def _inside(crossing: Crossing, s: Floats, v: Floats, margin_m: float = 0.0) -> Bools:
+def _inside(crossing: _Crossing, s: Floats, v: Floats, margin_m: float = 0.0) -> Bools:
     """Return which points, given along and across the main road, are on a deck or in a tube."""
     half = (MAIN_M if crossing.tube else DECK_M) + margin_m
     return (np.abs(s - crossing.along) <= crossing.half_length_m + margin_m) & (np.abs(v) <= half)

@@ -7,12 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from flexroad.catalog.grid import Grid
-from flexroad.tools.synthetic.layout import SOUTH_M, WEST_M
 from flexroad.tools.synthetic.noise import generator
-from flexroad.tools.synthetic.options import SceneOptions
+from flexroad.tools.synthetic.options import SOUTH_M, WEST_M, SceneOptions
 
 STRATA = {"urban": 168, "suburban": 23, "rural": 49}
 """Tiles of the complete benchmark, as in the paper."""
@@ -166,12 +163,8 @@ def _place(row: int, stratum: str, number: int, seed: int) -> tuple[str, Grid, s
     west = WEST_M + along * APART_M
     south = SOUTH_M + (down * len(STRATA) + row) * APART_M
     grid = Grid("EPSG:25832", west, south + SIZE_M, 1.0, SIZE_M, SIZE_M)
-    return f"{west}_{south}", grid, stratum, _varied(PRESET[stratum], generator(seed, "gerod", row, number))
-
-
-def _varied(options: SceneOptions, rng: np.random.Generator) -> SceneOptions:
-    drawn = {
-        name: getattr(options, name) * (1 + rng.uniform(-spread, spread)) for name, spread in VARIED.items()
-    }
-    turn = rng.uniform(0, 90)
-    return SceneOptions(**options.model_dump() | drawn | {"turn_deg": turn})
+    options, rng = PRESET[stratum].model_dump(), generator(seed, "gerod", row, number)
+    for name, spread in VARIED.items():
+        options[name] *= 1 + rng.uniform(-spread, spread)
+    options["turn_deg"] = rng.uniform(0, 90)
+    return f"{west}_{south}", grid, stratum, SceneOptions(**options)

@@ -39,7 +39,7 @@ DISTRICT_M = 250
 
 
 @dataclass(frozen=True)
-class Stratum:
+class _Stratum:
     """Density of buildings, traffic and vegetation in an area."""
 
     name: str
@@ -75,25 +75,25 @@ class Stratum:
 STRATA = {
     stratum.name: stratum
     for stratum in (
-        Stratum("urban", 0.7, 0.85, (12, 16), (8, 11), (13, 22), 0.88, (0, 0), (1.2, 4), (10, 13), (9, 19),
+        _Stratum("urban", 0.7, 0.85, (12, 16), (8, 11), (13, 22), 0.88, (0, 0), (1.2, 4), (10, 13), (9, 19),
                 0.35, 0.5, 1.5, 0.5, 8),
-        Stratum("suburban", 0.1, 0.7, (9, 12), (6.5, 8), (17, 24), 0.85, (5, 10), (4, 8), (9, 12), (4, 7),
+        _Stratum("suburban", 0.1, 0.7, (9, 12), (6.5, 8), (17, 24), 0.85, (5, 10), (4, 8), (9, 12), (4, 7),
                 0.1, 0.25, 0.6, 0.35, 12),
-        Stratum("rural", 0.2, 0.2, (8, 11), (5, 6.5), (25, 45), 0.2, (8, 20), (5, 14), (9, 16), (3.5, 7),
+        _Stratum("rural", 0.2, 0.2, (8, 11), (5, 6.5), (25, 45), 0.2, (8, 20), (5, 14), (9, 16), (3.5, 7),
                 0.05, 0.02, 0.4, 0.4, 6),
     )
 }  # fmt: skip
 """Strata by name; the fractions are those of the paper's 168, 23 and 49 tiles."""
 
 
-def find_stratum(name: str) -> Stratum:
+def find_stratum(name: str) -> _Stratum:
     """Return the stratum with a name."""
     if name not in STRATA:
         raise TaskError(f"no stratum {name!r}; there are {', '.join(STRATA)}")
     return STRATA[name]
 
 
-def stratum_at(seed: int, easting: float, northing: float) -> Stratum:
+def stratum_at(seed: int, easting: float, northing: float) -> _Stratum:
     """Return the stratum of the district at a point."""
     key = math.floor(easting / DISTRICT_M), math.floor(northing / DISTRICT_M)
     shares = np.cumsum([stratum.share for stratum in STRATA.values()])
@@ -102,7 +102,7 @@ def stratum_at(seed: int, easting: float, northing: float) -> Stratum:
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class _Line:
     """A lattice line: its coordinate across as a smooth function of the coordinate along it."""
 
     position: float
@@ -128,12 +128,12 @@ class Street:
 
     key: tuple[int, int, int]
     """Axis, line and piece: the key of the street's random generators."""
-    line: Line
+    line: _Line
     start: float
     end: float
     half_width_m: float
     """Half width of the street, median included (m)."""
-    stratum: Stratum
+    stratum: _Stratum
     cross_slope: float = 0.0
     """One-sided slope of the carriageway, added to its crossfall."""
     median_m: float = 0.0
@@ -191,7 +191,7 @@ class Street:
 class Stream:
     """A watercourse half-way between two neighbouring lines."""
 
-    banks: tuple[Line, Line]
+    banks: tuple[_Line, _Line]
     paved: bool = False
     """Whether it is a sunken road, not a stream."""
 
@@ -241,7 +241,7 @@ class Plan:
         cos, sin = self._turn
         return cos * x - sin * y, sin * x + cos * y
 
-    def stratum_at(self, x: Any, y: Any) -> Stratum:
+    def stratum_at(self, x: Any, y: Any) -> _Stratum:
         """Return the stratum at one point."""
         return find_stratum(self.stratum) if self.stratum else stratum_at(self.seed, *self.to_map(x, y))
 
@@ -280,13 +280,13 @@ def _touch(a: Box, b: Box) -> bool:
 
 
 @lru_cache(maxsize=4096)
-def _line(plan: Plan, axis: int, index: int) -> Line:
+def _line(plan: Plan, axis: int, index: int) -> _Line:
     lengths, amplitudes = np.array(BENDS).T * plan.block_m
     shared = generator(plan.seed, "bends", axis).uniform(0, 2 * np.pi, lengths.size)
     rng = generator(plan.seed, "line", axis, index)
     position = (index + rng.uniform(-JITTER, JITTER)) * plan.block_m
     phases = shared + rng.uniform(-PHASE_SPREAD, PHASE_SPREAD, lengths.size)
-    return Line(position, 2 * np.pi / lengths, phases, amplitudes)
+    return _Line(position, 2 * np.pi / lengths, phases, amplitudes)
 
 
 @lru_cache(maxsize=4096)

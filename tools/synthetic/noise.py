@@ -41,6 +41,12 @@ class Waves:
         return total
 
 
+def field(seed: int, purpose: str, span_m: tuple[float, float], number: int, rms_m: float = 1.0) -> Waves:
+    """Return a field of a root mean square: waves of equal amplitude from the shortest to the longest."""
+    lengths = np.geomspace(*span_m, number)
+    return waves(generator(seed, purpose), lengths, rms_m * np.sqrt(2 / number))
+
+
 def waves(rng: np.random.Generator, lengths_m: ArrayLike, amplitudes_m: ArrayLike) -> Waves:
     """Return waves of the given lengths and amplitudes with random directions and phases."""
     lengths, amplitudes = np.broadcast_arrays(

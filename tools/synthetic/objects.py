@@ -279,8 +279,8 @@ def towers(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: floa
     reach: Floats = np.array([np.hypot(house.half_length, house.half_depth) for house in planned])
     free = (under.edge > reach + 1) & (under.trough == 0)
     return tuple(
-        House(h.x, h.y, h.heading, h.half_length, h.half_depth, float(base) + h.eaves, h.rise)
-        for h, base, ok in zip(planned, under.bare, free, strict=True)
+        replace(house, eaves=float(base) + house.eaves)
+        for house, base, ok in zip(planned, under.bare, free, strict=True)
         if ok
     )
 
@@ -322,9 +322,10 @@ def roofs_seen(
     x, y = (np.array([getattr(house, axis) for house in houses]) for axis in ("x", "y"))
     height = np.array([house.eaves for house in houses]) - ground_at(x, y).bare
     shift = lean * height * from_middle(seed, x, y)
+    places = [(int(house.x // 1), int(house.y // 1)) for house in houses]
     return tuple(
-        Roof(house, (float(east), float(north)), _drawn(house, seed) < facades)
-        for house, east, north in zip(houses, *shift, strict=True)
+        Roof(house, (float(east), float(north)), bool(generator(seed, "facade", *place).random() < facades))
+        for house, east, north, place in zip(houses, *shift, places, strict=True)
     )
 
 
@@ -334,7 +335,3 @@ def from_middle(seed: int, x: Floats, y: Floats) -> Floats:
     return np.stack(
         [2 * ((axis + start) / IMAGE_M % 1) - 1 for axis, start in zip((x, y), phase, strict=True)]
     )
-
-
-def _drawn(house: House, seed: int) -> float:
-    return float(generator(seed, "facade", int(house.x // 1), int(house.y // 1)).random())

@@ -1,10 +1,17 @@
-"""Options of a synthetic world."""
+"""Options of a synthetic world, and its tiles."""
 
 from __future__ import annotations
 
+import math
+from itertools import islice
+
 from pydantic import Field
 
+from flexroad.catalog.grid import Grid
 from flexroad.tasks.options import Options
+
+WEST_M, SOUTH_M = 500_000, 5_600_000
+"""South-west corner of a block: on the central meridian of EPSG:25832, a multiple of common tile sizes."""
 
 
 class SceneOptions(Options):
@@ -119,3 +126,12 @@ class SceneOptions(Options):
 
 
 DEFAULTS = SceneOptions()
+
+
+def block(tiles: int, size_m: int = 250) -> list[tuple[str, Grid]]:
+    """Return the ids and grids of a near-square block of neighbouring tiles; the last row may be partial."""
+    columns = math.ceil(math.sqrt(tiles))
+    rows = math.ceil(tiles / max(columns, 1))
+    west, south = WEST_M // size_m * size_m, SOUTH_M // size_m * size_m
+    bounds = (west, south, west + columns * size_m, south + rows * size_m)
+    return list(islice(Grid.covering("EPSG:25832", bounds, 1.0).tiles(size_m), tiles)) if tiles > 0 else []

@@ -71,9 +71,6 @@ def orthophoto(
 ) -> NDArray[np.uint8]:
     """Return the orthophoto of the scene that `make_scene` gives for the same arguments.
 
-    - `seed`: seed of the world, 0 or more.
-    - `stratum`: see `make_scene`.
-    - `gsd`: ground sampling distance (m).
     - result: red, green and blue, 0 to 255, over the grid's bounds.
     """
     pixels = _pixel_grid(grid, gsd)
@@ -108,7 +105,8 @@ def _ground(scene: Scene, seed: int) -> Picture:
     """Return the colours of the ground without objects."""
     x, y = np.meshgrid(scene.grid.eastings, scene.grid.northings)
     patchy = waves(generator(seed, "green"), np.geomspace(9, 90, 9), 1 / 3)(x, y)
-    picture = _mix(_flat(x.shape, LAWN), DRY, np.clip(0.3 + 0.5 * patchy, 0, 1))
+    dry = np.clip(0.3 + 0.5 * patchy, 0, 1).astype(np.float32)[..., None]
+    picture: Picture = np.array(LAWN, np.float32) * (1 - dry) + np.array(DRY, np.float32) * dry
     away = ndimage.distance_transform_edt(~scene.reference_road) * scene.grid.cell
     if scene.stratum == "rural":
         _paint(picture, away > 2 * PAVEMENT_M, _fields(x, y, seed), 0.8)
@@ -228,16 +226,6 @@ def _sun() -> tuple[float, float, float]:
     """Return the unit vector to the sun: east, north, up."""
     azimuth, height = np.radians(SUN_AZIMUTH_DEG), np.radians(SUN_HEIGHT_DEG)
     return np.sin(azimuth) * np.cos(height), np.cos(azimuth) * np.cos(height), np.sin(height)
-
-
-def _flat(shape: tuple[int, ...], colour: Any) -> Picture:
-    return np.broadcast_to(np.array(colour, np.float32), (*shape, 3)).copy()
-
-
-def _mix(picture: Picture, colour: Any, share: Any) -> Picture:
-    share = np.asarray(share, np.float32)[..., None]
-    mixed: Picture = picture * (1 - share) + np.asarray(colour, np.float32) * share
-    return mixed
 
 
 def _paint(picture: Picture, cells: Bools, colour: Any, opacity: float) -> None:

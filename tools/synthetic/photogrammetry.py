@@ -12,10 +12,9 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.prepare.mesh.sample import TexturedMesh
-from flexroad.tools.synthetic.dsc3d import Place
+from flexroad.tools.synthetic.dsc3d import Place, Reconstruction, reconstruct
 from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.orthophoto import orthophoto
-from flexroad.tools.synthetic.reconstruction import Reconstruction, reconstruct
 from flexroad.tools.synthetic.scene import Scene, make_scene
 
 PIL = lazy("PIL")
@@ -36,7 +35,7 @@ RIM = 7
 
 
 @dataclass(frozen=True, eq=False)
-class PhotogrammetryScene:
+class _PhotogrammetryScene:
     """One synthetic scene: its true surface and its photogrammetric mesh."""
 
     name: str
@@ -51,10 +50,9 @@ class PhotogrammetryScene:
     """The reconstructed surface, before simplification."""
 
 
-def photogrammetry(place: Place, seed: int) -> PhotogrammetryScene:
+def photogrammetry(place: Place, seed: int) -> _PhotogrammetryScene:
     """Make one scene of the stand-in for DSC3D.
 
-    - `place`: a place from `tools.synthetic.dsc3d.survey`.
     - result: equal input gives equal scenes. The mesh fills the square of the place, except for open holes.
     """
     site, grid = place.site, place.grid
@@ -63,13 +61,18 @@ def photogrammetry(place: Place, seed: int) -> PhotogrammetryScene:
     reconstruction = reconstruct(surface, seed, site.faults)
     origin = np.array([grid.west, grid.south, math.floor(reconstruction.height.min())])
     rng = generator(seed, "fragments", *map(int, grid.origin))
-    centres = _fragment_centres(reconstruction, site.faults.fragments, origin, grid, rng)
+    # Random points above the surface, relative to the origin.
+    number = site.faults.fragments
+    x, y = rng.uniform(0, grid.width * grid.cell, (2, number))
+    height = reconstruction.height[reconstruction.grid.cells(x + origin[0], y + origin[1])]
+    centres = np.column_stack([x, y, height - origin[2] + rng.uniform(*FLOATING_M, number)])
     floating, pieces = fragments(centres, rng)
     vertices, faces = _mesh(reconstruction, site.triangles - len(pieces), origin)
     faces = np.concatenate([faces, pieces + np.int32(len(vertices))])
-    vertices = _clip(np.concatenate([vertices, floating]), grid)
+    vertices = np.concatenate([vertices, floating])
+    vertices[:, :2] = np.clip(vertices[:, :2], 0, np.array([grid.width, grid.height]) * grid.cell)
     texture = orthophoto(grid, seed, site.stratum, place.options, GSD_M).transpose(1, 2, 0)
-    return PhotogrammetryScene(
+    return _PhotogrammetryScene(
         site.name, _textured(vertices, faces, texture, origin, grid), truth, surface, reconstruction
     )
 
@@ -86,21 +89,6 @@ def _mesh(reconstruction: Reconstruction, triangles: int, origin: Floats) -> tup
     return simplified(
         *lattice(east, north, reconstruction.height - origin[2], reconstruction.open), triangles
     )
-
-
-def _fragment_centres(
-    reconstruction: Reconstruction, count: int, origin: Floats, grid: Grid, rng: np.random.Generator
-) -> Floats:
-    """Return random points above the surface, relative to the origin, ``(count, 3)``."""
-    x, y = rng.uniform(0, grid.width * grid.cell, (2, count))
-    height = reconstruction.height[reconstruction.grid.cells(x + origin[0], y + origin[1])]
-    return np.column_stack([x, y, height - origin[2] + rng.uniform(*FLOATING_M, count)])
-
-
-def _clip(vertices: Floats, grid: Grid) -> Floats:
-    """Return the vertices, clipped to the square in x and y."""
-    side = np.array([grid.width, grid.height]) * grid.cell
-    return np.column_stack([np.clip(vertices[:, :2], 0, side), vertices[:, 2]])
 
 
 def _textured(

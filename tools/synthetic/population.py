@@ -38,6 +38,12 @@ OCCUPIED = 0.55
 """Fraction of the bays with a car."""
 MISTAKEN = 0.6
 """Fraction of these areas that the segmentation mistakes for road."""
+SIZES = {
+    "car parks": ((9, 17), (8, 13), (2, 5)),
+    "fields": ((10, 20), (5, 14), (1.5, 4)),
+    "paved yards": ((3, 10), (3, 9), (1.2, 2.5)),
+}
+"""Kinds of areas: ranges of half length, half width and distance from the road (m)."""
 CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (0, 0)])
 STEP_M = 0.25
 """Distance between the points of a line (m)."""
@@ -81,11 +87,11 @@ def populate(
     - `ground_at`: returns the ground at points, with all streets nearby.
     """
     density, errors = options.density, options.mask_errors
-    parks = car_parks(farther, seed, ground_at, options.car_parks * density)
-    bare = fields(farther, seed, ground_at, options.fields * errors)
+    parks = _beside(farther, seed, "car parks", ground_at, options.car_parks * density)
+    bare = _beside(farther, seed, "fields", ground_at, options.fields * errors)
     built = houses(streets, seed, ground_at, density * options.built, options.storeys)
     built += towers(streets, seed, ground_at, options.towers * density)
-    built = houses_off(built, (*parks, *bare))
+    built = tuple(house for house in built if not any(_overlap(house, area) for area in (*parks, *bare)))
     roofs = roofs_seen(built, seed, ground_at, options.lean * errors, options.facades)
     trees = crowns(streets, seed, ground_at, built, density, options.trees)
     vehicles = [car for street in streets for car in cars(street, seed, density)]
@@ -102,7 +108,7 @@ def populate(
         _false_roofs(roofs, seed, options.false_roofs * errors),
         rails(streets, seed, ground_at, options.rails * density),
         wires(streets, seed, ground_at, options.wires * density),
-        yards(farther, seed, ground_at, options.yards * errors),
+        _beside(farther, seed, "paved yards", ground_at, options.yards * errors),
         roofs if options.lean or options.verge_m or options.yards or options.open_ground else (),
     )
 
@@ -150,34 +156,18 @@ class Area:
         return self.x + cos * u - sin * v, self.y + sin * u + cos * v
 
 
-def car_parks(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: float) -> tuple[Area, ...]:
-    """Return car parks, ``mean`` per street on average."""
-    return _beside(streets, seed, "car parks", ground_at, mean, ((9, 17), (8, 13), (2, 5)))
-
-
-def fields(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: float) -> tuple[Area, ...]:
-    """Return bare fields, ``mean`` per street on average."""
-    return _beside(streets, seed, "fields", ground_at, mean, ((10, 20), (5, 14), (1.5, 4)))
-
-
-def yards(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: float) -> tuple[Area, ...]:
-    """Return paved yards next to the pavement, ``mean`` per street on average; houses may stand on them."""
-    return _beside(streets, seed, "paved yards", ground_at, mean, ((3, 10), (3, 9), (1.2, 2.5)))
-
-
 def _beside(
     streets: Sequence[Street],
     seed: int,
-    purpose: str,
+    kind: str,
     ground_at: GroundAt,
     mean: float,
-    sizes: tuple[tuple[float, float], ...],
 ) -> tuple[Area, ...]:
-    """Return rectangles; ``sizes``: ranges of half length, half width and distance from the road (m)."""
+    """Return areas of a kind of `SIZES`, ``mean`` per street on average; houses may stand on yards."""
     planned = [
         area
         for street in streets
-        for area in _planned(street, generator(seed, purpose, *street.key), mean, sizes)
+        for area in _planned(street, generator(seed, kind, *street.key), mean, SIZES[kind])
     ]
     if not planned:
         return ()
@@ -198,11 +188,6 @@ def _planned(
         x, y = (float(c) for c in street.point(along, lateral))
         planned.append(Area(x, y, float(street.heading(along)), length, width, bool(rng.random() < MISTAKEN)))
     return planned
-
-
-def houses_off(houses: Sequence[House], areas: Sequence[Area]) -> tuple[House, ...]:
-    """Return the houses that overlap none of the areas."""
-    return tuple(house for house in houses if not any(_overlap(house, area) for area in areas))
 
 
 def _overlap(house: House, area: Area) -> bool:

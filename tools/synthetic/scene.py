@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -13,18 +14,16 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.prepare.points.binning import bins
-from flexroad.tools.prepare.types import Points
+from flexroad.tools.prepare.points.binning import Points, bins
 from flexroad.tools.synthetic.network import Box, Plan, find_stratum
-from flexroad.tools.synthetic.noise import generator, waves
+from flexroad.tools.synthetic.noise import field, generator
 from flexroad.tools.synthetic.objects import GroundAt
 from flexroad.tools.synthetic.options import DEFAULTS, SceneOptions
 from flexroad.tools.synthetic.population import Objects, populate
 from flexroad.tools.synthetic.segmentation import segmentation
 from flexroad.tools.synthetic.spoilers import BARE, Canvas, Kind, surface_model
 from flexroad.tools.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
-from flexroad.tools.synthetic.survey_errors import changes, growth, mixed, rise, scars
-from flexroad.tools.synthetic.voids import hidden, water
+from flexroad.tools.synthetic.survey_errors import changes, growth, hidden, mixed, rise, scars, water
 
 __all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
 
@@ -62,7 +61,7 @@ class Scene:
     """True road, ``(H, W)``."""
     kind: NDArray[np.uint8]
     """Object that the surface model shows, a `Kind` per cell, ``(H, W)``."""
-    levels: Mapping[int, Floats] = field(default_factory=dict)
+    levels: Mapping[int, Floats] = dataclasses.field(default_factory=dict)
     """True height of each level, ``(H, W)``, m, NaN where it is not; only of `tools.synthetic.crossings`."""
 
     @property
@@ -83,7 +82,6 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     Ground, streets, objects and errors of the mask are functions of seed and absolute coordinates, so tiles
     of one seed join without a step. The noise of the heights is drawn per tile.
 
-    - `seed`: seed of the world, 0 or more.
     - `stratum`: stratum of the complete world: ``urban``, ``suburban`` or ``rural``; by default a mix of
       districts.
     """
@@ -103,12 +101,14 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     objects = populate(streets, farther, seed, ground_at, options)
     rng = generator(seed, "survey", *map(int, grid.origin))
     dsm, kind = _survey(canvas, here, truth, objects, options, rng)
-    offset = _flight_offset(canvas, options.flight_offset_m)
+    offset = field(seed, "flights", FLIGHT_WAVES_M, 5, options.flight_offset_m)(canvas.x, canvas.y)
+    west, south, east, north = wide.bounds
+    centre = plan.from_map((west + east) / 2, (south + north) / 2)
     bare = here.bare + scars(canvas, objects.houses, seed, options.scars_m) + offset
     dtm = terrain_model(bare, wide.cell, options.dtm_noise_m, rng)
     return Scene(
         grid=grid,
-        stratum=plan.stratum_at(*_centre(canvas)).name,
+        stratum=plan.stratum_at(*centre).name,
         dsm=dsm[inner],
         dtm=dtm[inner],
         road_mask=segmentation(canvas, here.edge, objects, ground_at, options)[inner],
@@ -204,13 +204,6 @@ def terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Gene
     return smooth
 
 
-def _flight_offset(canvas: Canvas, rms_m: float) -> Floats:
-    """Return the slowly varying offset of the DTM's survey from the DSM's (m), ``(H, W)``."""
-    lengths = np.geomspace(*FLIGHT_WAVES_M, 5)
-    field = waves(generator(canvas.plan.seed, "flights"), lengths, rms_m * np.sqrt(2 / lengths.size))
-    return field(canvas.x, canvas.y)
-
-
 def _box(canvas: Canvas, margin_m: float) -> Box:
     """Return the plan's box around a canvas."""
     x, y = canvas.x, canvas.y
@@ -222,19 +215,12 @@ def _box(canvas: Canvas, margin_m: float) -> Box:
     )
 
 
-def _centre(canvas: Canvas) -> tuple[float, float]:
-    west, south, east, north = canvas.grid.bounds
-    return canvas.plan.from_map((west + east) / 2, (south + north) / 2)
-
-
 def scan(scene: Scene, per_m2: float, noise_m: float, seed: int = 0) -> Points:
     """Return points on a scene's surface, at random positions.
 
     Heights are those of the true ground, linear between cell centres, plus what stands on the point's cell.
 
     - `scene`: a scene without noise of its own (`SceneOptions.dsm_noise_m`).
-    - `per_m2`: number of points per m2.
-    - `noise_m`: standard deviation of their heights (m).
     """
     grid, rng = scene.grid, generator(seed, "scan", *map(int, scene.grid.origin))
     west, south, east, north = grid.bounds

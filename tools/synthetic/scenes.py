@@ -18,11 +18,12 @@ from flexroad.catalog.sources import prepared
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Executor, Jobs, SerialExecutor
+from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Jobs, SerialExecutor
 from flexroad.tasks.io.vectors import vector_date
 from flexroad.tools.prepare.from_mesh import POINTS, MeshOptions, prepare_mesh
 from flexroad.tools.prepare.options import PrepareOptions
-from flexroad.tools.synthetic import Scene, SceneOptions, block, dsc3d, gerod, make_scene
+from flexroad.tools.prepare.output import on_failure
+from flexroad.tools.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
 from flexroad.tools.synthetic.centrelines import CentreLine, centre_lines
 from flexroad.tools.synthetic.crossings import CrossingOptions, Crossings, make_crossings
 from flexroad.tools.synthetic.dsc3d import Place
@@ -79,9 +80,7 @@ def write_scenes(
     reference of a preset's tiles is the one that the paper describes. Beside their catalog,
     ``catalog_true.parquet`` lists them with the truth as reference.
 
-    - `folder`: output folder.
     - `tiles`: number of tiles; if None, 4, or all of the preset.
-    - `seed`: seed of the world.
     - `size_m`: side of a tile (m); 250 if None. The size of a preset's tiles is fixed.
     - `dop`: whether to write orthophotos; the preset dsc3d always has them.
     - `preset`: one of `PRESETS`; None for a block of neighbouring tiles.
@@ -94,13 +93,10 @@ def write_scenes(
         return write_stand_in(folder, tiles, seed)
     jobs = _jobs(folder, tiles, seed, size_m, dop, preset, decks)
     executor = AdaptiveExecutor(None, DaskExecutor(), lambda line: None)
+    fail = on_failure(lambda job: f"scene {job.tile_id}", "")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        written = list[Tile]()
-        for result in executor.map(_write_scene, Jobs(iter(jobs), len(jobs)), _failure):
-            if isinstance(result, str):
-                raise ConfigError(result)
-            written.append(result)
+        written = list(executor.map(_write_scene, Jobs(iter(jobs), len(jobs)), fail))
         path = folder / "catalog.parquet"
         tiles_written = prepared.with_neighbours(written)
         catalog = Catalog(_with_roads(folder / "roads.gpkg", jobs, tiles_written))
@@ -141,26 +137,25 @@ def _jobs(
     ]
 
 
-def _write_scene(job: _SceneJob) -> Tile | str:
+def _write_scene(job: _SceneJob) -> Tile:
     if isinstance(job.options, CrossingOptions):
-        return _write_crossings(job, make_crossings(job.grid, job.seed, job.options))
-    arguments = (job.grid, job.seed, job.stratum, job.options)
-    scene = make_scene(*arguments)
-    layers = {**scene.layers, **({"dop": orthophoto(*arguments)} if job.dop else {})}
+        scene = make_crossings(job.grid, job.seed, job.options)
+        photo = {}
+    else:
+        arguments = (job.grid, job.seed, job.stratum, job.options)
+        scene = make_scene(*arguments)
+        photo = {"dop": orthophoto(*arguments)} if job.dop else {}
+    layers = {**scene.layers, **photo}
     folder, about = Path(job.folder), (scene.stratum, MADE, job.name)
+    for level, heights in scene.levels.items():
+        prepared.write_tile(
+            folder / KNOWN / f"level{level}", job.tile_id, job.grid, {"reference": heights}, *about
+        )
     if job.extended_dtm:
         truth = {"reference": scene.reference, "reference_road": scene.reference_road}
         prepared.write_tile(folder / KNOWN, job.tile_id, job.grid, truth, *about)
         layers |= {"reference": scene.extended_dtm}
     return prepared.write_tile(folder, job.tile_id, job.grid, layers, *about)
-
-
-def _write_crossings(job: _SceneJob, scene: Scene) -> Tile:
-    folder, about = Path(job.folder), (scene.stratum, MADE, job.name)
-    for level, heights in scene.levels.items():
-        truth = {"reference": heights}
-        prepared.write_tile(folder / KNOWN / f"level{level}", job.tile_id, job.grid, truth, *about)
-    return prepared.write_tile(folder, job.tile_id, job.grid, scene.layers, *about)
 
 
 def _with_roads(path: Path, jobs: Sequence[_SceneJob], tiles: Sequence[Tile]) -> tuple[Tile, ...]:
@@ -208,10 +203,6 @@ def _level_columns(lines: Sequence[CentreLine]) -> dict[str, list[Any]]:
     }
 
 
-def _failure(job: _SceneJob, reason: str) -> Tile | str:
-    return f"scene {job.tile_id}: {reason}"
-
-
 def _with_truth(tile: Tile, folder: str, dataset: str) -> Tile:
     """Return a tile with the truth as reference, whose layers are in a folder relative to the tile's root."""
     layers = tuple(
@@ -221,25 +212,13 @@ def _with_truth(tile: Tile, folder: str, dataset: str) -> Tile:
     return replace(tile, layers=layers, dataset=dataset)
 
 
-@dataclass(frozen=True)
-class _StandInJob:
-    """One scene to write."""
-
-    folder: str
-    place: Place
-    seed: int
-
-
-def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Executor | None = None) -> Path:
+def write_stand_in(folder: Path, scenes: int | None, seed: int) -> Path:
     """Write the stand-in for DSC3D; return the path of the catalog with the paper's reference.
 
     The folder of a scene contains ``mesh.glb``, its true layers (``known/<layer>/<scene>.tif``), and the
     rasters and catalog that ``prepare mesh`` writes. In the folder above are the catalogs of all scenes.
 
-    - `folder`: output folder.
     - `scenes`: number of scenes; all five if None.
-    - `seed`: seed of the world.
-    - `executor`: executor of the scenes; this process if None.
     """
     available = len(dsc3d.SITES)
     if scenes is not None and scenes > available:
@@ -247,12 +226,10 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Execut
             f"--tiles {scenes}: dsc3d has {available} scenes; leave --tiles out for all of them"
         )
     places = dsc3d.survey(scenes or available, seed)
-    jobs = [_StandInJob(str(folder), place, seed) for place in places]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for error in (executor or SerialExecutor()).map(_write_stand_in, jobs, _stand_in_failure):
-            if error:
-                raise ConfigError(error)
+        for place in places:
+            _write_stand_in(folder, seed, place)
         tiles = [_stand_in_tile(folder, place) for place in places]
         true = f"{STAND_IN.format(seed)}; true reference"
         Catalog(tuple(_with_truth(tile, f"{tile.id}/{KNOWN}", true) for tile in tiles)).write(
@@ -264,16 +241,16 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Execut
     return folder / "catalog.parquet"
 
 
-def _write_stand_in(job: _StandInJob) -> str:
-    scene = photogrammetry(job.place, job.seed)
-    folder = Path(job.folder) / scene.name
+def _write_stand_in(parent: Path, seed: int, place: Place) -> None:
+    scene = photogrammetry(place, seed)
+    folder = parent / scene.name
     truth = scene.truth
     layers = {
         "road_mask": truth.road_mask,
         "reference": truth.reference,
         "reference_road": truth.reference_road,
     }
-    name = STAND_IN.format(job.seed)
+    name = STAND_IN.format(seed)
     prepared.write_tile(folder / KNOWN, scene.name, truth.grid, layers, truth.stratum, MADE, name)
     write(folder / "mesh.glb", encode(scene.mesh))
     roads = folder / KNOWN / "road_mask" / f"{scene.name}.tif"
@@ -281,11 +258,6 @@ def _write_stand_in(job: _StandInJob) -> str:
     prepare_mesh(
         folder / "mesh.glb", folder, options, MeshOptions(), POINTS, SerialExecutor(), lambda _: None
     )
-    return ""
-
-
-def _stand_in_failure(job: _StandInJob, reason: str) -> str:
-    return f"scene {job.place.site.name}: {reason}"
 
 
 def _stand_in_tile(folder: Path, place: Place) -> Tile:

@@ -10,7 +10,7 @@ from scipy.special import ndtri
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.synthetic.noise import generator, waves
+from flexroad.tools.synthetic.noise import field
 from flexroad.tools.synthetic.objects import GroundAt, Roof
 from flexroad.tools.synthetic.options import SceneOptions
 from flexroad.tools.synthetic.population import Area, Objects
@@ -56,8 +56,9 @@ def _patches(grid: Grid, side: float) -> Grid:
 def _classified(canvas: Canvas, edge: Floats, objects: Objects, options: SceneOptions) -> Bools:
     """Return the mask at the points of a canvas, ``(H, W)``."""
     scale = options.mask_errors
-    error = scale * _wobble(canvas, options.wobble_m)
-    mask: Bools = edge + error <= scale * _verge(canvas, options)
+    error = scale * field(canvas.plan.seed, "wobble", WOBBLE_M, 12, options.wobble_m)(canvas.x, canvas.y)
+    verge = np.where(_stretches(canvas, "verge", options.verge_share), options.verge_m, 0.0)
+    mask: Bools = edge + error <= scale * verge
     if scale > 0:
         mask |= _stretches(canvas, "open ground", options.open_ground)
         _add(mask, canvas, objects.yards, error)
@@ -89,25 +90,11 @@ def _disc(
     return window, away + error[window] < radius
 
 
-def _wobble(canvas: Canvas, rms_m: float) -> Floats:
-    """Return the offset of the mask's edges (m), ``(H, W)``."""
-    lengths = np.geomspace(*WOBBLE_M, 12)
-    field = waves(generator(canvas.plan.seed, "wobble"), lengths, rms_m * np.sqrt(2 / lengths.size))
-    return field(canvas.x, canvas.y)
-
-
-def _verge(canvas: Canvas, options: SceneOptions) -> Floats:
-    """Return how far the mask reaches beyond the carriageway (m), ``(H, W)``."""
-    return np.where(_stretches(canvas, "verge", options.verge_share), options.verge_m, 0.0)
-
-
 def _stretches(canvas: Canvas, purpose: str, share: float) -> Bools:
     """Return coherent areas that cover a fraction of the plane, ``(H, W)``."""
     if share <= 0:
         return np.zeros(canvas.x.shape, np.bool_)
-    lengths = np.geomspace(*STRETCH_M, 15)
-    field = waves(generator(canvas.plan.seed, purpose), lengths, np.sqrt(2 / lengths.size))
-    inside: Bools = field(canvas.x, canvas.y) < ndtri(share)
+    inside: Bools = field(canvas.plan.seed, purpose, STRETCH_M, 15)(canvas.x, canvas.y) < ndtri(share)
     return inside
 
 

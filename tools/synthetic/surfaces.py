@@ -10,7 +10,7 @@ import numpy as np
 
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.network import Stream, Street
-from flexroad.tools.synthetic.noise import Waves, generator, waves
+from flexroad.tools.synthetic.noise import Waves, field, generator, waves
 
 CROSSFALL = 0.025
 """Mean cross slope from a street's middle to its edge."""
@@ -48,7 +48,6 @@ class Relief:
 def relief(seed: int, slope: float, roughness_m: float, datum_m: float, embankment_m: float = 0.0) -> Relief:
     """Return the relief of a world.
 
-    - `slope`: root mean square slope of the hills.
     - `roughness_m`: root mean square height of the humps (m).
     - `datum_m`: mean height of the world (m).
     - `embankment_m`: root mean square height of streets above or below the hills (m).
@@ -59,8 +58,7 @@ def relief(seed: int, slope: float, roughness_m: float, datum_m: float, embankme
     heights = slope * hills / (2 * np.pi) * np.sqrt(2 / hills.size)
     relative = humps / np.sqrt(np.mean(humps**2))
     bumps = roughness_m * relative * np.sqrt(2 / humps.size)
-    shifts = np.geomspace(160, 500, 5)
-    grading = waves(generator(seed, "grading"), shifts, embankment_m * np.sqrt(2 / shifts.size))
+    grading = field(seed, "grading", (160, 500), 5, embankment_m)
     return Relief(waves(rng, hills, heights), waves(rng, humps, bumps), datum_m, grading)
 
 
@@ -141,9 +139,9 @@ def ground(land: Relief, ways: Ways, x: Floats, y: Floats) -> Ground:
             blend.add(..., hills, beyond, beyond, 1 - blend.heaviest)
     graded = blend.with_terrain(hills + land.small(x, y)) + land.datum_m
     if ways.curb_m:
-        graded = graded + ways.curb_m * _pavement(over)
+        graded = graded + ways.curb_m * _terrace(over, 2.2, 1.5)
     if ways.wall_m:
-        graded = graded + ways.wall_m * _terrace(over)
+        graded = graded + ways.wall_m * _terrace(over, 8.0, 12.0)
     return Ground(graded, _trough(ways.streams, x, y), blend.edge, over)
 
 
@@ -201,16 +199,12 @@ def _street_lift(street: Street, land: Relief, x: Floats, y: Floats) -> tuple[Fl
     return lift, beyond, np.where(strip > 0, np.maximum(beyond, strip - distance), beyond)
 
 
-def _pavement(edge: Floats) -> Floats:
-    """Return the pavement's profile beside an edge, 0 to 1: a step up, level, then a slope down."""
-    up, down = (smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (2.2, 1.5)))
-    return up - down
+def _terrace(edge: Floats, level_m: float, slope_m: float) -> Floats:
+    """Return the profile of a pavement, or of the ground behind a wall, beside an edge, 0 to 1.
 
-
-def _terrace(edge: Floats) -> Floats:
-    """Return the profile of the ground behind a wall, 0 to 1: a step up, level, then a slope down."""
-    up, down = (smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (8.0, 12.0)))
-    return up - down
+    It is a step up, level up to ``level_m`` from the edge, then a slope down of width ``slope_m``.
+    """
+    return smoothstep((edge - 0.0) / 0.2) - smoothstep((edge - level_m) / slope_m)
 
 
 def _crest(streams: Sequence[Stream], x: Floats, y: Floats) -> Floats:

@@ -1,22 +1,27 @@
 """What makes the rasters of a survey differ from the true ground, besides noise and objects.
 
 Changes between two surveys (new road surfaces, new kerbs, excavations), low vegetation that a scan does not
-penetrate, mixed cells at edges and walls, and errors of a terrain model under houses.
+penetrate, mixed cells at edges and walls, errors of a terrain model under houses, and cells without a height:
+
+- ground that crowns hide. The survey sees a crown from one image, so that the ground at its far side is
+  hidden, the farther the nearer the crown is to the image's edge;
+- water, which gives no echo, and has nothing that two images have in common.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.synthetic.network import Street
-from flexroad.tools.synthetic.noise import generator, waves
-from flexroad.tools.synthetic.objects import House
+from flexroad.tools.synthetic.network import Stream, Street
+from flexroad.tools.synthetic.noise import field, generator
+from flexroad.tools.synthetic.objects import Crown, House, from_middle
 from flexroad.tools.synthetic.spoilers import Canvas
+from flexroad.tools.synthetic.surfaces import BED_M
 
 KINDS = ("surface", "kerb", "excavation")
 LENGTH_M = {"surface": (30.0, 100.0), "kerb": (8.0, 30.0), "excavation": (4.0, 20.0)}
@@ -37,10 +42,12 @@ RIM_M = 1.5
 """Distance beyond the walls to which the ground was removed with the house (m)."""
 TILT = 0.5
 """Tilt of a scar, as a fraction of its depth."""
+SPREAD = 0.5
+"""Greatest deviation of the length of a crown's hidden ground, relative: crowns are not equally dense."""
 
 
 @dataclass(frozen=True)
-class Change:
+class _Change:
     """A stretch of a street whose height changed; lengths in m along and across the centre line."""
 
     street: Street
@@ -52,17 +59,17 @@ class Change:
     """Height of the later survey over the earlier one."""
 
 
-def changes(streets: Sequence[Street], seed: int, mean: float) -> tuple[Change, ...]:
+def changes(streets: Sequence[Street], seed: int, mean: float) -> tuple[_Change, ...]:
     """Return the changes of some streets, ``mean`` per street on average."""
     return tuple(change for street in streets for change in _of(street, seed, mean)) if mean > 0 else ()
 
 
-def _of(street: Street, seed: int, mean: float) -> list[Change]:
+def _of(street: Street, seed: int, mean: float) -> list[_Change]:
     rng = generator(seed, "works", *street.key)
     return [_drawn(street, str(rng.choice(KINDS)), rng) for _ in range(rng.poisson(mean))]
 
 
-def _drawn(street: Street, kind: str, rng: np.random.Generator) -> Change:
+def _drawn(street: Street, kind: str, rng: np.random.Generator) -> _Change:
     half, side = street.half_width_m, rng.choice((-1, 1))
     length, rise = rng.uniform(*LENGTH_M[kind]), rng.uniform(*RISE_M[kind])
     start = rng.uniform(street.start, max(street.end - length, street.start))
@@ -73,10 +80,10 @@ def _drawn(street: Street, kind: str, rng: np.random.Generator) -> Change:
     else:
         middle, width = rng.uniform(-1, 1) * (half + BESIDE_M), rng.uniform(*TRENCH_M)
         left, right = middle - width / 2, middle + width / 2
-    return Change(street, start, min(start + length, street.end), left, right, rise)
+    return _Change(street, start, min(start + length, street.end), left, right, rise)
 
 
-def rise(found: Sequence[Change], x: Floats, y: Floats) -> Floats:
+def rise(found: Sequence[_Change], x: Floats, y: Floats) -> Floats:
     """Return by how much the later survey's ground is higher at points in the plan's frame (m)."""
     total = np.zeros(np.shape(x))
     for change in found:
@@ -110,8 +117,7 @@ def growth(
     - `height_m`: mean height inside a thicket (m).
     - `rng`: draws the height of each cell relative to the mean.
     """
-    lengths = np.geomspace(*THICKET_M, 18)
-    thick = waves(generator(seed, "thickets"), lengths, np.sqrt(2 / lengths.size))(x, y)
+    thick = field(seed, "thickets", THICKET_M, 18)(x, y)
     covered: Bools = (thick > 0) & (edge > CLEAR_M)
     # A skewed distribution of mean 1: most cells are lower than the mean, a few are far higher.
     ragged: Floats = rng.gamma(2.0, 0.5, x.shape)
@@ -132,3 +138,34 @@ def scars(canvas: Canvas, houses: Sequence[House], seed: int, depth_m: float) ->
         plane = level + TILT * tilt * u / house.half_length
         error[window] = np.where(inside, plane, error[window])
     return error
+
+
+def hidden(canvas: Canvas, dsm: Floats, crowns: Sequence[Crown], seed: int, length: float) -> Bools:
+    """Return the cells that crowns hide, ``(H, W)``: beside a crown, and below the middle of its height.
+
+    - `length`: mean length of the hidden ground at the edge of an image, per height of the crown.
+    """
+    found = np.zeros(dsm.shape, np.bool_)
+    if length <= 0 or not crowns:
+        return found
+    x, y = (np.array([getattr(crown, axis) for crown in crowns]) for axis in ("x", "y"))
+    for crown, away in zip(crowns, from_middle(seed, x, y).T, strict=True):
+        rng = generator(seed, "hidden", int(crown.x // 1), int(crown.y // 1))
+        east, north = away * length * crown.height * rng.uniform(1 - SPREAD, 1 + SPREAD)
+        window = canvas.around(crown.x, crown.y, crown.radius + float(np.hypot(east, north)))
+        dx, dy = canvas.x[window] - crown.x, canvas.y[window] - crown.y
+        # The crown moved along its shift: the nearest of its middles to each cell.
+        part = np.clip((dx * east + dy * north) / (east**2 + north**2), 0, 1)
+        covered = np.hypot(dx - part * east, dy - part * north) < crown.radius
+        beside = np.hypot(dx, dy) > crown.radius
+        found[window] |= covered & beside & (dsm[window] < crown.top - crown.height / 2)
+    return found
+
+
+def water(canvas: Canvas, streams: Iterable[Stream]) -> Bools:
+    """Return the cells in the beds of streams, ``(H, W)``, also those below bridges."""
+    wet = np.zeros(canvas.x.shape, np.bool_)
+    for stream in streams:
+        if not stream.paved:
+            wet |= stream.distance(canvas.x, canvas.y) < BED_M
+    return wet

@@ -86,19 +86,6 @@ class Evaluation:
     """Error of the segmentation; empty if it succeeded."""
 
 
-@dataclass(frozen=True, eq=False)
-class Preview:
-    """Rasters for a map of one tile."""
-
-    grid: Grid
-    photo: NDArray[np.uint8]
-    """The orthophoto, ``(3, h, w)``."""
-    truth: Bools
-    """Road according to the labels, ``(H, W)``."""
-    predicted: Bools
-    """Road according to the model, ``(H, W)``."""
-
-
 @dataclass(frozen=True)
 class LabelledTiles:
     """Reads tiles with their labels. Nothing is cached, so memory does not grow with the number of tiles."""
@@ -154,16 +141,15 @@ class Outcome:
     judged: tuple[Evaluation, ...]
     notes: tuple[str, ...]
 
-    def preview(self, evaluation: Evaluation) -> Preview:
-        """Return the rasters for a map of one tile; the tile is read again."""
+    def preview(self, evaluation: Evaluation) -> tuple[NDArray[np.uint8], Bools, Bools, Grid]:
+        """Return photo, road by the labels and by the model, and grid of a tile, which is read again."""
         data, truth = self.tiles.read(evaluation.piece.tile)
         window = data.grid.window(data.core)
         mask = np.unpackbits(evaluation.mask, count=data.core.width * data.core.height).astype(bool)
         # Tiles without a photo are left out from the start.
         assert data.dop is not None
-        return Preview(
-            data.core, read_photo(data.dop, data.core).colour, truth[window], mask.reshape(data.core.shape)
-        )
+        photo = read_photo(data.dop, data.core).colour
+        return photo, truth[window], mask.reshape(data.core.shape), data.core
 
     @property
     def quality(self) -> Quality:
@@ -206,7 +192,10 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> 
     - `log`: called with each line of progress.
     """
     settings = _settings(options)
-    tiles = LabelledTiles(options, _chain(config)["load"], _vector_options(config))
+    chain = config.chains[config.export.variants[0]]
+    configured = chain["segment"]
+    vectors = configured if isinstance(configured, rasterise.Options) else rasterise.DEFAULTS
+    tiles = LabelledTiles(options, chain["load"], vectors)
     notes: list[str] = []
     sides = _split(list(_labelled(catalog, tiles, notes)), options)
     log(f"{count(len(sides.train), 'tile')} for training, {len(sides.validate)} for validation")
@@ -219,19 +208,14 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> 
     with ScratchFolder() as folder:
         model = Path(folder, f"model{trained.suffix}")
         model.write_bytes(trained.model)
-        applied = segment_options(config, model)
+        given = configured.model_dump() if isinstance(configured, segmenter.Options) else {}
+        # Without cleanup: the figures are those of the model alone.
+        applied = segmenter.Options(**given | {"model": model, "cleanup": NOTHING})
         judged = tuple(
             _evaluate(block, tiles, lambda data: segmenter.segment(data, applied)) for block in sides.validate
         )
     notes += [f"{each.piece.tile.id}: {each.note}" for each in judged if each.note]
     return Outcome(options, tiles, trained, sides, judged, tuple(notes))
-
-
-def segment_options(config: Config, model: Path) -> segmenter.Options:
-    """Return the options of `segment` for validation: as configured, but without cleanup."""
-    configured = _chain(config)["segment"]
-    given = configured.model_dump() if isinstance(configured, segmenter.Options) else {}
-    return segmenter.Options(**given | {"model": model, "cleanup": NOTHING})
 
 
 def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], RoadMask]) -> Evaluation:
@@ -309,13 +293,3 @@ def _settings(options: TrainOptions) -> fit_head.Options:
             f"--set {name}: {fault['msg'].lower()}, not {shown(fault['input'])}; "
             f"the training has {', '.join(fit_head.Options.model_fields)}"
         ) from error
-
-
-def _vector_options(config: Config) -> rasterise.Options:
-    """Return the options of vector roads: those of the configured segmenter, else the defaults."""
-    segment = _chain(config)["segment"]
-    return segment if isinstance(segment, rasterise.Options) else rasterise.DEFAULTS
-
-
-def _chain(config: Config) -> dict[str, Any]:
-    return config.chains[config.export.variants[0]]

@@ -228,9 +228,7 @@ def _batches(sample: Sample, options: Options) -> Iterator[tuple[NDArray[np.floa
     images, labels = [], []
     for row, col in corners(photo.known.shape, size):
         window = np.s_[row : row + size, col : col + size]
-        west, north = photo.grid.west + col * options.gsd_m, photo.grid.north - row * options.gsd_m
-        ground = Grid(photo.grid.crs, west, north, options.gsd_m, size, size)
-        window_labels = _labels(sample, ground, photo.known[window])
+        window_labels = _labels(sample, photo.grid.part(*window), photo.known[window])
         if len(window_labels.road):
             images.append(image[(slice(None), *window)])
             labels.append(window_labels)
@@ -256,7 +254,7 @@ def _labels(sample: Sample, window: Grid, covered: Bools) -> Labels:
     return Labels(np.stack([x, y], axis=1)[used].astype(np.float32), road.astype(np.float32))
 
 
-class Regression:
+class _Regression:
     """A linear map trained by AdamW on the weighted cross entropy."""
 
     def __init__(self, windows: Windows, options: Options) -> None:
@@ -310,7 +308,7 @@ def regress(
     train: Windows, validate: Windows, options: Options, progress: Progress | None = None
 ) -> tuple[Line, tuple[Epoch, ...]]:
     """Train; return the map with the lowest loss on ``validate``, and the losses of all epochs."""
-    regression = Regression(train, options)
+    regression = _Regression(train, options)
     rng = np.random.default_rng(options.seed)
     history: list[Epoch] = []
     best = regression.line()

@@ -20,7 +20,7 @@ from flexroad.pipeline.run.record import versions
 from flexroad.pipeline.store.records import no_nan
 from flexroad.tools.report.pages import template
 from flexroad.tools.report.render import curves, segmentation_map
-from flexroad.tools.train.driver import Evaluation, Outcome
+from flexroad.tools.train.driver import Outcome
 from flexroad.tools.train.mask_metrics import Quality
 
 SHOWN = 3
@@ -36,12 +36,16 @@ COLUMNS = {
     "edge_mean_m": "edge, mean (m)",
     "edge_p95_m": "edge, p95 (m)",
 }
+MEANING = (
+    "Quality of the model's mask before cleanup, on all surveyed cells. Edges: distance from each piece "
+    "of the segmented outline to the nearest labelled one, and vice versa; a false road far from any "
+    "true road counts with its full distance."
+)
 
 
 def write_model(outcome: Outcome, path: Path) -> tuple[Path, ...]:
     """Write the report and the model; return the paths, the model first.
 
-    - `outcome`: the result of the training.
     - `path`: path of the model; without a suffix, ``.safetensors`` is added.
     """
     path = path if path.suffix else path.with_suffix(outcome.trained.suffix)
@@ -101,7 +105,7 @@ def _page(outcome: Outcome, name: str) -> str:
         state=summary(outcome),
         lines=_lines(outcome),
         sections=[
-            ("Validation tiles, together", overall.rename(columns=COLUMNS), _meaning(outcome)),
+            ("Validation tiles, together", overall.rename(columns=COLUMNS), MEANING),
             ("Validation tiles, one by one", per_tile.rename(columns=COLUMNS), ""),
         ],
         curves=list(_curves(outcome)),
@@ -124,14 +128,6 @@ def _lines(outcome: Outcome) -> list[str]:
         "Expect lower quality on land that looks different. The stopping point and the threshold are chosen "
         "on the validation tiles, so the figures are slightly optimistic.",
     ]
-
-
-def _meaning(outcome: Outcome) -> str:
-    return (
-        "Quality of the model's mask before cleanup, on all surveyed cells. Edges: distance from each piece "
-        "of the segmented outline to the nearest labelled one, and vice versa; a false road far from any "
-        "true road counts with its full distance."
-    )
 
 
 def _curves(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
@@ -163,12 +159,7 @@ def _pictures(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
         if rank < SHOWN or rank >= worst:
             iou = evaluation.quality.iou
             caption = f"{evaluation.piece.tile.id}: IoU {iou:.3f} ({rank + 1} of {len(ranked)})"
-            yield caption, _picture(outcome, evaluation)
-
-
-def _picture(outcome: Outcome, evaluation: Evaluation) -> bytes:
-    preview = outcome.preview(evaluation)
-    return segmentation_map(preview.photo, preview.truth, preview.predicted, preview.grid)
+            yield caption, segmentation_map(*outcome.preview(evaluation))
 
 
 def _share(quality: Quality) -> float:

@@ -7,7 +7,7 @@ straight line divides the tiles, and cells near the validation side are not used
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,7 +72,10 @@ def split(pieces: Sequence[Block], share: float, gap_m: float, seed: int) -> Spl
     count = min(max(1, round(share * len(pieces))), len(pieces) - 1)
     for turn in np.random.default_rng(seed).permutation(DIRECTIONS):
         angle = 2 * math.pi * turn / DIRECTIONS
-        along = [math.sin(angle) * (w + e) + math.cos(angle) * (s + n) for w, s, e, n in _bounds(pieces)]
+        along = [
+            math.sin(angle) * (w + e) + math.cos(angle) * (s + n)
+            for w, s, e, n in (one.bounds for one in pieces)
+        ]
         order = np.argsort(along, kind="stable")
         validate = tuple(pieces[i] for i in sorted(order[-count:]))
         train = tuple(pieces[i] for i in sorted(order[:-count]))
@@ -96,10 +99,6 @@ def split_tile(bounds: Bounds, share: float) -> tuple[Bounds, Bounds]:
         return (west, south, middle, north), (middle, south, east, north)
     middle = south + share * (north - south)
     return (west, middle, east, north), (west, south, east, middle)
-
-
-def _bounds(pieces: Sequence[Block]) -> Iterator[Bounds]:
-    return (piece.bounds for piece in pieces)
 
 
 def _has_both(pieces: Sequence[Block]) -> bool:

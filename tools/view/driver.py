@@ -84,7 +84,7 @@ SIMPLIFIED_M = 0.05
 
 
 @dataclass(frozen=True)
-class Written:
+class _Written:
     """What was written."""
 
     page: Location
@@ -104,7 +104,7 @@ def write_viewer(
     bbox: Bounds | None = None,
     photo_px: int = 1024,
     track: Track = untracked,
-) -> Written:
+) -> _Written:
     """Write the viewer of a run, or of the selected tiles, into a folder."""
     tiles = shown_tiles(run, ids, bbox)
     variant = run.config.export.variants[0]
@@ -128,7 +128,7 @@ def write_viewer(
     write(out / encoding.NAME_RUN, encoding.encode_run(index | {"pictures": bool(pictures)}))
     write(out / PAGE, (_built() / PAGE).read_bytes())
     notes = tuple(f"tile {row['tile']}: {note}" for row in rows for note in row["notes"])
-    return Written(out / PAGE, len(done), len(tiles) - len(done), notes)
+    return _Written(out / PAGE, len(done), len(tiles) - len(done), notes)
 
 
 def shown_tiles(run: Run, ids: Sequence[str], bbox: Bounds | None) -> tuple[Tile, ...]:

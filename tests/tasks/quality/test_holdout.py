@@ -12,9 +12,10 @@ from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality.estimate import INTERVAL, heights_fitted
 from flexroad.tasks.quality.holdout import INSET_M, Holdout, holdout, withheld_squares
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
-from flexroad.tools.prepare.points.to_rasters import Options, rasterise
+from flexroad.tools.prepare.points.to_rasters import Options
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from flexroad.tools.synthetic.scene import scan
+from tests.make_clouds import rasterise
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
 EVERYWHERE = np.ones(GRID.shape, bool)

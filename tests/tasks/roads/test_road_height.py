@@ -16,9 +16,9 @@ from flexroad.tasks.roads.road_height import dsm_offset, with_road_heights
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 from flexroad.tools.prepare.points.to_rasters import Options as Rastering
-from flexroad.tools.prepare.points.to_rasters import rasterise
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from flexroad.tools.synthetic.scene import scan
+from tests.make_clouds import rasterise
 
 GRID = Grid("EPSG:25832", 500000, 5600300, 1.0, 300, 300)
 AROUND_M = 75

@@ -7,7 +7,7 @@ import shapely
 
 from flexroad.catalog import Grid, Tile
 from flexroad.tasks.roads.level_numbers import level_numbers
-from flexroad.tools.check import decks
+from flexroad.tools.check import catalog as catalog_check
 from flexroad.tools.check.likely_decks import Deck
 from flexroad.tools.synthetic.crossings import Crossings
 from flexroad.tools.synthetic.scenes import write_scenes
@@ -111,7 +111,7 @@ def test_tiles_in_local_coordinates_have_no_map(tmp_path):
     site = 'LOCAL_CS["my site",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
     deck = Deck(shapely.box(0, 0, 9, 9), 6.0, 2)
     tile = Tile("a", Grid(site, 0, 60, 1.0, 60, 60), (), "", datetime.now(UTC))
-    (line,) = decks._written(tmp_path / "decks.geojson", [(tile, deck)])
+    (line,) = catalog_check._written(tmp_path / "decks.geojson", [(tile, deck)])
     assert line.text == f"{LINE}; no map of them, as their CRS has no place on the Earth"
     assert list(tmp_path.iterdir()) == []
 
@@ -129,12 +129,12 @@ def test_tiles_in_local_coordinates_have_no_map(tmp_path):
 def test_places_that_may_be_roofs_are_counted_apart(tmp_path, ends, words):
     tile = Tile("a", Grid("EPSG:25832", 0, 60, 1.0, 60, 60), (), "", datetime.now(UTC))
     found = [(tile, Deck(shapely.box(0, 0, 9, 9), 6.0, number)) for number in ends]
-    (line,) = decks._written(tmp_path / "decks.geojson", found)
+    (line,) = catalog_check._written(tmp_path / "decks.geojson", found)
     assert line.text.startswith(f"{words}; no road there has a level: check {tmp_path}")
 
 
 def test_large_catalog_is_mapped_if_asked_for(unnamed, told, monkeypatch):
-    monkeypatch.setattr(decks, "MOST_TILES", 3)
+    monkeypatch.setattr(catalog_check, "MOST_TILES", 3)
     path = unnamed.with_name("decks.geojson")
     (line,) = told(unnamed)
     assert line == f"{LINE}, on 3 of 4 tiles: look at all with --decks"

@@ -11,7 +11,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.prepare.from_mesh import POINTS, MeshOptions, prepare_mesh
 from flexroad.tools.prepare.mesh.read import read_mesh
-from flexroad.tools.prepare.mesh.sample import surface_heights
+from flexroad.tools.prepare.mesh.sample import project_down
 from flexroad.tools.prepare.options import PrepareOptions
 
 CRS = "EPSG:32617"
@@ -178,7 +178,7 @@ def test_prepare_mesh_deepscenario_matches_mesh_and_map(real_data, tmp_path):
     (tile,) = Catalog.read(published.catalog).tiles
     assert tile.grid.crs == "EPSG:32617"
     fine = Grid.covering(CRS, tile.grid.bounds, 0.1)
-    rendered = surface_heights(read_mesh(path), fine).reshape(tile.grid.height, 10, tile.grid.width, 10)
+    rendered = project_down(read_mesh(path), fine)[0].reshape(tile.grid.height, 10, tile.grid.width, 10)
     whole = np.isfinite(rendered).all(axis=(1, 3))
     assert whole.sum() > 1000
     difference = (rendered.max(axis=(1, 3)) - read(tmp_path / "dsm.tif"))[whole]

@@ -20,9 +20,9 @@ from flexroad.tools.prepare import from_points as points
 from flexroad.tools.prepare import point_buckets, point_reading
 from flexroad.tools.prepare.from_points import prepare_points
 from flexroad.tools.prepare.options import PrepareOptions
-from flexroad.tools.prepare.points.to_rasters import Options, rasterise
-from flexroad.tools.prepare.types import Points
-from tests.make_clouds import write_cloud
+from flexroad.tools.prepare.points.binning import Points
+from flexroad.tools.prepare.points.to_rasters import Options
+from tests.make_clouds import rasterise, write_cloud
 
 SIZE = np.array([130.0, 90.0])
 """Size of the synthetic ground (m); its south-west corner is at whole metres."""

@@ -60,12 +60,6 @@ def test_hillshade_nan_cells_have_nodata_colour():
     assert not near(on_map(png, 50, 50), render.UNKNOWN, 10)
 
 
-def test_hillshade_with_road_is_darker_on_road_only():
-    plain, with_road = (render.hillshade(RELIEF, GRID, road=road) for road in (None, np.abs(COL - 60) < 8))
-    assert on_map(with_road, 125, 60).mean() < on_map(plain, 125, 60).mean() - 50
-    np.testing.assert_allclose(on_map(with_road, 125, 180), on_map(plain, 125, 180), atol=6)
-
-
 def test_filter_picture_colours_kept_and_dropped_cells():
     raw = np.abs(COL - 60) < 12
     kept = raw & (ROW > 80)
@@ -118,7 +112,7 @@ def test_pictures_of_empty_data_are_drawn():
     empty = np.full(GRID.shape, np.nan)
     none = np.zeros(GRID.shape, bool)
     for png in (
-        render.hillshade(empty, GRID, road=none),
+        render.hillshade(empty, GRID),
         render.filter_picture(empty, none, none, GRID),
         render.error_map(empty, GRID, road=none),
     ):
@@ -129,9 +123,9 @@ def test_pictures_of_noise_are_small():
     noise = np.random.default_rng(0).normal(0, 0.1, GRID.shape)
     rough = RELIEF + np.where(noise > 0.1, 10, 0)
     for png in (
-        render.hillshade(rough, GRID, "rough"),
-        render.error_map(noise, GRID, "noise"),
-        render.filter_picture(rough, noise > 0, noise > 0.1, GRID, "noise"),
+        render.hillshade(rough, GRID),
+        render.error_map(noise, GRID),
+        render.filter_picture(rough, noise > 0, noise > 0.1, GRID),
     ):
         assert len(png) < 120_000
         assert pixels(png).shape[1] == 480
@@ -147,7 +141,7 @@ def test_hillshade_of_any_shape_has_fixed_width(width, height):
 
 
 def test_hillshade_twice_gives_equal_bytes():
-    assert render.hillshade(RELIEF, GRID, "a") == render.hillshade(RELIEF, GRID, "a")
+    assert render.hillshade(RELIEF, GRID) == render.hillshade(RELIEF, GRID)
 
 
 def sheet(n: int = 26) -> Mesh:

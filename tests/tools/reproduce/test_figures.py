@@ -18,7 +18,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
-from flexroad.tools.reproduce import figures, tile_figures, tile_view, trajectory
+from flexroad.tools.reproduce import figures, tile_figures, tile_view
 from flexroad.tools.reproduce.layout import DPI, SMALL_PX
 from flexroad.tools.reproduce.metrics_data import collect
 
@@ -158,7 +158,7 @@ def test_trajectory_on_straight_road_is_right_of_centre():
     road = np.zeros((80, 120), bool)
     road[40:50] = True
     road[40:44, 60] = False  # a hole in the mask does not interrupt the road
-    row, col = trajectory.vehicle_trajectory(road)
+    row, col = tile_view.vehicle_trajectory(road)
     assert np.ptp(col) > 95
     assert road[row.round().astype(int), col.round().astype(int)].mean() > 0.98
     # Rows increase southwards: eastbound traffic uses the southern half of the road.
@@ -171,7 +171,7 @@ def test_trajectory_at_fork_is_longest_path():
     road = np.zeros((150, 150), bool)
     road[70:78, :] = True
     road[:75, 40:48] = True
-    row, col = trajectory.vehicle_trajectory(road)
+    row, col = tile_view.vehicle_trajectory(road)
     along = np.hypot(np.diff(row), np.diff(col)).sum()
     # From the northern to the eastern end.
     assert abs(along - (74 + 106)) < 30
@@ -182,7 +182,7 @@ def test_trajectory_at_fork_is_longest_path():
 
 def test_trajectory_on_diagonal_road_ends_at_tile_edge():
     row, col = np.indices((200, 200))
-    row, col = trajectory.vehicle_trajectory(np.abs(row - col) < 20)
+    row, col = tile_view.vehicle_trajectory(np.abs(row - col) < 20)
     # The path is straight: one that continued along the tile's edge would be longer than its chord.
     along = np.hypot(np.diff(row), np.diff(col)).sum()
     assert along / np.hypot(row[-1] - row[0], col[-1] - col[0]) < 1.001
@@ -193,7 +193,7 @@ def test_trajectory_on_diagonal_road_ends_at_tile_edge():
 def test_trajectory_on_tiny_road_is_empty_or_short(cells):
     road = np.zeros((20, 20), bool)
     road[5, 5 : 5 + cells] = True
-    row, col = trajectory.vehicle_trajectory(road)
+    row, col = tile_view.vehicle_trajectory(road)
     assert row.size == col.size <= 4
 
 

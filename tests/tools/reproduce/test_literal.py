@@ -6,14 +6,10 @@ import pandas as pd
 
 from flexroad.tools.report.content import FIGURES
 from flexroad.tools.reproduce.comparison import compare
-from flexroad.tools.reproduce.metrics_data import (
-    FIGURE_DTYPE,
-    MetricsData,
-    read_metrics_data,
-    write_metrics_data,
-)
+from flexroad.tools.reproduce.metrics_data import FIGURE_DTYPE, MetricsData, write_metrics_data
 from flexroad.tools.reproduce.published import TABLE_I, TABLE_II, published
 from flexroad.tools.reproduce.tables import pages
+from tests.stored_metrics import read_metrics_data
 
 VARIANTS = [row.variant for row in (*TABLE_II, *TABLE_I[:2])]
 

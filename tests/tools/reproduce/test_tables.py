@@ -19,7 +19,6 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.tables import metrics_frame
 from flexroad.tools.report.content import FIGURES
-from flexroad.tools.reproduce.bootstrap import bootstrap
 from flexroad.tools.reproduce.claims import (
     HELD,
     NOT_DECIDED,
@@ -27,19 +26,15 @@ from flexroad.tools.reproduce.claims import (
     NOT_TESTED,
     STRONGER,
     WEAKER,
+    bootstrap,
     check,
     percent,
 )
 from flexroad.tools.reproduce.comparison import compare
-from flexroad.tools.reproduce.metrics_data import (
-    FIGURE_DTYPE,
-    MetricsData,
-    collect,
-    read_metrics_data,
-    write_metrics_data,
-)
+from flexroad.tools.reproduce.metrics_data import FIGURE_DTYPE, MetricsData, collect, write_metrics_data
 from flexroad.tools.reproduce.published import TABLE_I_DSC3D, TABLE_II, Claim, published
 from flexroad.tools.reproduce.tables import pages, write_comparison
+from tests.stored_metrics import read_metrics_data
 
 VARIANTS = list(load_config("ablation").chains)
 

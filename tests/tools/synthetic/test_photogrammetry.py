@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
 from flexroad.tools.prepare.mesh.sample import orthophoto as mesh_orthophoto
-from flexroad.tools.prepare.mesh.sample import surface_heights
+from flexroad.tools.prepare.mesh.sample import project_down
 from flexroad.tools.synthetic import Kind
 from flexroad.tools.synthetic.dsc3d import SITES, SIZE_M, survey
 from flexroad.tools.synthetic.orthophoto import orthophoto
@@ -28,7 +28,7 @@ def scene(place):
 @pytest.fixture(scope="module")
 def height(scene):
     """Height of the mesh at the nodes it was made from; NaN in open holes."""
-    return surface_heights(scene.mesh, scene.surface.grid)
+    return project_down(scene.mesh, scene.surface.grid)[0]
 
 
 def test_sites_span_ranges_of_paper():

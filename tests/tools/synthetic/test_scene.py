@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from flexroad.catalog import CatalogError, Grid
 from flexroad.tasks import TaskError
-from flexroad.tools.prepare.points.to_rasters import Options, rasterise
+from flexroad.tools.prepare.points.to_rasters import Options
 from flexroad.tools.synthetic import Kind, Scene, SceneOptions, block, make_scene
 from flexroad.tools.synthetic.network import STRATA, Plan, stratum_at
 from flexroad.tools.synthetic.scene import DECK, GROUND, scan, true_height
+from tests.make_clouds import rasterise
 
 CLEAN = SceneOptions(density=0, mask_errors=0, dsm_noise_m=(0, 0), dtm_noise_m=0)
 SILENT = SceneOptions(dsm_noise_m=(0, 0))

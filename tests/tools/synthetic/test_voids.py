@@ -10,7 +10,7 @@ from flexroad.tools.synthetic.network import Plan
 from flexroad.tools.synthetic.objects import Crown, from_middle
 from flexroad.tools.synthetic.orthophoto import orthophoto
 from flexroad.tools.synthetic.spoilers import Canvas
-from flexroad.tools.synthetic.voids import hidden
+from flexroad.tools.synthetic.survey_errors import hidden
 
 GRID = block(1)[0][1]
 WET = {"stream_share": 1.0, "density": 0.0}

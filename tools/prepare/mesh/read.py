@@ -87,7 +87,10 @@ def read_mesh(
         raise TaskError(
             f"{path} has no faces; export a mesh, or use its points: prepare points", file=str(path)
         )
-    vertices = _z_up(np.concatenate([part.vertices for part in parts]), up or _usual_up(path))
+    vertices = np.concatenate([part.vertices for part in parts])
+    if (up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")) == "y":
+        # Rotated, so that faces keep their orientation.
+        vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
     counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([p.faces + first for p, first in zip(parts, counts, strict=False)])
     vertices, faces = _used(path, vertices, faces)
@@ -228,17 +231,6 @@ def _in_scene(scene: Any) -> Georeference:
     return Georeference(crs, (east, north, up))
 
 
-def _usual_up(path: Path) -> str:
-    return "y" if path.suffix.lower() in (".glb", ".gltf") else "z"
-
-
-def _z_up(vertices: Floats, up: str) -> Floats:
-    """Rotate (x, y, z) with y up to (x, -z, y); the orientation of faces is kept."""
-    if up == "z":
-        return vertices
-    return vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
-
-
 def _used(path: Path, vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
     """Return the mesh without the vertices that no face uses, if one of these is not a place."""
     valid: Bools = np.asarray((np.abs(vertices) <= FARTHEST).all(axis=1))
@@ -286,7 +278,11 @@ def gltf_elements(path: Path) -> int:
     if max(len(nodes), sum(map(len, meshes))) > MOST_NODES:
         raise ValueError(f"it has more than {MOST_NODES:,} nodes or primitives")
     _check_graph(nodes)
-    sizes: list[int] = [sum(_primitive(part, counts) for part in parts) for parts in meshes]
+    sizes = [0] * len(meshes)
+    for number, primitives in enumerate(meshes):
+        for part in primitives:
+            used = [*part.get("attributes", {}).values(), *([part["indices"]] if "indices" in part else [])]
+            sizes[number] += sum(counts[index] for index in used)
     placed = sum(sizes[int(node["mesh"])] for node in nodes if "mesh" in node)
     return bare + sum(sizes) + placed
 
@@ -294,12 +290,10 @@ def gltf_elements(path: Path) -> int:
 def _header(path: Path) -> dict[str, Any]:
     with path.open("rb") as file:
         head = file.read(20)
-        if head[:4] != MAGIC:
-            file.seek(0)
-            content = file.read()
+        if head[:4] == MAGIC:
+            header = json.loads(file.read(int.from_bytes(head[12:16], "little")))
         else:
-            content = file.read(int.from_bytes(head[12:16], "little"))
-    header = json.loads(content)
+            header = json.loads(head + file.read())
     if not isinstance(header, dict):
         raise TypeError("its JSON is not an object")
     return header
@@ -310,11 +304,6 @@ def _count(accessor: dict[str, Any]) -> int:
     if not isinstance(count, int) or count < 0:
         raise ValueError(f"an accessor has {str(count)[:50]} elements")
     return count
-
-
-def _primitive(part: dict[str, Any], counts: list[int]) -> int:
-    used = [*part.get("attributes", {}).values(), *([part["indices"]] if "indices" in part else [])]
-    return sum(counts[index] for index in used)
 
 
 def _check_graph(nodes: list[dict[str, Any]]) -> None:

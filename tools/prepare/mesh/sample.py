@@ -17,7 +17,7 @@ from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats, Orthophoto
-from flexroad.tools.prepare.types import Points
+from flexroad.tools.prepare.points.binning import Points
 
 CHUNK = 500_000
 """Points, or rays of the orthophoto, processed at a time, so that memory does not grow with the area."""
@@ -88,7 +88,6 @@ def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
     input gives equal points.
 
     - `mesh`: in a CRS in metres.
-    - `density`: points per m2 of surface.
     - result: at most `CHUNK` points, with colours if all faces have a colour.
     """
     rng = np.random.default_rng(seed)
@@ -124,22 +123,12 @@ def orthophoto(mesh: TexturedMesh, grid: Grid) -> Orthophoto:
     return Orthophoto(grid, colour, valid)
 
 
-def surface_heights(mesh: TexturedMesh, grid: Grid) -> Floats:
-    """Return the height of the highest surface at each cell's centre, ``(H, W)``; NaN where there is none."""
-    return _project_down(mesh, grid)[0]
-
-
-def covered_cells(mesh: TexturedMesh, grid: Grid) -> Bools:
-    """Return the cells whose centre is inside a face in plan, ``(H, W)``."""
-    return _project_down(mesh, grid)[1] >= 0
-
-
 def _draw_rows(mesh: TexturedMesh, grid: Grid, rows: slice, rays: int) -> tuple[NDArray[np.uint8], Bools]:
     """Return colours, ``(3, h, W)``, and validity, ``(h, W)``, of some rows of an orthophoto."""
     height = rows.stop - rows.start
     north = grid.north - rows.start * grid.cell
     fine = Grid(grid.crs, grid.west, north, grid.cell / rays, grid.width * rays, height * rays)
-    _, face_index = _project_down(mesh, fine)
+    _, face_index = project_down(mesh, fine)
     row, col = np.nonzero(face_index >= 0)
     face = face_index[row, col]
     colour = np.zeros((*fine.shape, 3), np.float32)
@@ -228,7 +217,7 @@ def _texels(
             colour[n, band] = above * (1 - south) + below * south
 
 
-def _project_down(mesh: TexturedMesh, grid: Grid) -> tuple[Floats, Faces]:
+def project_down(mesh: TexturedMesh, grid: Grid) -> tuple[Floats, Faces]:
     """Return height and face of the highest surface at each centre, ``(H, W)``; NaN and -1 without one."""
     # Column and row in metres from the centre of the north-western cell: small numbers.
     points = np.column_stack(

@@ -112,7 +112,10 @@ def read_shot(path: Path) -> Shot:
         check_pixels(image, str(path), remedy, path)
         memory.check(BYTES * image.width * image.height, str(path), remedy, str(path))
         exif, (width, height) = image.getexif(), image.size
-        xmp = _xmp(image.info.get("xmp", b""))
+        packet = image.info.get("xmp", b"")
+        text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
+        # DJI's tags may be attributes or elements.
+        xmp = dict(re.findall(r'drone-dji:(\w+)\s*(?:="|>)\s*([^"<]*)', text))
         # A truncated file is only detected when its pixels are read.
         image.draft("L", (width // 8, height // 8))
         image.load()
@@ -189,12 +192,6 @@ def read_control(path: Path, placed: PlacedPhotos, crs: str | None = None) -> Co
     transformer = Transformer.from_crs(in_plan(crs or placed.crs), placed.crs, always_xy=True)
     points[:, 0], points[:, 1] = transformer.transform(points[:, 0], points[:, 1])
     return Control(tuple(by_name), points, tuple(marks for _, marks in by_name.values()))
-
-
-def _xmp(packet: bytes | str) -> dict[str, str]:
-    """Return DJI's tags, which may be attributes or elements."""
-    text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
-    return dict(re.findall(r'drone-dji:(\w+)\s*(?:="|>)\s*([^"<]*)', text))
 
 
 def _from_xmp(xmp: Mapping[str, str]) -> tuple[float, float, float, str] | None:

@@ -61,7 +61,7 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class Pinhole:
+class _Pinhole:
     """A camera without distortion: focal length, and position of the pixels on the image plane."""
 
     focal: float
@@ -81,15 +81,15 @@ class Pinhole:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class _Pair:
     """Two photographs rectified to a common camera, displaced along its rows."""
 
     rotation: Floats
     """World to the common camera, ``(3, 3)``; x points from the first photograph to the second."""
     base_m: float
     """Distance of the projection centres (m)."""
-    first: Pinhole
-    second: Pinhole
+    first: _Pinhole
+    second: _Pinhole
     parallaxes: int
     """Number of parallaxes to search (px); 0 is the farthest depth."""
 
@@ -175,10 +175,10 @@ def _scale(view: View, size: int) -> float:
     return min(1.0, size / max(view.camera.width, view.camera.height))
 
 
-def _pinhole(view: View, size: int) -> Pinhole:
+def _pinhole(view: View, size: int) -> _Pinhole:
     camera, scale = view.camera, _scale(view, size)
     width, height = round(camera.width * scale), round(camera.height * scale)
-    return Pinhole(camera.focal_px * scale, -width / 2, -height / 2, width, height)
+    return _Pinhole(camera.focal_px * scale, -width / 2, -height / 2, width, height)
 
 
 def _read(view: View, size: int) -> NDArray[np.uint8]:
@@ -196,7 +196,7 @@ def _read(view: View, size: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def _rectify(view: View, other: View, points: Floats, focal: float) -> Pair:
+def _rectify(view: View, other: View, points: Floats, focal: float) -> _Pair:
     base = other.centre - view.centre
     length = float(np.linalg.norm(base))
     x = base / length
@@ -214,11 +214,11 @@ def _rectify(view: View, other: View, points: Floats, focal: float) -> Pair:
     farthest = focal * length / far
     left, right = a[0] - parallaxes, a[2]
     width, height = math.ceil(right - left), max(math.ceil(bottom - top), 1)
-    return Pair(
+    return _Pair(
         rotation,
         length,
-        Pinhole(focal, left, top, width, height),
-        Pinhole(focal, left - farthest, top, width, height),
+        _Pinhole(focal, left, top, width, height),
+        _Pinhole(focal, left - farthest, top, width, height),
         parallaxes,
     )
 
@@ -233,7 +233,7 @@ def _frame(view: View, rotation: Floats, focal: float) -> tuple[float, float, fl
 
 
 def _resampled(
-    view: View, image: NDArray[np.uint8], rotation: Floats, pixels: Pinhole
+    view: View, image: NDArray[np.uint8], rotation: Floats, pixels: _Pinhole
 ) -> tuple[NDArray[np.uint8], Bools]:
     """Return a photograph resampled to other pixels, ``(h, w, 3)``, and which it covers, ``(h, w)``."""
     camera = view.camera
@@ -256,7 +256,7 @@ def _match(
     image: NDArray[np.uint8],
     other: View,
     partner: NDArray[np.uint8],
-    pair: Pair,
+    pair: _Pair,
     options: Options,
 ) -> NDArray[np.float32]:
     """Return depths of the first photograph along the common camera's z, ``(h, w)``, m; NaN if unmatched."""
@@ -288,7 +288,7 @@ def _match(
 
 
 def _to_view(
-    rays: NDArray[np.float32], view: View, pair: Pair, depth: NDArray[np.float32]
+    rays: NDArray[np.float32], view: View, pair: _Pair, depth: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Return depths along the photograph's z at its own pixels, ``(h, w)``, m.
 

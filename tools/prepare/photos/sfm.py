@@ -59,7 +59,7 @@ class Options(base.Options):
 
 
 @dataclass(frozen=True)
-class Camera:
+class _Camera:
     """A lens and sensor, as a COLMAP camera model."""
 
     model: str
@@ -79,7 +79,7 @@ class View:
     """A photograph with its pose."""
 
     path: Path
-    camera: Camera
+    camera: _Camera
     rotation: Floats
     """World to camera, ``(3, 3)``; the viewing direction is z, rows increase along y."""
     centre: Floats
@@ -142,7 +142,6 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct the poses of photographs and sparse points from their features and GNSS positions.
 
-    - `placed`: the photographs and their GNSS positions.
     - `work`: empty folder for the database and the model.
     - `options`: options. The same seed and number of threads give the same result up to rounding.
     - `control`: ground control points. If 3 or more are marked in at least 2 placed photographs each, they
@@ -300,20 +299,16 @@ def _control(model: Any, shots: Mapping[str, Shot], control: Control, origin: Fl
     for image in image_of.values():
         config.add_image(image.image_id)
     for point, rays in zip(given, observations, strict=True):
-        config.add_constant_point(_add_point(model, point, rays))
+        track = pycolmap.Track()
+        for image, pixel in rays:
+            image.points2D.append(pycolmap.Point2D(pixel))
+            track.add_element(image.image_id, len(image.points2D) - 1)
+        config.add_constant_point(int(model.add_point3D(point, track)))
     pycolmap.create_default_bundle_adjuster(
         pycolmap.BundleAdjustmentOptions(print_summary=False), config, model
     ).solve()
     residuals: Floats = np.array([_intersect(rays) for rays in observations]) - given
     return residuals
-
-
-def _add_point(model: Any, point: Floats, rays: Sequence[tuple[Any, Floats]]) -> int:
-    track = pycolmap.Track()
-    for image, pixel in rays:
-        image.points2D.append(pycolmap.Point2D(pixel))
-        track.add_element(image.image_id, len(image.points2D) - 1)
-    return int(model.add_point3D(point, track))
 
 
 def _intersect(rays: Sequence[tuple[Any, Floats]]) -> Floats:
@@ -362,7 +357,7 @@ def _view(image: Any, path: Path, index: Mapping[int, int]) -> View:
     visible = {index[p.point3D_id] for p in image.points2D if p.has_point3D()}
     return View(
         path=path,
-        camera=Camera(camera.model.name, camera.width, camera.height, tuple(camera.params.tolist())),
+        camera=_Camera(camera.model.name, camera.width, camera.height, tuple(camera.params.tolist())),
         rotation=image.cam_from_world().rotation.matrix(),
         centre=image.projection_center(),
         visible=np.array(sorted(visible), np.intp),

@@ -1,4 +1,4 @@
-"""The cell of each point, and what the points of a cell give: means, the highest point and the top layer.
+"""Points, the cell of each, and what the points of a cell give: means, highest point, top layer, colour.
 
 The highest of n points with noise is above the surface, the more so the more points a cell has. The mean of
 the points close below it, the top layer, is not, and still belongs to the uppermost surface: a deck, not the
@@ -7,7 +7,7 @@ ground under it. A single point far above all around it is a spike.
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,7 @@ from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Floats
-from flexroad.tools.prepare.types import TopLayer
+from flexroad.tasks.types import Bools, Floats, Orthophoto
 
 Cells = NDArray[np.int64]
 """Row-major index of the cell of each point, ``(n,)``; -1 outside the grid."""
@@ -25,6 +24,33 @@ NUDGE = 1e-6
 """Part of a cell that is more than the rounding error of its edge's coordinates."""
 AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 """The 8 neighbours of a cell."""
+Codes = NDArray[np.int32]
+"""Colours as 24-bit numbers (red, green, blue from the highest byte); -1 if there is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """A point cloud in the metric CRS of the rasters."""
+
+    easting: Floats
+    """``(n,)``, m."""
+    northing: Floats
+    """``(n,)``, m."""
+    height: Floats
+    """``(n,)``, m."""
+    kind: NDArray[np.uint8]
+    """Class by ASPRS, ``(n,)``: 2 is ground, 17 a bridge deck, 0 and 1 are unclassified."""
+    colour: NDArray[np.uint8] | None = None
+    """Red, green, blue, ``(n, 3)``, or None if the source has no colours."""
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.height)
+
+    def __getitem__(self, key: slice | Bools | NDArray[np.intp]) -> Points:
+        """Return a subset of the points, by a slice, a mask or indices."""
+        colour = None if self.colour is None else self.colour[key]
+        return Points(self.easting[key], self.northing[key], self.height[key], self.kind[key], colour)
 
 
 def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
@@ -33,23 +59,10 @@ def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
     A point on the border of two cells belongs to the eastern or southern one. Rounding does not change that,
     so all grids of the same lattice give the same result.
     """
-    cells: Cells = _bins(
-        np.asarray(easting), np.asarray(northing), grid.west, grid.north, grid.cell, grid.height, grid.width
-    )
-    return cells
-
-
-@compiled()
-def _bins(
-    easting: Floats, northing: Floats, west: float, north: float, cell: float, rows: int, cols: int
-) -> Cells:
-    cells = np.full(easting.size, -1, np.int64)
-    for i in range(easting.size):
-        col = math.floor((easting[i] - west) / cell + NUDGE)
-        row = math.floor((north - northing[i]) / cell + NUDGE)
-        if 0 <= row < rows and 0 <= col < cols:
-            cells[i] = row * cols + col
-    return cells
+    row = np.floor((grid.north - northing) / grid.cell + NUDGE)
+    col = np.floor((easting - grid.west) / grid.cell + NUDGE)
+    inside = (row >= 0) & (row < grid.height) & (col >= 0) & (col < grid.width)
+    return np.where(inside, row * grid.width + col, -1).astype(np.int64)
 
 
 def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats, ...]:
@@ -58,23 +71,13 @@ def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats
     Values are summed in the order of the points: another order changes only the last digits.
 
     - `cells`: the cells of the points, ``(n,)``; points outside the grid are left out.
-    - `shape`: rows and columns.
-    - `values`: one value per point, ``(n,)``.
     """
-    size = shape[0] * shape[1]
+    # The first number is that of the points outside.
+    numbers, size = cells + 1, shape[0] * shape[1] + 1
+    count = np.bincount(numbers, minlength=size)
     with np.errstate(invalid="ignore"):
-        return tuple(np.divide(*_totals(cells, value, size)).reshape(shape) for value in values)
-
-
-@compiled()
-def _totals(cells: Cells, value: Floats, size: int) -> tuple[Floats, Floats]:
-    """Return the sum of the values and their number, per cell."""
-    total, count = np.zeros(size), np.zeros(size)
-    for i in range(cells.size):
-        if cells[i] >= 0:
-            total[cells[i]] += value[i]
-            count[cells[i]] += 1.0
-    return total, count
+        found = (np.bincount(numbers, value, size) / count for value in values)
+        return tuple(mean[1:].reshape(shape) for mean in found)
 
 
 def highest(cells: Cells, height: Floats, shape: tuple[int, int]) -> Floats:
@@ -115,33 +118,73 @@ def _two_highest(cells: Cells, height: Floats, size: int) -> tuple[Floats, Float
 
 def top_layer(
     cells: Cells, height: Floats, highest: Floats, depth_m: float, shape: tuple[int, int]
-) -> TopLayer:
-    """Return mean, number and spread of the points of each cell's top layer.
+) -> Floats:
+    """Return the top layer of each cell: mean height (m), number and spread of its points, ``(3, H, W)``.
 
-    - `cells`: the cells of the points, ``(n,)``.
-    - `height`: the points, ``(n,)``, m.
+    The spread is the standard deviation of the heights (m): 0 for one point. Where there are no points, it
+    and the mean are NaN.
+
     - `highest`: highest point per cell, ``(H, W)``, m; NaN where there is none.
     - `depth_m`: points up to this much below the highest one belong to the top layer (m).
-    - `shape`: rows and columns.
     """
-    count, below, squared = _sums(cells, height, highest.ravel(), depth_m)
+    inside = cells >= 0
+    cells = cells[inside]
+    below = height[inside] - highest.ravel()[cells]
+    cells, below = cells[below >= -depth_m], below[below >= -depth_m]
+    count = np.bincount(cells, minlength=highest.size)
     with np.errstate(invalid="ignore"):
-        mean, square = below / count, squared / count
+        mean, square = (np.bincount(cells, values, highest.size) / count for values in (below, below * below))
     spread = np.sqrt(np.maximum(square - mean**2, 0.0))
-    return TopLayer(highest + mean.reshape(shape), count.reshape(shape), spread.reshape(shape))
+    return np.stack([highest + mean.reshape(shape), count.reshape(shape), spread.reshape(shape)])
+
+
+def photo(points: Points, grid: Grid, fill_m: float) -> Orthophoto:
+    """Return the colour of the highest point in each pixel; voids have that of the nearest valid pixel.
+
+    Of points at the same height, the one with the greatest red, then green, then blue is used; of pixels at
+    the same distance, the northernmost, then the westernmost.
+
+    - `points`: must have colours, and include a rim of ``fill_m`` around the grid.
+    - `fill_m`: pixels whose centre is farther than this from that of a valid pixel stay without colour (m).
+    """
+    assert points.colour is not None
+    rim = grid.buffered(fill_m)
+    red, green, blue = points.colour.T.astype(np.int32)
+    top = _top_codes(
+        bins(points.easting, points.northing, rim), points.height, red << 16 | green << 8 | blue, rim.shape
+    )
+    # Offsets to the pixels within the distance, the nearest first.
+    radius = fill_m / grid.cell
+    reach = int(radius + 1e-9)
+    row, col = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
+    square = row**2 + col**2
+    order = np.lexsort((col, row, square))[: np.count_nonzero(square <= radius**2 + 1e-9)]
+    codes = _nearest(top, np.stack([row, col], axis=1)[order])[rim.window(grid)]
+    colour = np.stack([codes >> 16 & 255, codes >> 8 & 255, codes & 255]).astype(np.uint8)
+    valid = codes >= 0
+    return Orthophoto(grid, np.where(valid, colour, np.uint8(0)), valid)
 
 
 @compiled()
-def _sums(cells: Cells, height: Floats, highest: Floats, depth_m: float) -> tuple[Floats, Floats, Floats]:
-    """Return number, sum and sum of squares of the heights relative to the highest, per cell."""
-    count, below, squared = np.zeros_like(highest), np.zeros_like(highest), np.zeros_like(highest)
+def _top_codes(cells: Cells, height: Floats, codes: Codes, shape: tuple[int, int]) -> Codes:
+    top = np.full(shape[0] * shape[1], -np.inf)
+    best = np.full(top.size, -1, np.int32)
     for i in range(cells.size):
         c = cells[i]
-        if c < 0:
-            continue
-        z = height[i] - highest[c]
-        if z >= -depth_m:
-            count[c] += 1.0
-            below[c] += z
-            squared[c] += z * z
-    return count, below, squared
+        if c >= 0 and (height[i] > top[c] or (height[i] == top[c] and codes[i] > best[c])):
+            top[c], best[c] = height[i], codes[i]
+    return best.reshape(shape)
+
+
+@compiled()
+def _nearest(codes: Codes, offsets: NDArray[np.int64]) -> Codes:
+    rows, cols = codes.shape
+    filled = codes.copy()
+    for r in range(rows):
+        for c in range(cols):
+            for k in range(offsets.shape[0]):
+                row, col = r + offsets[k, 0], c + offsets[k, 1]
+                if 0 <= row < rows and 0 <= col < cols and codes[row, col] >= 0:
+                    filled[r, c] = codes[row, col]
+                    break
+    return filled

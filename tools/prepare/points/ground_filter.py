@@ -70,7 +70,6 @@ def ground_cells(heights: Floats, cell: float, options: Options) -> Bools:
     """Return which cells of a surface model are ground: `ground` applied to the cell centres.
 
     - `heights` ``(H, W)``: in metres; cells with NaN are not ground.
-    - `cell`: cell size (m).
     """
     row, col = np.indices(heights.shape, np.float64).reshape(2, -1)
     return ground(col * cell, -row * cell, heights.ravel(), options).reshape(heights.shape)

@@ -54,7 +54,7 @@ class Options(base.Options):
 
 def without_low_outliers(
     easting: Floats, northing: Floats, height: Floats, radius_m: float, options: Options
-) -> Buckets:
+) -> _Buckets:
     """Return the points that are finite and no low outliers, sorted into buckets.
 
     A point is a low outlier if within ``low_radius_m`` at most ``low_companions`` others are lower or at most
@@ -69,11 +69,11 @@ def without_low_outliers(
     valid = np.flatnonzero(np.isfinite(easting) & np.isfinite(northing) & np.isfinite(height))
     if valid.size == 0:
         nothing = np.zeros(0)
-        return Buckets(nothing, nothing, nothing, valid, np.zeros(2, np.int64), (1, 1), radius_m)
+        return _Buckets(nothing, nothing, nothing, valid, np.zeros(2, np.int64), (1, 1), radius_m)
     is_part = valid.size < height.size
     if is_part:
         easting, northing, height = easting[valid], northing[valid], height[valid]
-    points = Buckets.of(easting, northing, height, radius_m)
+    points = _Buckets.of(easting, northing, height, radius_m)
     if options.low_m is not None:
         low = _low_outliers(*points.arrays, options.low_radius_m, options.low_m, options.low_companions)
         points = points.without(low)
@@ -81,7 +81,7 @@ def without_low_outliers(
 
 
 @dataclass(frozen=True, eq=False)
-class Buckets:
+class _Buckets:
     """Points sorted by square bucket and, within a bucket, by height."""
 
     x: Floats
@@ -97,7 +97,7 @@ class Buckets:
     """Side of a bucket (m)."""
 
     @classmethod
-    def of(cls, easting: Floats, northing: Floats, height: Floats, radius: float) -> Buckets:
+    def of(cls, easting: Floats, northing: Floats, height: Floats, radius: float) -> _Buckets:
         """Sort points into buckets, whose number is at most a small multiple of that of the points."""
         # Subtracting a whole-metre origin from large coordinates is exact.
         x, y = easting - math.floor(easting.min()), northing - math.floor(northing.min())
@@ -108,7 +108,7 @@ class Buckets:
         order, start = _sorted(x, y, height, shape, side)
         return cls(x[order], y[order], height[order], order, start, shape, side)
 
-    def without(self, excluded: Bools) -> Buckets:
+    def without(self, excluded: Bools) -> _Buckets:
         """Return a copy without the excluded points, given in sorted order."""
         if not excluded.any():
             return self

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.catalog.lazy import lazy
@@ -79,16 +78,11 @@ def _highest_ground(surface: Floats, radius: int, fall: float) -> Floats:
     """
     result = surface.copy()
     for size in range(1, radius + 1):
-        disk = _disk(size)
+        down, across = np.mgrid[-size : size + 1, -size : size + 1]
+        disk = np.asarray(down**2 + across**2 <= size**2, np.uint8)
         lowest = cv2.erode(surface, disk)
         # Where no point is within the disk, the lowest one is inf, or OpenCV's value beyond the border.
         there = lowest < np.finfo(np.float64).max
         opened = cv2.dilate(np.where(there, lowest, -np.inf), disk)
         np.minimum(result, opened + fall * size, out=result)
     return result
-
-
-def _disk(radius: int) -> NDArray[np.uint8]:
-    """Return the cells whose centres lie within a radius, ``(2 r + 1, 2 r + 1)``, uint8."""
-    down, across = np.mgrid[-radius : radius + 1, -radius : radius + 1]
-    return np.asarray(down**2 + across**2 <= radius**2, np.uint8)

@@ -48,7 +48,6 @@ def triangulated(ground: Floats, grid: Grid, void_m: float, inner: Window | None
     - `ground` ``(3, H, W)``: easting and northing of the cells' centroids from the grid's north-west corner,
       and their height (m); NaN without ground points.
     - `void_m`: the DTM is NaN where a circle of this diameter plus `EMPTY_CIRCLE_CELLS` has no node (m).
-    - `inner`: see `tin`.
     """
     east, north, height = ground
     interpolated = tin(east, north, height, grid, void_m + EMPTY_CIRCLE_CELLS * grid.cell, inner)

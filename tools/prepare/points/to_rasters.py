@@ -1,12 +1,11 @@
 """Rasters from a point cloud: DSM and its top layer, DTM, bridge decks and orthophoto of a block of ground.
 
-Values depend only on the points within `reach_m` of the block, not on the division into blocks or on the
-order of the points; heights agree to 1e-8 m, the rounding error of sums and large coordinates.
+Values depend only on the points near the block (`points_reach_m` + `cells_reach_m`), not on the division into
+blocks or on the order of the points; heights agree to 1e-8 m, the rounding of sums and large coordinates.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -18,13 +17,29 @@ from flexroad.tasks.types import Bools, Floats, Orthophoto
 from flexroad.tools.prepare.points import ground_filter as slope_filter
 from flexroad.tools.prepare.points import morphological as morphological_filter
 from flexroad.tools.prepare.points import tin
-from flexroad.tools.prepare.points.binning import bins, highest, means, spikes, top_layer
-from flexroad.tools.prepare.points.orthophoto import photo
-from flexroad.tools.prepare.types import CellHeights, Points, Rasters, TopLayer
+from flexroad.tools.prepare.points.binning import (
+    Points,
+    bins,
+    highest,
+    means,
+    photo,
+    spikes,
+    top_layer,
+)
 
 BRIDGE_CLASSES = {"asprs": (17,), "ahn": (26,)}
 """Classes of bridge decks by the scheme of a point cloud: ASPRS LAS 1.4, also in Switzerland, Sweden and
 North Rhine-Westphalia; the Dutch AHN, whose class of structures (kunstwerken) also has locks and weirs."""
+
+
+CELL_LAYERS = (
+    *("highest point (m)", "top layer: mean height (m)", "number of points", "spread (m)"),
+    *("ground: easting from the grid's west (m)", "northing from its north (m)", "height (m)"),
+    "bridge decks: mean height (m)",
+)
+"""What the points of each cell give, without the cells around it; NaN where there are none."""
+GROUND = "ground"
+"""Layer of the cells with ground points, for the refinement of a mesh's DTM; it is not published."""
 
 
 class Options(base.Options):
@@ -68,24 +83,10 @@ class Options(base.Options):
     )
 
 
-def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Rasters:
-    """Make the rasters of a block of ground.
-
-    - `points`: in the grid's CRS (m), including a rim of `reach_m` around the grid; others have no effect.
-    - `dop_cell`: pixel of the orthophoto (m); None makes no orthophoto.
-    - result: NaN without points, and the DTM without ground points; no orthophoto if the points have no
-      colours.
-    """
-    rim = grid.buffered(cells_reach_m(options, grid.cell))
-    pixels = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
-    heights, image = of_points(points, rim, options, pixels)
-    return replace(of_cells(heights, rim, grid, options), photo=image)
-
-
 def of_points(
     points: Points, grid: Grid, options: Options, pixels: Grid | None
-) -> tuple[CellHeights, Orthophoto | None]:
-    """Return what the points of each cell give, and the orthophoto.
+) -> tuple[Floats, Orthophoto | None]:
+    """Return what the points of each cell give, `CELL_LAYERS`, ``(8, H, W)``, and the orthophoto.
 
     - `points`: in the grid's CRS (m), including a rim of `points_reach_m` around the grid; others have no
       effect.
@@ -93,7 +94,11 @@ def of_points(
     - result: no orthophoto if the points have no colours.
     """
     if options.despike_m is not None:
-        points = _without_spikes(points, grid.buffered(points_reach_m(options, grid.cell)), options.despike_m)
+        rim = grid.buffered(points_reach_m(options, grid.cell))
+        cells = bins(points.easting, points.northing, rim)
+        kept = np.ones(len(points), bool)
+        kept[spikes(cells, points.height, rim.shape, options.despike_m)] = False
+        points = points[kept]
     cells = bins(points.easting, points.northing, grid)
     highest_points = highest(cells, points.height, grid.shape)
     top = top_layer(cells, points.height, highest_points, options.top_layer_m, grid.shape)
@@ -108,31 +113,30 @@ def of_points(
         points.height,
     )
     image = photo(points, pixels, options.dop_fill_m) if pixels and points.colour is not None else None
-    return CellHeights(highest_points, top, np.stack(of_ground), bridges), image
+    return np.stack([highest_points, *top, *of_ground, bridges]), image
 
 
-def of_cells(heights: CellHeights, rim: Grid, grid: Grid, options: Options) -> Rasters:
-    """Return the rasters of a block of ground, without orthophoto.
+def of_cells(cells: Floats, rim: Grid, grid: Grid, options: Options) -> dict[str, Floats | Bools]:
+    """Return the rasters of a block of ground by layer: heights (m), NaN where there is none, and `GROUND`.
 
-    - `heights`: on the cells of ``rim``: the grid and `cells_reach_m` around it.
+    ``road_height`` has three bands, ``(3, H, W)``: where a void is filled, the number of points is 0. Without
+    decks there is no layer ``bridges``.
+
+    - `cells`: `CELL_LAYERS` on the cells of ``rim``: the grid and `cells_reach_m` around it.
     """
     inner = rim.window(grid)
-    top = heights.top
-    dsm, road_height = tin.fill_voids(np.stack([heights.highest, top.height]), rim, options.fill_m)
-    bridges = heights.bridges[inner]
-    return Rasters(
-        grid,
-        dsm=dsm[inner],
-        dtm=_dtm(heights.ground, rim, grid, options)[inner],
-        top=TopLayer(road_height[inner], top.count[inner], top.spread[inner]),
-        ground=np.isfinite(heights.ground[2][inner]),
-        bridges=bridges if np.isfinite(bridges).any() else None,
-    )
-
-
-def reach_m(options: Options, cell: float) -> float:
-    """Return the largest distance from a grid of such cells at which points can change a value in it (m)."""
-    return points_reach_m(options, cell) + cells_reach_m(options, cell)
+    highest, top, ground, bridges = cells[0], cells[1:4], cells[4:7], cells[7][inner]
+    dsm, road_height = tin.fill_voids(np.stack([highest, top[0]]), rim, options.fill_m)
+    if options.dtm == "mean":
+        dtm = tin.fill_voids(ground[2], rim, options.void_m)
+    else:
+        dtm = tin.triangulated(ground, rim, options.void_m, inner)
+    layers: dict[str, Floats | Bools] = {"dsm": dsm[inner], "dtm": dtm[inner]}
+    layers["road_height"] = np.stack([road_height[inner], top[1][inner], top[2][inner]])
+    if np.isfinite(bridges).any():
+        layers["bridges"] = bridges
+    layers[GROUND] = np.isfinite(ground[2][inner])
+    return layers
 
 
 def points_reach_m(options: Options, cell: float) -> float:
@@ -187,13 +191,6 @@ def _classes(classes: tuple[int, ...]) -> str:
     return f"class{'es' if len(classes) > 1 else ''} {', '.join(map(str, classes))}"
 
 
-def _without_spikes(points: Points, grid: Grid, despike_m: float) -> Points:
-    cells = bins(points.easting, points.northing, grid)
-    kept = np.ones(len(points), bool)
-    kept[spikes(cells, points.height, grid.shape, despike_m)] = False
-    return points[kept]
-
-
 def _is_ground(points: Points, asked: Bools, options: Options) -> Bools:
     """Return which of the points that are asked for are ground, ``(n,)``."""
     if options.ground == "classes":
@@ -208,10 +205,3 @@ def _has_class(points: Points, classes: tuple[int, ...]) -> Bools:
     """Return which points have one of some classes, ``(n,)``."""
     chosen = np.isin(np.arange(256), classes)
     return chosen[points.kind]
-
-
-def _dtm(ground: Floats, rim: Grid, grid: Grid, options: Options) -> Floats:
-    """Return the bare ground, ``(H, W)``, m, on the cells of ``rim``; only those of ``grid`` are complete."""
-    if options.dtm == "mean":
-        return tin.fill_voids(ground[2], rim, options.void_m)
-    return tin.triangulated(ground, rim, options.void_m, rim.window(grid))

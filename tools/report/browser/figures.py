@@ -53,9 +53,7 @@ class Comparison:
 def compare(table: TileTable, before: pd.DataFrame, variant: str, name: str) -> Comparison:
     """Compare the tiles of a run with the rows of another one, called ``name``.
 
-    - `table`: the tiles of this run.
     - `before`: the other run's metrics.parquet.
-    - `variant`: the variant that is compared.
     - `name`: name of the other run in the text.
     """
     own = before[(before.variant == variant) & (before.status == "done")].drop_duplicates("tile_id")
@@ -107,7 +105,7 @@ def _line(table: TileTable, before: pd.DataFrame, name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Histogram:
+class _Histogram:
     """One chart."""
 
     title: str
@@ -118,7 +116,7 @@ class Histogram:
 
 def histograms(
     columns: dict[str, tuple[str, str, pd.Series]], limits: dict[str, float]
-) -> Iterator[Histogram]:
+) -> Iterator[_Histogram]:
     """Yield histograms of the main columns (label, unit, values); ``limits`` are the flags' thresholds."""
     shown = 0
     for name in SHOWN:
@@ -131,7 +129,7 @@ def histograms(
             continue
         shown += 1
         median, high = np.percentile(values, [50, 95])
-        yield Histogram(
+        yield _Histogram(
             f"{label} ({unit})" if unit else label,
             _svg(values, limits.get(name), label),
             f"median {short(median)}, 95% below {short(high)}; {count(len(values), 'tile')}",

@@ -128,7 +128,6 @@ def reasons(
     """Return a tile's flags in words.
 
     - `row`: the tile's row of metrics.parquet.
-    - `options`: the thresholds of the flags.
     - `places`: place of each flag, as far as known (`flexroad.tasks.quality.places.places`).
     - `notes`: notes on the sources of the tile: a DSM that lies off the DTM as a whole is why roads are
       dropped.
@@ -183,7 +182,7 @@ def _number(value: Any, percent: bool) -> str:
 
 
 @dataclass(frozen=True)
-class Statement:
+class _Statement:
     """One line on the run, with what to do."""
 
     kind: str
@@ -221,13 +220,10 @@ def cards(table: TileTable) -> list[tuple[str, int, str]]:
     return [("all", len(table.tiles), "tiles"[: 5 if len(table.tiles) != 1 else 4]), *shown]
 
 
-def statements(content: Content, table: TileTable, failed: Mapping[str, str], run: str) -> list[Statement]:
+def statements(content: Content, table: TileTable, failed: Mapping[str, str], run: str) -> list[_Statement]:
     """Return what is to be known of a run, the most urgent first.
 
-    - `content`: the tables of the run.
-    - `table`: its tiles.
     - `failed`: the error of each failed tile by id.
-    - `run`: path of the run, for commands.
     """
     run = shlex.quote(run)
     return [
@@ -242,15 +238,15 @@ def statements(content: Content, table: TileTable, failed: Mapping[str, str], ru
     ]
 
 
-def _last_run(content: Content, run: str) -> Iterator[Statement]:
+def _last_run(content: Content, run: str) -> Iterator[_Statement]:
     if content.counts.refused:
-        yield Statement("failed", f"The last run could not go on: {printable(content.counts.refused)}")
+        yield _Statement("failed", f"The last run could not go on: {printable(content.counts.refused)}")
     if content.counts.interrupted:
         text = "The last run was interrupted; its tiles are kept."
-        yield Statement("pending", text, f"flexroad rerun {run}")
+        yield _Statement("pending", text, f"flexroad rerun {run}")
 
 
-def _skipped(content: Content) -> Iterator[Statement]:
+def _skipped(content: Content) -> Iterator[_Statement]:
     """Say which files the catalog lacks: no tile tells."""
     counts = content.counts
     if not counts.skipped:
@@ -261,10 +257,10 @@ def _skipped(content: Content) -> Iterator[Statement]:
         f"The catalog lacks {count(counts.skipped, 'file')} that cannot be used: {told}. Repair what was "
         "skipped, repeat the `flexroad catalog` command, then `flexroad run`."
     )
-    yield Statement("failed", text)
+    yield _Statement("failed", text)
 
 
-def _failures(number: int, failed: Mapping[str, str], run: str) -> Iterator[Statement]:
+def _failures(number: int, failed: Mapping[str, str], run: str) -> Iterator[_Statement]:
     if not number:
         return
     kinds = Counter(_kind(text) for text in failed.values())
@@ -275,7 +271,7 @@ def _failures(number: int, failed: Mapping[str, str], run: str) -> Iterator[Stat
     )
     more = f"; {count(len(kinds) - MOST, 'other kind')} in the details" if len(kinds) > MOST else ""
     text = f"{count(number, 'tile')} failed. {told}{more}. Correct the cause, then compute only those:"
-    yield Statement("failed", text, f"flexroad rerun {run} --failed")
+    yield _Statement("failed", text, f"flexroad rerun {run} --failed")
 
 
 def _kind(error: str) -> str:
@@ -283,15 +279,15 @@ def _kind(error: str) -> str:
     return re.sub(r"\S*[\d/\\]\S*", "", error)
 
 
-def _pending(number: int, run: str, running: bool) -> Iterator[Statement]:
+def _pending(number: int, run: str, running: bool) -> Iterator[_Statement]:
     if number and running:
-        yield Statement("pending", f"{_have(number)} no result yet; the run is in progress.")
+        yield _Statement("pending", f"{_have(number)} no result yet; the run is in progress.")
     elif number:
         text = f"{_have(number)} no result for the current files and options:"
-        yield Statement("pending", text, f"flexroad rerun {run}")
+        yield _Statement("pending", text, f"flexroad rerun {run}")
 
 
-def _flagged(table: TileTable) -> Iterator[Statement]:
+def _flagged(table: TileTable) -> Iterator[_Statement]:
     number = table.counts["flagged"]
     if not number:
         return
@@ -302,20 +298,20 @@ def _flagged(table: TileTable) -> Iterator[Statement]:
         if name and name != NO_ROAD
     )
     told = ", ".join(f"{name} {n:,}" for name, n in names.most_common())
-    yield Statement(
+    yield _Statement(
         "flagged",
         f"{count(number, 'done tile')} should be looked at, by {'its' if number == 1 else 'their'} flags: "
         f"{told}. Below is where.",
     )
 
 
-def _without_roads(number: int) -> Iterator[Statement]:
+def _without_roads(number: int) -> Iterator[_Statement]:
     if number:
         remedy = MEANINGS[NO_ROAD].remedy.capitalize()
-        yield Statement("no-road", f"{_have(number)} no road; the surface there is the terrain. {remedy}.")
+        yield _Statement("no-road", f"{_have(number)} no road; the surface there is the terrain. {remedy}.")
 
 
-def _surfaces(content: Content) -> Iterator[Statement]:
+def _surfaces(content: Content) -> Iterator[_Statement]:
     """Say whether neighbouring tiles meet and meshes have no fault."""
     steps = content.steps.check
     own = steps[steps.variant == content.variant] if len(steps) else steps
@@ -323,16 +319,16 @@ def _surfaces(content: Content) -> Iterator[Statement]:
         row = own.iloc[0]
         bad = str(row.result).startswith("error")
         text = f"Neighbouring tiles ({count(int(row.edges), 'common edge')}): {row.result}."
-        yield Statement("failed" if bad else "good", text)
+        yield _Statement("failed" if bad else "good", text)
     meshes = content.meshes[content.meshes.method == content.variant]
     if len(meshes):
         row = meshes.iloc[0]
         bad = bool(row["meshes with faults"])
         text = f"Meshes: {count(int(row.meshes), 'mesh').replace('meshs', 'meshes')} checked, {row.result}."
-        yield Statement("failed" if bad else "good", text)
+        yield _Statement("failed" if bad else "good", text)
 
 
-def _changes(content: Content) -> Iterator[Statement]:
+def _changes(content: Content) -> Iterator[_Statement]:
     counts = content.counts
     parts = [
         f"{number} {what}"
@@ -345,7 +341,7 @@ def _changes(content: Content) -> Iterator[Statement]:
         if number
     ]
     if parts and (counts.changed or counts.cached or counts.vanished):
-        yield Statement("good", f"In the last run, tiles were: {', '.join(parts)}.")
+        yield _Statement("good", f"In the last run, tiles were: {', '.join(parts)}.")
 
 
 def _all(total: int) -> str:

@@ -81,10 +81,8 @@ def html_page(
 ) -> str:
     """Return the report as one self-contained HTML page.
 
-    - `content`: its tables.
     - `viewer`: address of the page of the 3D viewer, relative to the report; empty without one.
     - `before`: name and rows of another run over the same tiles, for a comparison.
-    - `track`: shows the progress.
     """
     table, failed = tile_table(run.catalog.tiles, content), errors(content)
     options: Options = run.config.chains[content.variant]["assess"]

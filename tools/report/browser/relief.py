@@ -35,7 +35,7 @@ OPACITY = 0.78
 
 
 @dataclass(frozen=True)
-class Relief:
+class _Relief:
     """One picture with the tiles side by side, in squares of equal size."""
 
     webp: bytes
@@ -47,12 +47,10 @@ class Relief:
     """Number of the square of each tile by id, row by row from the top left."""
 
 
-def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = untracked) -> Relief | None:
+def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = untracked) -> _Relief | None:
     """Draw the surfaces of tiles as a shaded relief with their roads; None if none is in the store.
 
     - `tiles`: the tiles to draw; those whose surface is not in the store are left out.
-    - `results`: the results of all finished tiles.
-    - `track`: shows the progress.
     """
     tiles = list(tiles)
     if not tiles:
@@ -69,7 +67,7 @@ def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = unt
         square = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]
         square[:] = _square(*found, side)
         places[tile.id] = len(places)
-    return Relief(_encoded(picture), side, columns, places) if places else None
+    return _Relief(_encoded(picture), side, columns, places) if places else None
 
 
 def _square(surface: Surface, road: RoadMask, side: int) -> NDArray[np.uint8]:

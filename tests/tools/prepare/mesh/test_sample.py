@@ -8,10 +8,9 @@ from flexroad.catalog.grid import Grid
 from flexroad.tools.prepare.mesh import sample as sample_module
 from flexroad.tools.prepare.mesh.sample import (
     TexturedMesh,
-    covered_cells,
     orthophoto,
+    project_down,
     sample,
-    surface_heights,
 )
 
 CRS = "EPSG:25832"
@@ -96,7 +95,7 @@ def test_orthophoto_uses_texture_of_each_face():
 def test_orthophoto_higher_surface_hides_lower_in_any_order():
     ground, bridge = (rectangle(0, 0, 20, 20, 100), RED), (rectangle(8, 0, 12, 20, 106), BLUE)
     for mesh in (plain(ground, bridge), plain(bridge, ground)):
-        photo, heights = orthophoto(mesh, grid(20, 20)), surface_heights(mesh, grid(20, 20))
+        photo, heights = orthophoto(mesh, grid(20, 20)), project_down(mesh, grid(20, 20))[0]
         on_bridge = np.zeros((20, 20), bool)
         on_bridge[:, 8:12] = True
         assert (heights == np.where(on_bridge, 106, 100)).all()
@@ -109,7 +108,7 @@ def test_surface_heights_of_a_plane_are_exact():
         return 100 + 0.25 * x - 0.125 * y
 
     where = grid(30, 20, cell=0.5)
-    heights = surface_heights(plain((rectangle(0, 0, 15, 10, slope), RED)), where)
+    heights = project_down(plain((rectangle(0, 0, 15, 10, slope), RED)), where)[0]
     truth = slope(where.eastings[None] - EAST, where.northings[:, None] - NORTH)
     np.testing.assert_allclose(heights, truth, atol=1e-8)
 
@@ -122,7 +121,7 @@ def test_covered_cells_have_no_gap_at_edges_of_triangles():
     around = np.arange(720)
     faces = np.column_stack([np.zeros(720, int), around + 1, (around + 1) % 720 + 1]).astype(np.int32)
     mesh = TexturedMesh(CRS, vertices, faces, np.full(720, -1, np.int32))
-    assert covered_cells(mesh, grid(21, 21, cell=1)).all()
+    assert (project_down(mesh, grid(21, 21, cell=1))[1] >= 0).all()
 
 
 def test_orthophoto_of_inside_out_or_non_manifold_mesh_is_the_same(texture):
@@ -141,14 +140,14 @@ def test_orthophoto_of_inside_out_or_non_manifold_mesh_is_the_same(texture):
     expected = orthophoto(mesh, grid(16, 12))
     for other in (reversed_, repeated):
         assert np.array_equal(orthophoto(other, grid(16, 12)).colour, expected.colour)
-        assert np.array_equal(surface_heights(other, grid(16, 12)), surface_heights(mesh, grid(16, 12)))
+        assert np.array_equal(project_down(other, grid(16, 12))[0], project_down(mesh, grid(16, 12))[0])
 
 
 def test_covered_cells_are_those_with_centre_in_a_face():
     mesh = plain((rectangle(2, 3, 6.4, 8, 0), RED), (rectangle(5, 0, 9.6, 4, 50), RED))
     truth = np.zeros((10, 10), bool)
     truth[2:7, 2:6] = truth[6:10, 5:10] = True
-    assert np.array_equal(covered_cells(mesh, grid(10, 10)), truth)
+    assert np.array_equal(project_down(mesh, grid(10, 10))[1] >= 0, truth)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -9,10 +9,10 @@ from PIL import Image
 
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks import TaskError
-from flexroad.tools.prepare.photos import mvs_cpu, mvs_gpu, sfm
+from flexroad.tools.prepare.photos import mvs_cpu, sfm, surface
 from flexroad.tools.prepare.photos.exif import Control, place_photos, read_shot
-from flexroad.tools.prepare.photos.poisson import poisson, write_ply
 from flexroad.tools.prepare.photos.sfm import Options, reconstruct
+from flexroad.tools.prepare.photos.surface import poisson, write_ply
 from tests import make_photos
 from tests.gpu import REASON
 
@@ -103,9 +103,9 @@ def test_photo_cloud_has_true_heights_and_normals(reconstruction, cloud):
 
 
 def test_patchmatch_has_true_heights(reconstruction, tmp_path):
-    if not mvs_gpu.available():
+    if not surface.has_gpu():
         pytest.skip(f"{REASON} and pycolmap-cuda12")
-    cloud = mvs_gpu.patchmatch(reconstruction, tmp_path, mvs_gpu.Options())
+    cloud = surface.patchmatch(reconstruction, tmp_path, 2000)
     errors = height_errors(cloud.points, reconstruction.origin)
     assert np.abs(np.median(errors)) < 0.05
     assert np.quantile(np.abs(errors), 0.95) < 0.15
@@ -120,7 +120,7 @@ def test_patchmatch_has_true_heights(reconstruction, tmp_path):
 def test_patchmatch_needs_cuda_and_a_gpu(monkeypatch, built, gpus, expected):
     monkeypatch.setattr(sfm.colmap(), "has_cuda", built)
     monkeypatch.setattr("pycolmap.get_num_cuda_devices", lambda: gpus, raising=False)
-    assert mvs_gpu.available() == expected
+    assert surface.has_gpu() == expected
 
 
 def test_photo_cloud_has_colours_of_the_photographs(reconstruction, cloud, photos):
@@ -152,7 +152,7 @@ def test_poisson_gives_true_heights_and_ends_at_the_points(reconstruction, cloud
 
 def test_read_ply_returns_written_cloud(cloud, tmp_path):
     write_ply(tmp_path / "cloud.ply", cloud)
-    result = mvs_gpu.read_ply(tmp_path / "cloud.ply")
+    result = surface.read_ply(tmp_path / "cloud.ply")
     np.testing.assert_allclose(result.points, cloud.points, atol=1e-5)
     np.testing.assert_array_equal(result.colours, cloud.colours)
 

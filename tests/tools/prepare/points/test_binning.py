@@ -4,6 +4,7 @@ from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
 from flexroad.tools.prepare.points.binning import bins, highest, means, spikes, top_layer
+from tests.make_clouds import Top
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 7, 5)
 # Positions in quarters of a cell, many of them on borders of cells; some are outside the grid.
@@ -74,7 +75,7 @@ def test_bins_points_on_borders_are_in_same_cells_of_all_grids():
 
 def layer_of(easting, northing, height, grid=GRID, depth_m=DEPTH_M):
     cells = bins(easting, northing, grid)
-    return top_layer(cells, height, highest(cells, height, grid.shape), depth_m, grid.shape)
+    return Top(*top_layer(cells, height, highest(cells, height, grid.shape), depth_m, grid.shape))
 
 
 @given(clouds)

@@ -3,8 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tools.prepare.points.orthophoto import photo
-from flexroad.tools.prepare.types import Points
+from flexroad.tools.prepare.points.binning import Points, photo
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 6, 5)
 COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 0, 1)]

@@ -5,8 +5,9 @@ import pytest
 
 from flexroad.catalog.grid import Grid
 from flexroad.tools.prepare.points import ground_filter as slope_filter
-from flexroad.tools.prepare.points.to_rasters import Options, rasterise, reach_m, tags
-from flexroad.tools.prepare.types import Points, Rasters
+from flexroad.tools.prepare.points.binning import Points
+from flexroad.tools.prepare.points.to_rasters import Options, tags
+from tests.make_clouds import Rasters, rasterise, reach_m
 
 NO_CLASS, GROUND, TREE, HOUSE, DECK = 0, 2, 5, 6, 17
 SMALL = Options(fill_m=2, void_m=6, dop_fill_m=1, despike_m=2)

@@ -1,6 +1,8 @@
-"""Poisson surface reconstruction (Kazhdan & Hoppe, 2013) of oriented points, by pycolmap.
+"""From camera poses to a mesh by pycolmap: a dense cloud on a GPU, and the surface of any dense cloud.
 
-The reconstructed surface is closed; parts far from all points are invented, and are removed.
+The cloud is COLMAP's PatchMatch stereo and fusion (Schönberger et al., 2016). It needs a GPU and a pycolmap
+built with CUDA, as the package pycolmap-cuda12. The surface is Poisson's (Kazhdan & Hoppe, 2013). It is
+closed: parts far from all points are invented, and are removed.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 from flexroad.tools.prepare.mesh.sample import TexturedMesh
 from flexroad.tools.prepare.photos.mvs_cpu import Cloud
-from flexroad.tools.prepare.photos.sfm import colmap
+from flexroad.tools.prepare.photos.sfm import Reconstruction, colmap
 
 spatial = lazy("scipy.spatial")
 trimesh = lazy("trimesh")
@@ -38,13 +40,49 @@ end_header
 """
 
 
+def has_gpu() -> bool:
+    """Return whether pycolmap was built with CUDA and finds a GPU; raises TaskError if it is missing."""
+    pycolmap = colmap()
+    return bool(pycolmap.has_cuda) and pycolmap.get_num_cuda_devices() > 0
+
+
+def patchmatch(reconstruction: Reconstruction, work: Path, size: int) -> Cloud:
+    """Return the fused cloud of all photographs, relative to the reconstruction's origin.
+
+    - `reconstruction`: its model and photographs are read from their files.
+    - `work`: folder for undistorted photographs and depth maps: about 20 bytes per pixel of each photograph.
+    - `size`: photographs are reduced to this width or height (pixels).
+    """
+    pycolmap = colmap()
+    workspace, fused = work / "stereo", work / "fused.ply"
+    undistorting = pycolmap.UndistortCameraOptions(max_image_size=size)
+    pycolmap.undistort_images(
+        workspace, reconstruction.model, reconstruction.root, undistort_options=undistorting
+    )
+    pycolmap.patch_match_stereo(workspace, options=pycolmap.PatchMatchOptions(max_image_size=size))
+    pycolmap.stereo_fusion(fused, workspace, output_type="PLY")
+    return read_ply(fused)
+
+
+def read_ply(path: Path) -> Cloud:
+    """Read the points from the PLY file of COLMAP's fusion."""
+    _, _, body = path.read_bytes().partition(b"end_header\n")
+    records = np.frombuffer(body, RECORD)
+    if not len(records):
+        raise TaskError("dense stereo gave no points; use photographs that overlap by 60 % or more")
+    points, normals, colours = (
+        np.column_stack([records[name] for name in names])
+        for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
+    )
+    return Cloud(points.astype(np.float64), normals.astype(np.float64), colours)
+
+
 def poisson(
     cloud: Cloud, spacing_m: float, crs: str, origin: Floats, work: Path, threads: int | None = None
 ) -> TexturedMesh:
     """Return the surface of a cloud as a mesh with vertex colours.
 
     - `cloud`: points about ``spacing_m`` apart, with normals.
-    - `spacing_m`: distance between neighbouring points (m).
     - `crs`, `origin`: CRS, and the position of the cloud's origin in it: easting, northing, height, ``(3,)``,
       m.
     - `work`: folder for two temporary PLY files.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tools.prepare.mesh.reference import reference, refine
+from flexroad.tools.prepare.from_mesh import reference, refine
 
 CRS = "EPSG:25832"
 N = 60

@@ -13,8 +13,7 @@ from flexroad.tasks import TaskError, memory
 from flexroad.tools.prepare import blockwise, point_reading
 from flexroad.tools.prepare import from_points as points
 from flexroad.tools.prepare.from_points import prepare_points
-from flexroad.tools.prepare.limits import check_extent, prepared_grid
-from flexroad.tools.prepare.options import PrepareOptions
+from flexroad.tools.prepare.options import PrepareOptions, check_extent, prepared_grid
 from flexroad.tools.prepare.points.to_rasters import Options
 from tests.make_clouds import write_cloud
 
