@@ -22,7 +22,7 @@ from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import RECORD, Run, check_links, check_models
-from flexroad.pipeline.run.status import open_database, peek_statuses
+from flexroad.pipeline.run.status import known_record, open_database, peek_statuses
 from flexroad.pipeline.run.store_users import FOLDER, runs_using
 from flexroad.pipeline.store.records import DONE, FAILED
 from flexroad.pipeline.worker.exports import KINDS, LEVEL_KINDS
@@ -160,7 +160,7 @@ def _in_tiles(run: Run) -> Iterator[Garbage]:
                 # Markers come last, so that an interrupted deletion is continued by the next clean.
                 markers = [name for name in (DONE, FAILED) if name in files]
                 yield from (Garbage("tiles", folder / name, files[name]) for name in [*products, *markers])
-            elif entry := database.lookup(tile.id):
+            elif entry := known_record(run, database, tile.id):
                 kept = {folder.name + end for end in current} | entry.sizes.keys()
                 yield from (
                     Garbage("products", folder / name, files[name]) for name in products if name not in kept
