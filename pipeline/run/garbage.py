@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Literal
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, absolute, entries, exists, hidden_files, listing, remove
+from flexroad.catalog.text import Notify
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import STAGE_NAMES
@@ -49,7 +50,7 @@ class Garbage:
 
 @contextlib.contextmanager
 def exclusive(
-    run: Run, without: Sequence[Location], notify: Callable[[str], None], allow: Sequence[str] = ()
+    run: Run, without: Sequence[Location], notify: Notify, allow: Sequence[str] = ()
 ) -> Iterator[list[Run]]:
     """Lock all other runs of this run's store; a context manager that gives all runs, this one first.
 
