@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+Notify = Callable[[str], None]
+"""Takes a line for the user."""
 MAX_SHOWN = 160
 """Longest text of a value in a message."""
 MAX_REASON = 500

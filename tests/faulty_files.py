@@ -1,9 +1,8 @@
 """Interception of what this process writes below a folder, for tests of faults.
 
 An observer is called before each operation. It may raise OSError, and the operation fails with this error, or
-end the process. Seen are files that Python opens, functions of ``os``, pyarrow's tables, and SQLite
-(`tests.faulty_sqlite`); the product's GDAL writes only to memory. A longer write is two operations, so that a
-fault also leaves half-written data.
+end the process. Seen are files that Python opens, functions of ``os``, and pyarrow's tables; the product's
+GDAL writes only to memory. A longer write is two operations, so that a fault also leaves half-written data.
 """
 
 import builtins
@@ -18,8 +17,8 @@ from pathlib import Path
 from typing import Literal
 from unittest import mock
 
-from tests import faulty_sqlite
-
+SPLIT = 16
+"""Shortest write that is split in two (bytes)."""
 Kind = Literal["create", "write", "truncate", "fsync", "rename", "link", "remove", "mkdir", "rmdir"]
 
 
@@ -90,7 +89,6 @@ def intercepted(root: Path, observer: Observer) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         for patch in patches:
             stack.enter_context(patch)
-        stack.enter_context(faulty_sqlite.observed(announce))
         yield
 
 
@@ -111,7 +109,7 @@ class _RawFile(io.FileIO):
 
     def write(self, data) -> int:
         view = memoryview(data).cast("B")
-        self._split = not self._split and len(view) >= faulty_sqlite.SPLIT
+        self._split = not self._split and len(view) >= SPLIT
         part = view[: len(view) // 2] if self._split else view
         offset = os.fstat(self.fileno()).st_size if "a" in self.mode else self.tell()
         self._announce("write", _located(self.fileno()), offset=offset, data=bytes(part))

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.text import one_line, printable, write_reason
+from flexroad.catalog.text import Notify, one_line, printable, write_reason
 
 CHUNK_BYTES = 1 << 20
 MAX_RATIO = 20
@@ -23,7 +23,7 @@ Progress = Callable[[Iterable[int], str, int], Iterable[int]]
 """Shows the items of a step: steps of `CHUNK_BYTES`, what is done, and their number."""
 
 
-def unpack(archive: Path, sha256: str, progress: Progress, told: Callable[[str], None]) -> Path:
+def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Path:
     """Return the folder with an archive's files: beside it, with its name; unpack it if there is none.
 
     A folder that is there is complete: it gets its name when all files are in it.
@@ -31,15 +31,15 @@ def unpack(archive: Path, sha256: str, progress: Progress, told: Callable[[str],
     - `archive`: the zip file.
     - `sha256`: checksum of the published file.
     - `progress`: shows how far the checksum and the unpacking are.
-    - `told`: takes a line that says how much is unpacked where, or that the folder is there.
+    - `notify`: takes a line that says how much is unpacked where, or that the folder is there.
     """
     target = archive.with_suffix("")
     if target.is_dir():
-        told(f"{target} is there and is read in place of {archive.name}; remove it to unpack anew")
+        notify(f"{target} is there and is read in place of {archive.name}; remove it to unpack anew")
         return target
     entries = _entries(archive)
     size, free = sum(entry.file_size for entry in entries), _free(target.parent)
-    told(f"{archive.name} unpacks to {size / GB:.2f} GB in {target}; {free / GB:.2f} GB are free")
+    notify(f"{archive.name} unpacks to {size / GB:.2f} GB in {target}; {free / GB:.2f} GB are free")
     if size > free:
         raise CatalogError(
             f"{archive} needs {size / GB:.2f} GB, but only {free / GB:.2f} GB are free in {target.parent}; "

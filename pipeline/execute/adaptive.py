@@ -19,7 +19,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Generic
 
-from flexroad.catalog.text import count
+from flexroad.catalog.text import Notify, count
 from flexroad.pipeline.execute.executor import Executor, J, Probe, R
 
 START_S = 12.0
@@ -43,7 +43,7 @@ class Jobs(Generic[J]):
     number: int
     job_s: float | None = None
     """Median time of such jobs in an earlier run (s), None if there was none."""
-    log: Callable[[str], None] = lambda line: None
+    log: Notify = lambda line: None
     """Takes each decision, one line."""
 
     def __iter__(self) -> Iterator[J]:
@@ -100,14 +100,14 @@ class AdaptiveExecutor:
         Largest number of worker processes; by default one per core.
     parallel : Executor
         Runs the jobs on the workers.
-    say : callable
+    notify : callable
         Prints each decision, one line.
     """
 
-    def __init__(self, workers: int | None, parallel: Executor, say: Callable[[str], None]) -> None:
+    def __init__(self, workers: int | None, parallel: Executor, notify: Notify) -> None:
         self.workers = workers_of(workers)
         self.parallel = parallel
-        self.say = say
+        self.notify = notify
 
     def map(
         self,
@@ -143,4 +143,4 @@ class AdaptiveExecutor:
     def _tell(self, jobs: Jobs[J], left: int, times: Sequence[float]) -> None:
         line = decision(left, self.workers, *estimate(times, jobs.job_s))
         jobs.log(line)
-        self.say(line)
+        self.notify(line)

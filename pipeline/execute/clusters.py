@@ -19,6 +19,7 @@ from distributed.security import Security
 from distributed.utils import silence_logging_cmgr
 
 from flexroad.catalog.storage.scratch import ScratchFolder
+from flexroad.catalog.text import Notify
 from flexroad.pipeline import OF_WORKERS
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
@@ -65,16 +66,16 @@ def open_cluster(
     scheduler: str | None,
     dashboard: bool,
     logs: Path | None = None,
-    say: Callable[[str], None] = lambda line: None,
+    notify: Notify = lambda line: None,
 ) -> Iterator[ClusterTarget]:
     """Connect to, start or request a cluster; on exit, stop it if it was started here.
 
-    ``logs`` is the folder for the output of SLURM jobs, and ``say`` prints one line about them.
+    ``logs`` is the folder for the output of SLURM jobs, and ``notify`` prints one line about them.
     """
     if scheduler:
         _check_certificates(scheduler)
         if not scheduler.startswith(("tls://", "wss://")):
-            say(
+            notify(
                 "a scheduler without tls:// is open to everyone who reaches it, and runs programs as its user"
             )
         yield ClusterTarget(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S, cluster.patience_s)
@@ -88,7 +89,7 @@ def open_cluster(
             started = stack.enter_context(local(cluster, dashboard))
             yield ClusterTarget(started, "the local cluster", 0, cluster.patience_s)
         else:
-            jobs = stack.enter_context(slurm(cluster, dashboard, logs, say))
+            jobs = stack.enter_context(slurm(cluster, dashboard, logs, notify))
             yield ClusterTarget(
                 jobs.cluster,
                 "the slurm cluster",
@@ -149,7 +150,7 @@ def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def connected(target: ClusterTarget, dashboard: bool, say: Callable[[str], None]) -> Iterator[Client]:
+def connected(target: ClusterTarget, dashboard: bool, notify: Notify) -> Iterator[Client]:
     """Connect to a cluster and wait for its first worker; say the dashboard's address if it is wanted."""
     make = partial(Client, target.target, timeout=ANSWER_S, set_as_default=False)
     with contextlib.ExitStack() as stack:
@@ -158,7 +159,7 @@ def connected(target: ClusterTarget, dashboard: bool, say: Callable[[str], None]
         except OSError as error:
             raise ConfigError(f"{target.name} does not answer: {error}") from error
         if dashboard:
-            say(_dashboard(client))
+            notify(_dashboard(client))
         if not _any_worker(client, target):
             raise ConfigError(f"{target.name} has no workers; {target.remedy}")
         yield client

@@ -10,7 +10,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.text import without_credentials
+from flexroad.catalog.text import Notify, without_credentials
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.executor import Executor, J, Probe, R
@@ -41,8 +41,8 @@ class DaskExecutor:
     cluster : Cluster
         The kind and size of the cluster, and how long to wait for workers.
     dashboard : bool
-        Serve Dask's dashboard; its address is passed to ``say``.
-    say : callable
+        Serve Dask's dashboard; its address is passed to ``notify``.
+    notify : callable
         Prints one line for the user: the address of the dashboard, a wait for workers.
     logs : Path, optional
         Folder for the output of SLURM jobs, on a disk that all machines share; by default one in the home
@@ -55,14 +55,14 @@ class DaskExecutor:
         scheduler: str | None = None,
         cluster: Cluster = LOCAL,
         dashboard: bool = False,
-        say: Callable[[str], None] = lambda line: None,
+        notify: Notify = lambda line: None,
         logs: Path | None = None,
     ) -> None:
         self.workers = workers
         self.scheduler = scheduler
         self.cluster = cluster
         self.dashboard = dashboard
-        self.say = say
+        self.notify = notify
         self.logs = logs
 
     def map(
@@ -93,11 +93,11 @@ class DaskExecutor:
         with (
             clusters.quiet(),
             clusters.open_cluster(
-                self.cluster, self.workers, self.scheduler, self.dashboard, self.logs, self.say
+                self.cluster, self.workers, self.scheduler, self.dashboard, self.logs, self.notify
             ) as target,
-            clusters.connected(target, self.dashboard, self.say) as client,
+            clusters.connected(target, self.dashboard, self.notify) as client,
         ):
-            yield _ConnectedExecutor(client, target, self.cluster, self.say)
+            yield _ConnectedExecutor(client, target, self.cluster, self.notify)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class _ConnectedExecutor:
     client: Any
     target: Any
     cluster: Cluster
-    say: Callable[[str], None]
+    notify: Notify
 
     def map(
         self,
@@ -128,7 +128,7 @@ class _ConnectedExecutor:
             iter(jobs),
             lost,
             self.cluster.model_copy(update={"patience_s": self.target.patience_s}),
-            self.say,
+            self.notify,
             probe,
         )
         yield from jobs_on_cluster.results()

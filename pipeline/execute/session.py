@@ -27,6 +27,7 @@ from distributed import Client, Future
 from distributed.protocol.pickle import dumps
 from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerError
 
+from flexroad.catalog.text import Notify
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.executor import J, Probe, R
@@ -78,7 +79,7 @@ class Session(Generic[J, R]):
         Takes a job and the reason, returns the result of a lost job.
     cluster : Cluster
         How long to wait for a worker when there is none, and longest time of a job.
-    say : callable
+    notify : callable
         Prints one line for the user.
     probe : Probe, optional
         The probe of the `WorkerCheck`.
@@ -93,7 +94,7 @@ class Session(Generic[J, R]):
         jobs: Iterator[J],
         lost: Callable[[J, str], R],
         cluster: Cluster,
-        say: Callable[[str], None],
+        notify: Notify,
         probe: Probe | None = None,
     ) -> None:
         self.client = client
@@ -108,8 +109,8 @@ class Session(Generic[J, R]):
         self.lost = lost
         self.patience_s = cluster.patience_s
         self.limit_s = cluster.tile_timeout_s
-        self.say = say
-        self.admission = Admission(probe, say)
+        self.notify = notify
+        self.admission = Admission(probe, notify)
         self.returned: deque[J] = deque()
         """Jobs that a worker could not take."""
         self.done = 0
@@ -211,7 +212,7 @@ class Session(Generic[J, R]):
             self.without_worker_s = None
         elif self.without_worker_s is None:
             self.without_worker_s = 0.0
-            self.say(f"no worker is left; waiting up to {self.patience_s:g} s for one")
+            self.notify(f"no worker is left; waiting up to {self.patience_s:g} s for one")
         else:
             self.without_worker_s += since_last_check
             if self.without_worker_s > self.patience_s:

@@ -10,7 +10,7 @@ import shutil
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from distributed.core import Status
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
-from flexroad.catalog.text import count
+from flexroad.catalog.text import Notify, count
 from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.start import (
@@ -52,14 +52,14 @@ class SlurmJobs:
         The cluster that the jobs belong to.
     folder : Path
         Folder of the output of the jobs, for messages.
-    say : callable
+    notify : callable
         Prints one line for the user.
     """
 
-    def __init__(self, cluster: Any, folder: Path, say: Callable[[str], None]) -> None:
+    def __init__(self, cluster: Any, folder: Path, notify: Notify) -> None:
         self.cluster = cluster
         self.folder = folder
-        self.say = say
+        self.notify = notify
         self.failures: Counter[str] = Counter()
         """Number of jobs since one had a worker that connected, by name in Dask."""
 
@@ -78,7 +78,7 @@ class SlurmJobs:
                     f"cluster.kind slurm: sbatch refuses the jobs: {_answer(error)}; correct the options "
                     "of the cluster"
                 ) from error
-            self.say(f"sbatch refuses a job: {_answer(error)}")
+            self.notify(f"sbatch refuses a job: {_answer(error)}")
 
     @contextlib.contextmanager
     def watched(self) -> Iterator[None]:
@@ -119,22 +119,20 @@ class SlurmJobs:
     async def _replace(self, ended: list[str]) -> None:
         left = [name for name in ended if name in self.cluster.worker_spec]
         if given_up := len(ended) - len(left):
-            self.say(
+            self.notify(
                 f"{count(given_up, 'SLURM job')} given up: {TRIES} in a row ended before a worker connected; "
                 f"{self.folder} has their output"
             )
         if left:
-            self.say(f"{count(len(left), 'SLURM job')} ended; submitted again")
+            self.notify(f"{count(len(left), 'SLURM job')} ended; submitted again")
             try:
                 await self.cluster._correct_state()
             except RuntimeError as error:
-                self.say(f"sbatch refuses a job: {_answer(error)}")
+                self.notify(f"sbatch refuses a job: {_answer(error)}")
 
 
 @contextlib.contextmanager
-def slurm(
-    cluster: Cluster, dashboard: bool, logs: Path | None, say: Callable[[str], None]
-) -> Iterator[SlurmJobs]:
+def slurm(cluster: Cluster, dashboard: bool, logs: Path | None, notify: Notify) -> Iterator[SlurmJobs]:
     """Open a cluster of SLURM jobs, whose output is written to the folder ``logs``."""
     jobqueue = load_jobqueue()
     for program in ("sbatch", "squeue", "scancel"):
@@ -148,7 +146,7 @@ def slurm(
         security = stack.enter_context(_certificates(cluster, folder))
         options = slurm_options(cluster, dashboard, folder) | {"security": security}
         make = partial(jobqueue.SLURMCluster, job_cls=_job_class(jobqueue), **options)
-        jobs = SlurmJobs(stack.enter_context(opened(make)), folder, say)
+        jobs = SlurmJobs(stack.enter_context(opened(make)), folder, notify)
         jobs.start(-(-(cluster.workers or 1) // cluster.per_job))
         stack.enter_context(jobs.watched())
         yield jobs

@@ -26,6 +26,7 @@ from distributed import Client, SchedulerPlugin, WorkerPlugin, get_worker
 from distributed.protocol.pickle import dumps, loads
 from threadpoolctl import threadpool_limits
 
+from flexroad.catalog.text import Notify
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.executor import J, Probe, R
@@ -189,13 +190,13 @@ class Admission:
     ----------
     probe : Probe, optional
         The probe of the `WorkerCheck`.
-    say : callable
+    notify : callable
         Prints one line for the user.
     """
 
-    def __init__(self, probe: Probe | None, say: Callable[[str], None]) -> None:
+    def __init__(self, probe: Probe | None, notify: Notify) -> None:
         self.probe = probe
-        self.say = say
+        self.notify = notify
         self.left_out: dict[str, str] = {}
         """Why a worker gets no jobs, in one line, by its address."""
         self._accepted: dict[str, Any] = {}
@@ -225,7 +226,7 @@ class Admission:
             self.left_out[address] = f"worker {address} on {host} is left out: {fault}"
             if (host, fault) not in self._told:
                 self._told.add((host, fault))
-                self.say(self.left_out[address])
+                self.notify(self.left_out[address])
         return not fault
 
 

@@ -29,7 +29,7 @@ from flexroad.catalog.storage.paths import Location, remove, write
 from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import count
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import open_database, recorded
+from flexroad.pipeline.run.status import known_record, open_database, recorded
 from flexroad.pipeline.store.records import DONE, TileRecord, TileState
 from flexroad.pipeline.worker.exports import (
     COLLECTION,
@@ -155,7 +155,7 @@ def _write_level_0(run: Run, grid: Grid | None, done: Sequence[Tile]) -> list[Ki
     if grid and getattr(run.config.chains[variant]["segment"], "levels", False):
         with open_database(run) as database:
             for tile in done:
-                record, name = database.lookup(tile.id), file_name(tile.id, variant, kind)
+                record, name = known_record(run, database, tile.id), file_name(tile.id, variant, kind)
                 if record and name in record.sizes:
                     names[tile.id] = name
     if grid is None or not names:

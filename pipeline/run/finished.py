@@ -21,17 +21,18 @@ from numpy.typing import NDArray
 from flexroad.catalog import Grid, Tile
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.guard.source_files import source_stat
-from flexroad.catalog.storage.paths import Location, parse_location, stat
+from flexroad.catalog.storage.paths import Location, parse_location
 from flexroad.catalog.text import count, some
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing, product_layers
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import Folders, TileStatus, peek_statuses
+from flexroad.pipeline.run.status import Folders, TileStatus, last_record, peek_statuses
 from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.store.products import DAMAGED, TileProducts
-from flexroad.pipeline.store.records import DONE, MarkerStat, TileRecord, distances_of, from_item
+from flexroad.pipeline.store.products import TileProducts
+from flexroad.pipeline.store.records import MarkerStat, distances_of
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
+from flexroad.pipeline.worker.tile import marker_stat
 from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
@@ -168,13 +169,14 @@ class RunPlace:
 
     def marker(self, tile_id: str) -> MarkerStat | None:
         """Return name, size and version of the marker of a finished tile, None if there is none."""
-        file = stat(self._folder(tile_id).file(DONE))
-        return (DONE, file.size, file.version) if file else None
+        return marker_stat(self._folder(tile_id), "done")
 
     def graph(self, tile: Tile, snapshot: Snapshot) -> TileGraph:
         """Return the graph of a finished tile; sources that no longer exist count as recorded."""
         graph = self.pattern.graph(tile, self.checksum)
-        if graph.fingerprint != snapshot.fingerprint and (record := self._record(tile.id)):
+        folder = self._folder(tile.id)
+        changed = graph.fingerprint != snapshot.fingerprint
+        if changed and (record := last_record(folder, None, folder.files())):
             if any_file_missing(graph):
                 graph = self.pattern.graph(tile, self.checksum, source_stat, record.sources)
             graph = graph.renamed(record.renamed)
@@ -183,13 +185,6 @@ class RunPlace:
                 f"its sources have changed; run `flexroad rerun {self.path}`, then export again"
             )
         return graph
-
-    def _record(self, tile_id: str) -> TileRecord | None:
-        content = self._folder(tile_id).marker(DONE)
-        try:
-            return from_item(content, None) if content else None
-        except DAMAGED:
-            return None
 
     def _folder(self, tile_id: str) -> TileProducts:
         return TileProducts.of(parse_location(self.path), tile_id)

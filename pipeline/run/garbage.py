@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -17,12 +17,13 @@ from typing import Literal
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, absolute, entries, exists, hidden_files, listing, remove
+from flexroad.catalog.text import Notify
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import RECORD, Run, check_links, check_models
-from flexroad.pipeline.run.status import open_database, peek_statuses
+from flexroad.pipeline.run.status import known_record, open_database, peek_statuses
 from flexroad.pipeline.run.store_users import FOLDER, runs_using
 from flexroad.pipeline.store.records import DONE, FAILED
 from flexroad.pipeline.worker.exports import KINDS, LEVEL_KINDS
@@ -49,7 +50,7 @@ class Garbage:
 
 @contextlib.contextmanager
 def exclusive(
-    run: Run, without: Sequence[Location], notify: Callable[[str], None], allow: Sequence[str] = ()
+    run: Run, without: Sequence[Location], notify: Notify, allow: Sequence[str] = ()
 ) -> Iterator[list[Run]]:
     """Lock all other runs of this run's store; a context manager that gives all runs, this one first.
 
@@ -160,7 +161,7 @@ def _in_tiles(run: Run) -> Iterator[Garbage]:
                 # Markers come last, so that an interrupted deletion is continued by the next clean.
                 markers = [name for name in (DONE, FAILED) if name in files]
                 yield from (Garbage("tiles", folder / name, files[name]) for name in [*products, *markers])
-            elif entry := database.lookup(tile.id):
+            elif entry := known_record(run, database, tile.id):
                 kept = {folder.name + end for end in current} | entry.sizes.keys()
                 yield from (
                     Garbage("products", folder / name, files[name]) for name in products if name not in kept

@@ -20,12 +20,13 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from flexroad.catalog.storage.paths import Location, read
+from flexroad.catalog.text import Notify
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.lock_file import LockFile, LockStat, lock_file
 
@@ -116,7 +117,7 @@ def describe_owner(holder: Owner) -> str:
 
 @contextlib.contextmanager
 def run_lock(
-    run: Location, notify: Callable[[str], None] = lambda line: None, heartbeat: Heartbeat | None = None
+    run: Location, notify: Notify = lambda line: None, heartbeat: Heartbeat | None = None
 ) -> Iterator[None]:
     """Hold the lock of a run folder; a context manager.
 
@@ -182,7 +183,7 @@ class _Lock:
     run: Location
     file: LockFile
     me: Owner
-    notify: Callable[[str], None]
+    notify: Notify
     heartbeat: Heartbeat
 
     def take(self) -> None:

@@ -24,7 +24,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from flexroad.catalog.text import count, printable
+from flexroad.catalog.text import Notify, count, printable
 from flexroad.pipeline.worker.tile import TileResult
 
 FIRST_S = 1.0
@@ -37,9 +37,7 @@ T = TypeVar("T")
 
 
 @contextlib.contextmanager
-def said_repeatedly(
-    line: Callable[[float], str], say: Callable[[str], None], wait_s: float
-) -> Iterator[None]:
+def said_repeatedly(line: Callable[[float], str], notify: Notify, wait_s: float) -> Iterator[None]:
     """Say a line if the block takes longer than ``wait_s``, and then every `PLAIN_EVERY_S`.
 
     - `line`: takes the time since the start of the block (s); an empty line is not said.
@@ -51,7 +49,7 @@ def said_repeatedly(
         while not ended.wait(wait):
             wait = PLAIN_EVERY_S
             if text := line(time.monotonic() - start):
-                say(text)
+                notify(text)
 
     speaker = threading.Thread(target=speak, daemon=True)
     speaker.start()

@@ -20,7 +20,7 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -250,17 +250,29 @@ def check_links(path: Location, below: bool = False) -> None:
 
 def check_folder(path: Location) -> None:
     """Check that a run may be written to a folder, so that no existing files are replaced."""
+    check_own(path, lambda: exists(path / RECORD) or _has_results(path), "a run", "--out", {LOCK, LOG})
+    check_links(path)
+
+
+def check_own(
+    folder: Location, is_own: Callable[[], bool], kind: str, option: str, ignored: Collection[str] = ()
+) -> None:
+    """Check that a folder has no visible files, or the mark of an earlier command (`is_own`).
+
+    - `kind`: what the command writes: ``a run``.
+    - `option`: the option that names the folder.
+    """
     try:
-        other = None if exists(path / RECORD) else visible_entry(path, {LOCK, LOG})
-        refused = other is not None and not _has_results(path)
+        other = visible_entry(folder, ignored)
+        refused = other is not None and not is_own()
     except OSError as error:
-        reason = error.strerror or error
-        raise ConfigError(f"cannot read {path}: {reason}; correct that or choose another --out") from error
+        reason = f"{error.strerror or error}; correct that or choose another {option}"
+        raise ConfigError(f"cannot read {folder}: {reason}") from error
     if refused:
         raise ConfigError(
-            f"{path} has other files, such as {other}, and is no run; choose an empty or new one with --out"
+            f"{folder} has files that are not of {kind}, such as {other}; "
+            f"choose an empty or new folder with {option}"
         )
-    check_links(path)
 
 
 def _has_results(path: Location) -> bool:

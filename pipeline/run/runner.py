@@ -6,7 +6,6 @@ import contextlib
 import statistics
 import time
 from array import array
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -38,12 +37,13 @@ from flexroad.pipeline.run.status import (
     tile_states,
     tile_statuses,
 )
-from flexroad.pipeline.run.summary import Summary, read_summary, summarise, with_skipped, write_summary
+from flexroad.pipeline.run.summary import Summary, read_summary, summarise, write_summary
 from flexroad.pipeline.store.database import RunDatabase
 from flexroad.pipeline.store.records import (
     DONE,
     Failure,
     MeshDistances,
+    MetricsRow,
     TileRecord,
     TileState,
     utc_now,
@@ -259,15 +259,13 @@ def _close(
         interrupted=interrupted,
         refused=refused,
     )
-    summary = with_skipped(summary, run.catalog)
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
         if plan.todo:
             _keep_previous(run.path, run.config.cluster.flush)
-        rows = with_distances(database.rows(), distances)
-        write_tables(run.path, rows, database.failures(), run.config.cluster.flush)
-        states = zip(run.catalog.tiles, database.states(), strict=True)
-        write_collection(run, [tile for tile, state in states if state in ("done", "cached")])
+        rows = with_distances(_rows(database), distances)
+        write_tables(run.path, rows, _failures(database), run.config.cluster.flush)
+        write_collection(run, list(_done(run, database)))
     summary = replace(summary, seconds=round(time.perf_counter() - start_s, 3))
     lists = ("failures", "flagged")
     log.note("end", **{name: value for name, value in asdict(summary).items() if name not in lists})
@@ -282,6 +280,25 @@ def _close(
     if run.config.cluster.flush:
         flush_names(run.path)
     return summary
+
+
+def _rows(database: RunDatabase) -> Iterator[MetricsRow]:
+    """Yield the metrics rows of all tiles that are not pending, in the catalog's order."""
+    for _, state, record in database.entries():
+        yield from record.rows if record and state != "pending" else ()
+
+
+def _failures(database: RunDatabase) -> Iterator[Failure]:
+    """Yield the failures of all failed tiles, in the catalog's order."""
+    for _, state, record in database.entries():
+        yield from record.failures if record and state == "failed" else ()
+
+
+def _done(run: Run, database: RunDatabase) -> Iterator[Tile]:
+    """Yield the done tiles."""
+    for tile, (_, state, _) in zip(run.catalog.tiles, database.entries(), strict=True):
+        if state in ("done", "cached"):
+            yield tile
 
 
 def _keep_previous(run: Location, flushed: bool) -> None:
@@ -304,16 +321,17 @@ def _final_summary(
         if plan.todo and not interrupted:
             # Without any tile to process they have just been looked at.
             _check_markers(run, database)
-    elif interrupted and database.listed(tile.id for tile in run.catalog.tiles) is None:
+    elif interrupted and not database.lists(tile.id for tile in run.catalog.tiles):
         # The run is to end soon: checking the tiles would take as long as the start that was interrupted.
-        return summarise(len(run.catalog.tiles), Counter(), ())
-    return recorded_summary(run, database, start)[0]
+        return summarise(run.catalog, (), "")
+    return recorded_summary(run, database, start)
 
 
 def _repair(run: Run, database: RunDatabase, start: str) -> None:
     """Make the list of tiles anew if it was damaged during the run."""
-    if database.listed(tile.id for tile in run.catalog.tiles) is not None:
+    if database.load() and database.lists(tile.id for tile in run.catalog.tiles):
         return
+    database.set_states(())
     states: list[tuple[str, TileState]] = []
     for status, state in tile_states(run, database, start):
         if status.last_record and status.from_marker:
@@ -326,10 +344,8 @@ def _repair(run: Run, database: RunDatabase, start: str) -> None:
 def _check_markers(run: Run, database: RunDatabase) -> None:
     """Record the done tiles whose marker was removed while the run worked as failed."""
     folders = Folders(run.path)
-    states = zip(run.catalog.tiles, database.states(), strict=True)
-    done = (tile.id for tile, state in states if state in ("done", "cached"))
-    for tile_id in [tile_id for tile_id in done if DONE not in folders(tile_id)]:
-        record = database.get(tile_id)
+    for tile in [tile for tile in _done(run, database) if DONE not in folders(tile.id)]:
+        record = database.get(tile.id)
         if record:
             database.record(_vanished(run, record, "missing: its folder was deleted while the run worked"))
 

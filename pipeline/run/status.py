@@ -7,13 +7,11 @@ is read only if it differs from the one in the database.
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import cached_property, partial
-from itertools import repeat
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +22,12 @@ from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
 from flexroad.pipeline.graph.sources import Stat
 from flexroad.pipeline.run.lock import Owner, owner
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.summary import MAX_FAILURES, Summary, read_summary, summarise, with_skipped
-from flexroad.pipeline.store.database import NAME, RunDatabase
+from flexroad.pipeline.run.summary import Summary, read_summary, summarise
+from flexroad.pipeline.store.database import NAME, Line, RunDatabase
 from flexroad.pipeline.store.products import DAMAGED, TileProducts
 from flexroad.pipeline.store.records import (
     DONE,
     FAILED,
-    Failure,
     MarkerStat,
     TileRecord,
     TileState,
@@ -195,14 +192,14 @@ def has_marker(run: Run, record: TileRecord) -> bool:
 
 
 def open_database(run: Run, write: bool = False) -> RunDatabase:
-    """Open the run's database; entries that it lacks are read from the markers."""
-    opened = RunDatabase.open if write else RunDatabase.open_readonly
-    return opened(run.path / NAME, partial(_read_marker, run))
+    """Open the run's database."""
+    return RunDatabase(run.path / NAME, write)
 
 
-def _read_marker(run: Run, tile_id: str) -> TileRecord | None:
+def known_record(run: Run, database: RunDatabase, tile_id: str) -> TileRecord | None:
+    """Return the record of a tile from the database, or from its marker if the database has none."""
     folder = run.folder(tile_id)
-    return last_record(folder, None, folder.files())
+    return database.get(tile_id) or last_record(folder, None, folder.files())
 
 
 def tile_states(
@@ -210,17 +207,19 @@ def tile_states(
 ) -> Iterator[tuple[TileStatus, TileState]]:
     """Yield the status and the state of every tile; checks every tile, its sources and its products.
 
-    A done tile is ``cached`` if the database says so; if its list of tiles is damaged, if the tile was
+    A done tile is ``cached`` if the database says so. If the database is damaged, it is ``cached`` if it was
     finished before ``since``, by default the start of the last run.
     """
-    listed = database.listed(tile.id for tile in run.catalog.tiles)
+    last: dict[str, TileState] = {}
+    if database.lists(tile.id for tile in run.catalog.tiles):
+        last = {tile: state for tile, state, _ in database.entries()}
     since = last_start(run) if since is None else since
-    states = database.states() if listed else repeat(None, len(run.catalog.tiles))
-    for status, last in zip(tile_statuses(run, database), states, strict=True):
+    for status in tile_statuses(run, database):
         if not status.done or status.last_record is None:
             yield status, "failed" if status.failed else "pending"
             continue
-        cached = last == "cached" if last else status.last_record.finished < since
+        tile_id, finished = status.last_record.tile_id, status.last_record.finished
+        cached = last[tile_id] == "cached" if last else finished < since
         yield status, "cached" if cached else "done"
 
 
@@ -231,12 +230,12 @@ def last_start(run: Run) -> str:
     return start if isinstance(start, str) else ""
 
 
-def recorded(run: Run, database: RunDatabase) -> Iterator[tuple[str, TileState, TileRecord | None]]:
+def recorded(run: Run, database: RunDatabase, since: str | None = None) -> Iterator[Line]:
     """Yield id, state and record of every tile: from the database, or if that is damaged by `tile_states`."""
-    if database.listed(tile.id for tile in run.catalog.tiles):
+    if database.lists(tile.id for tile in run.catalog.tiles):
         yield from database.entries()
         return
-    for status, state in tile_states(run, database):
+    for status, state in tile_states(run, database, since):
         yield status.graph.tile.id, state, status.last_record
 
 
@@ -254,49 +253,26 @@ def summary(
 
     ``each`` receives status and state of every tile, in the catalog's order.
     """
+
+    def checked(states: Iterable[tuple[TileStatus, TileState]]) -> Iterator[Line]:
+        for status, state in states:
+            each(status, state)
+            yield status.graph.tile.id, state, status.last_record
+
     with open_database(run) as database:
-        current = _checked(run, database, track=track, each=each)[0]
+        states = track(tile_states(run, database), "checking tiles", len(run.catalog.tiles))
+        current = summarise(run.catalog, checked(states), run.config.export.variants[0])
     last = read_summary(run.path)
     names = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
-    current = replace(current, **{name: last[name] for name in names if name in last})
-    return with_skipped(current, run.catalog)
+    return replace(current, **{name: last[name] for name in names if name in last})
 
 
-def recorded_summary(run: Run, database: RunDatabase, since: str) -> tuple[Summary, int]:
-    """Return the summary of a run and the number of tiles finished since a time (ISO 8601, UTC).
+def recorded_summary(run: Run, database: RunDatabase, since: str) -> Summary:
+    """Return the summary of a run that started at a time (ISO 8601, UTC), from the database.
 
-    They are read from the database; only if it is damaged or has other tiles, every tile is checked.
+    Only if the database is damaged or has other tiles, every tile is checked.
     """
-    listed = database.listed((tile.id for tile in run.catalog.tiles), since, run.config.export.variants[0])
-    if listed is None:
-        return _checked(run, database, since)
-    found = listed.without_roads, listed.flagged
-    return summarise(len(run.catalog.tiles), listed.counts, database.failures(), *found), listed.finished
-
-
-def _checked(
-    run: Run,
-    database: RunDatabase,
-    since: str | None = None,
-    track: Track = untracked,
-    each: Callable[[TileStatus, TileState], object] = ignored,
-) -> tuple[Summary, int]:
-    """Return what `recorded_summary` returns, from the tiles' folders and source files."""
-    counts, failures, finished, without_roads = Counter[TileState](), list[Failure](), 0, 0
-    flagged, variant = list[str](), run.config.export.variants[0]
-    states = tile_states(run, database, since)
-    for status, state in track(states, "checking tiles", len(run.catalog.tiles)):
-        counts[state] += 1
-        each(status, state)
-        record = status.last_record
-        finished += record is not None and record.finished >= (since or "")
-        if status.done and record is not None:
-            without_roads += record.without_roads
-            flagged += [record.tile_id] if variant in record.flagged else []
-        if state == "failed" and record and len(failures) < MAX_FAILURES:
-            failures += record.failures
-    current = summarise(len(run.catalog.tiles), counts, failures, without_roads, tuple(flagged))
-    return current, finished
+    return summarise(run.catalog, recorded(run, database, since), run.config.export.variants[0])
 
 
 def progress(run: Run, owner: Owner) -> tuple[Summary, str]:
@@ -305,9 +281,17 @@ def progress(run: Run, owner: Owner) -> tuple[Summary, str]:
     Only the database is read, so it can be repeated every few seconds; every tile is checked only if the
     database is damaged or does not have the catalog's tiles yet. ``owner`` is the process that runs it.
     """
+    finished = 0
+
+    def counted(lines: Iterable[Line]) -> Iterator[Line]:
+        nonlocal finished
+        for line in lines:
+            finished += line[2] is not None and line[2].finished >= owner.since
+            yield line
+
     with open_database(run) as database:
-        summary, finished = recorded_summary(run, database, owner.since)
-    summary = with_skipped(summary, run.catalog)
+        lines = counted(recorded(run, database, owner.since))
+        summary = summarise(run.catalog, lines, run.config.export.variants[0])
     minutes = (time.time() - datetime.fromisoformat(owner.since).timestamp()) / 60
     if not finished or minutes <= 0:
         return summary, ""

@@ -6,7 +6,7 @@ import contextlib
 import importlib.metadata
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Any
 
@@ -14,6 +14,7 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.skipped import lines
 from flexroad.catalog.storage.paths import Location, read, write
 from flexroad.pipeline.store import checked_json
+from flexroad.pipeline.store.database import Line
 from flexroad.pipeline.store.records import Failure, TileState
 
 NAME = "summary.json"
@@ -74,32 +75,36 @@ class Summary:
         return 2 if self.refused else int(self.failed + self.pending + self.skipped > 0)
 
 
-def summarise(
-    tiles: int,
-    counts: Counter[TileState],
-    failures: Iterable[Failure],
-    without_roads: int = 0,
-    flagged: tuple[str, ...] = (),
-) -> Summary:
-    """Return the summary of a run with ``tiles`` tiles from the number of tiles in each state."""
-    done, first = counts["done"] + counts["cached"], tuple(islice(failures, MAX_FAILURES))
-    pending = tiles - done - counts["failed"]
+def summarise(catalog: Catalog, tiles: Iterable[Line], variant: str) -> Summary:
+    """Return the summary of a run.
+
+    - `catalog`: its catalog.
+    - `tiles`: id, state and last record of its tiles; those that are missing are pending.
+    - `variant`: the variant whose flags are listed.
+    """
+    counts, without_roads = Counter[TileState](), 0
+    flagged, failures = list[str](), list[Failure]()
+    for tile_id, state, record in tiles:
+        counts[state] += 1
+        if record and state in ("done", "cached"):
+            without_roads += record.without_roads
+            flagged += [tile_id] if variant in record.flagged else []
+        elif record and state == "failed" and len(failures) < MAX_FAILURES:
+            failures += record.failures
+    number, done = len(catalog.tiles), counts["done"] + counts["cached"]
     return Summary(
-        tiles,
+        number,
         done,
         counts["failed"],
         counts["cached"],
-        pending,
+        number - done - counts["failed"],
         without_roads=without_roads,
-        flagged=flagged,
-        failures=first,
+        flagged=tuple(flagged),
+        skipped=len(catalog.skipped),
+        lost=len(catalog.lost),
+        left_out=tuple(islice(lines(catalog.skipped), MAX_FAILURES)),
+        failures=tuple(failures[:MAX_FAILURES]),
     )
-
-
-def with_skipped(summary: Summary, catalog: Catalog) -> Summary:
-    """Return the summary with what the run's catalog skipped."""
-    told = tuple(islice(lines(catalog.skipped), MAX_FAILURES))
-    return replace(summary, skipped=len(catalog.skipped), lost=len(catalog.lost), left_out=told)
 
 
 def write_summary(run: Location, summary: Summary, flushed: bool = False, **about: Any) -> None:

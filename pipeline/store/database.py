@@ -1,113 +1,87 @@
-"""The records of all tiles of a run, in one SQLite file: ``RUN/database.sqlite``.
+"""The states and records of all tiles of a run, in one file: ``RUN/database.txt``.
 
-The database is a cache of the tiles' markers. If it is missing, damaged or of another version, it starts
-empty. If a tile has no entry, or its marker differs from the one in the entry, the marker is read instead.
-One run writes the database; other processes may read it at the same time. Tables are read in pages, which
-keeps read locks short and memory use small. ::
+The file is a cache of the tiles' markers. If it is missing, damaged or of another version, it counts as
+empty, and the markers are read instead. One run writes it; other processes may read it at the same time. ::
 
-    entry   one row per tile that was ever processed: `TileRecord`
-    asked   the tiles of the catalog, in its order, each with its state, time, lack of roads, and the checksum
-            of its entry
-    total   the checksums of all rows of `asked`, combined by exclusive or
+    flexroad database 5 CHECKSUM            of the checksums of all lines
+    CHECKSUM    "tile"    state    record   a line per tile in the catalog's order, then a line per result
 
-Every row has a checksum, and nothing is returned that does not agree with it. A damaged, lost or old entry is
-noticed by its row in `asked`, a damaged, lost or old row of `asked` by the total (`RunDatabase.listed`).
+The last line of a tile is valid. Lines are only appended, and the first line is changed after that: a run
+that is killed leaves a valid file.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import json
-import sqlite3
+import os
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import reduce
-from operator import xor
-from typing import Any, TypeVar
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from hashlib import blake2b
+from typing import Any, BinaryIO
 
+from flexroad.catalog.storage.outputs import atomic_path, flush_path
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.storage.staging import StagedFile
-from flexroad.pipeline.store.records import Failure, MetricsRow, TileRecord, TileState
-from flexroad.pipeline.store.sqlite_file import (
-    Damage,
-    create,
-    is_damage,
-    open_readonly,
-    open_writable,
-    os_error,
-)
+from flexroad.pipeline.store.records import Failure, TileRecord, TileState
 
-NAME = "database.sqlite"
-VERSION = 4
-Recover = Callable[[str], TileRecord | None]
-"""Returns the record in a tile's marker, by the tile's id."""
-
-PAGE = 500
-"""Rows read at a time."""
+NAME = "database.txt"
+TITLE = b"flexroad database 5 "
+CHECKSUM_BYTES = 16
+DIGITS = 2 * CHECKSUM_BYTES
+"""Length of a checksum in the file (bytes)."""
 FLUSH_S = 1.0
 """Interval between writes of recorded tiles (s)."""
-CHECKSUM_BYTES = 16
-SEPARATOR = "\n"
-"""Between the variants in which a tile has flags."""
-TABLES = (
-    "CREATE TABLE entry (tile TEXT PRIMARY KEY, finished TEXT, record TEXT, checksum BLOB)",
-    "CREATE TABLE asked (position INTEGER PRIMARY KEY, tile TEXT UNIQUE, standing TEXT, finished TEXT,"
-    " roadless INTEGER, flagged TEXT, record BLOB, checksum BLOB)",
-    "CREATE TABLE total (checksum BLOB)",
-)
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Listed:
-    """Counts over the tiles of the last run."""
-
-    counts: Counter[TileState] = field(default_factory=Counter)
-    finished: int = 0
-    """Number of tiles finished (done or failed) since the time asked for."""
-    without_roads: int = 0
-    """Number of done tiles without roads."""
-    flagged: tuple[str, ...] = ()
-    """Ids of the done tiles that have flags in the variant asked for."""
+Line = tuple[str, TileState, TileRecord | None]
+"""Id and state of a tile, and the record of its last result; None if it has none."""
 
 
 class RunDatabase:
-    """Records and states of a run's tiles; a context manager that writes all pending records on exit."""
+    """States and records of a run's tiles; a context manager that writes all pending records on exit.
 
-    def __init__(self, connection: sqlite3.Connection, staged: StagedFile, recover: Recover) -> None:
-        self._connection = connection
-        self._staged = staged
-        self._recover = recover
+    - `path`: the file.
+    - `writable`: whether this process writes the file; it is then made empty if it is missing or damaged.
+    """
+
+    def __init__(self, path: Location, writable: bool = False) -> None:
+        self._staged = StagedFile(path, writable)
+        self._staged.fetch()
         self._pending: dict[str, TileRecord] = {}
         self._flushed = time.monotonic()
-        self._lost = False
-        """Whether the file is damaged and could not be made anew."""
+        self._file: BinaryIO | None = None
+        if not self.load() and writable:
+            self.set_states(())
 
-    @classmethod
-    def open(cls, path: Location, recover: Recover = lambda tile_id: None) -> RunDatabase:
-        """Open a database for writing; it is created empty if it is missing or damaged.
-
-        - `path`: the file.
-        - `recover`: reads the marker of a tile whose entry is lost or damaged.
-        """
-        staged = StagedFile(path)
-        staged.fetch()
-        try:
-            connection = open_writable(staged.path, TABLES, VERSION)
-        except Damage as error:
-            raise os_error(error, path) from error
-        return cls(connection, staged, recover)
-
-    @classmethod
-    def open_readonly(cls, path: Location, recover: Recover = lambda tile_id: None) -> RunDatabase:
-        """Open a database for reading, also while a run writes it; empty if it is missing or damaged."""
-        staged = StagedFile(path, writable=False)
-        staged.fetch()
-        return cls(open_readonly(staged.path, TABLES, VERSION), staged, recover)
+    def load(self) -> bool:
+        """Read the file again, and return whether it is valid; it counts as empty if it is not."""
+        if self._file:
+            self._file.close()
+        self._offsets: dict[str, int] = {}
+        self._checksums = blake2b(digest_size=CHECKSUM_BYTES)
+        self._file, self._end = None, 0
+        # To open a pipe would wait for a writer.
+        if not self._staged.path.is_file():
+            return False
+        offsets, checksums = {}, self._checksums.copy()
+        with contextlib.suppress(OSError):
+            self._file = self._staged.path.open("rb")
+            header = self._file.read(len(_header(checksums)))
+            # What is appended from now on is not read.
+            size, end = os.fstat(self._file.fileno()).st_size, len(header)
+            while end < size:
+                line = self._file.readline()
+                content = _content(line)
+                if content is None:
+                    return False
+                offsets[json.loads(content.split(b"\t", 2)[1])] = end
+                checksums.update(line[:DIGITS])
+                end += len(line)
+            if header == _header(checksums):
+                self._offsets, self._checksums, self._end = offsets, checksums, end
+                return True
+        return False
 
     def __enter__(self) -> RunDatabase:
         return self
@@ -119,10 +93,13 @@ class RunDatabase:
         """Write all pending records and close the file."""
         try:
             self.flush()
-            self._connection.close()
+            if self._staged.writable:
+                with contextlib.suppress(OSError):
+                    flush_path(self._staged.path)
             self._staged.put()
         finally:
-            self._connection.close()
+            if self._file:
+                self._file.close()
             self._staged.close()
 
     def set_states(self, tiles: Iterable[tuple[str, TileState]]) -> int:
@@ -130,12 +107,24 @@ class RunDatabase:
 
         - result: number of tiles with a record that are not in the list; their records are deleted.
         """
-        states = list(tiles)
-        return self._write(lambda: self._set_states(states))
+        self.flush()
+        vanished, checksums = self._offsets.copy(), blake2b(digest_size=CHECKSUM_BYTES)
+        with atomic_path(self._staged.path) as path, path.open("wb") as file:
+            file.write(_header(checksums))
+            for tile, state in tiles:
+                line = _line(tile, state, self.get(tile))
+                file.write(line)
+                checksums.update(line[:DIGITS])
+                vanished.pop(tile, None)
+            file.seek(0)
+            file.write(_header(checksums))
+        count = sum(self.get(tile) is not None for tile in vanished)
+        self.load()
+        return count
 
-    def record(self, entry: TileRecord) -> None:
+    def record(self, record: TileRecord) -> None:
         """Add a tile's record; it is written within seconds, on a full disk as soon as there is space."""
-        self._pending[entry.tile_id] = entry
+        self._pending[record.tile_id] = record
         if time.monotonic() - self._flushed > FLUSH_S:
             # A full disk does not stop the run; the write is repeated later.
             with contextlib.suppress(OSError):
@@ -145,217 +134,94 @@ class RunDatabase:
     def flush(self) -> None:
         """Write all pending records."""
         self._flushed = time.monotonic()
-        if self._pending:
-            self._write(self._write_pending)
-            self._pending.clear()
+        if not self._pending or not self._end:
+            return
+        lines, offsets, end, checksums = list[bytes](), {}, self._end, self._checksums.copy()
+        for tile, record in self._pending.items():
+            lines.append(_line(tile, record.state, record))
+            checksums.update(lines[-1][:DIGITS])
+            offsets[tile] = end
+            end += len(lines[-1])
+        try:
+            with self._staged.path.open("r+b") as file:
+                file.seek(self._end)
+                file.write(b"".join(lines))
+                file.flush()
+                file.seek(0)
+                file.write(_header(checksums))
+        except FileNotFoundError:
+            # Someone has deleted the file. At the end of the run the markers are read.
+            pass
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._staged.where)) from error
+        self._offsets |= offsets
+        self._end, self._checksums = end, checksums
+        self._pending.clear()
 
     def get(self, tile_id: str) -> TileRecord | None:
         """Return a tile's record, None if it has none or it is damaged."""
         if tile_id in self._pending:
             return self._pending[tile_id]
-        row = self._row("SELECT finished, record, checksum FROM entry WHERE tile = ?", tile_id)
-        return _record(tile_id, *row) if row else None
+        line = self._read(tile_id) if tile_id in self._offsets else None
+        return line[2] if line else None
 
-    def lookup(self, tile_id: str) -> TileRecord | None:
-        """Return a tile's record, from its marker if the database has none."""
-        return self.get(tile_id) or self._recover(tile_id)
-
-    def listed(self, tiles: Iterable[str], since: str = "", variant: str = "") -> Listed | None:
-        """Return the counts over the list of tiles; None if it is damaged or has other tiles.
-
-        - `tiles`: the ids that the list should have, in its order.
-        - `since`: count the tiles finished since this time (ISO 8601, UTC).
-        - `variant`: list the tiles that have flags in this variant.
-        """
+    def lists(self, tiles: Iterable[str]) -> bool:
+        """Return whether the file has exactly these tiles, in this order."""
         self.flush()
-        counts, finished, without_roads, flagged = Counter[TileState](), 0, 0, list[str]()
-        combined, total = 0, bytes(CHECKSUM_BYTES)
-        # One query sees one state of the file, also while a run writes it.
-        query = (
-            "SELECT position, tile, standing, finished, roadless, flagged, record, checksum,"
-            " (SELECT checksum FROM total)"
-            " FROM asked ORDER BY position"
-        )
-        try:
-            rows = self._connection.execute(query)
-            for number, (tile, row) in enumerate(zip(tiles, rows, strict=True), 1):
-                *fields, checksum, total = row
-                if fields[:2] != [number, tile] or digest(*fields) != checksum:
-                    return None
-                counts[fields[2]] += 1
-                finished += bool(fields[3]) and str(fields[3]) >= since
-                if fields[2] in ("done", "cached"):
-                    without_roads += fields[4]
-                    flagged += [tile] if variant and variant in fields[5].split(SEPARATOR) else []
-                combined ^= int.from_bytes(checksum)
-        except (*Damage, ValueError):
-            return None
-        return Listed(counts, finished, without_roads, tuple(flagged)) if total == _bytes(combined) else None
+        return list(self._offsets) == list(tiles)
 
-    def states(self) -> Iterator[TileState]:
-        """Yield the state of every tile as set by the last run, in the catalog's order."""
-        for row in self._asked():
-            yield row[2]
-
-    def entries(self) -> Iterator[tuple[str, TileState, TileRecord | None]]:
-        """Yield id, state and record (None if there is none) of every tile, in the catalog's order.
-
-        A record that is lost or damaged is read from the tile's marker.
-        """
-        return self._entries("")
-
-    def rows(self) -> Iterator[MetricsRow]:
-        """Yield the metrics rows of all tiles that are not pending, in the catalog's order."""
-        for _, _, record in self._entries("AND standing != 'pending'"):
-            yield from record.rows if record else ()
-
-    def failures(self) -> Iterator[Failure]:
-        """Yield the failures of all failed tiles, in the catalog's order."""
-        for _, _, record in self._entries("AND standing = 'failed'"):
-            yield from record.failures if record else ()
-
-    def _entries(self, condition: str) -> Iterator[tuple[str, TileState, TileRecord | None]]:
-        for _, tile, state, _, _, _, link, _ in self._asked(condition):
-            # No join: where an entry cannot be read, the rest of the page can.
-            row = self._row("SELECT finished, record FROM entry WHERE tile = ?", tile) if link else None
-            record = _record(tile, row[0], row[1], link) if row else None
-            yield tile, state, self._recover(tile) if record is None and state != "pending" else record
-
-    def _asked(self, condition: str = "") -> Iterator[Sequence[Any]]:
-        """Yield rows of `asked`, read in pages."""
+    def entries(self) -> Iterator[Line]:
+        """Yield id, state and record of every tile, in the catalog's order."""
         self.flush()
-        query = (
-            "SELECT position, tile, standing, finished, roadless, flagged, record, checksum FROM asked"
-            f" WHERE position > ? {condition} ORDER BY position LIMIT {PAGE}"
-        )
-        last = 0
-        while page := self._page(query, last):
-            for row in page:
-                if digest(*row[:7]) != row[7] or row[0] <= last:
-                    raise OSError(errno.EIO, "the list of tiles is damaged", str(self._staged.where))
-                last = row[0]
-                yield row
+        for tile in list(self._offsets):
+            line = self._read(tile)
+            if line is None:
+                raise OSError(errno.EIO, "the list of tiles is damaged", str(self._staged.where))
+            yield line
 
-    def _page(self, query: str, last: int) -> list[Sequence[Any]]:
-        try:
-            return self._connection.execute(query, (last,)).fetchall()
-        except Damage as error:
-            raise os_error(error, self._staged.where) from error
-
-    def _row(self, query: str, value: str) -> Sequence[Any] | None:
-        """Return the first row of a query, None if there is none or the database is damaged."""
-        with contextlib.suppress(*Damage):
-            row: Sequence[Any] | None = self._connection.execute(query, (value,)).fetchone()
-            return row
-        return None
-
-    def _set_states(self, tiles: Sequence[tuple[str, TileState]]) -> int:
-        execute = self._connection.execute
-        execute("DELETE FROM asked")
-        combined = 0
-        for position, (tile, state) in enumerate(tiles, 1):
-            entry = execute("SELECT finished, record, checksum FROM entry WHERE tile = ?", (tile,)).fetchone()
-            record = _record(tile, *entry) if entry else None
-            about = (entry[0], *_marks(record), entry[2]) if record else ("", 0, "", b"")
-            fields = (position, tile, state, *about)
-            checksum = digest(*fields)
-            execute("INSERT INTO asked VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*fields, checksum))
-            combined ^= int.from_bytes(checksum)
-        execute("DELETE FROM total")
-        execute("INSERT INTO total VALUES (?)", (_bytes(combined),))
-        others = "FROM entry WHERE tile NOT IN (SELECT tile FROM asked)"
-        vanished = execute(f"SELECT tile, finished, record, checksum {others}")
-        count = sum(digest(*fields) == checksum for *fields, checksum in vanished)
-        execute(f"DELETE {others}")
-        return int(count)
-
-    def _write_pending(self) -> None:
-        changes: list[int] = []
-        for entry in self._pending.values():
-            content = vars(entry) | {"failures": [asdict(failure) for failure in entry.failures]}
-            row = (entry.tile_id, entry.finished, json.dumps(content))
-            checksum = digest(*row)
-            self._connection.execute("INSERT OR REPLACE INTO entry VALUES (?, ?, ?, ?)", (*row, checksum))
-            change = self._update_asked(entry, checksum)
-            if change is None:
-                # Without a total the list counts as damaged.
-                self._connection.execute("DELETE FROM total")
-            else:
-                changes.append(change)
-        for (total,) in self._connection.execute("SELECT checksum FROM total").fetchall():
-            if isinstance(total, bytes) and len(total) == CHECKSUM_BYTES:
-                combined = _bytes(reduce(xor, changes, int.from_bytes(total)))
-                self._connection.execute("UPDATE total SET checksum = ?", (combined,))
-
-    def _update_asked(self, entry: TileRecord, link: bytes) -> int | None:
-        """Set a tile's state and the checksum of its entry; return the change of the total.
-
-        It is None if the tile has no row, or a damaged one, which stays as it is.
-        """
-        query = (
-            "SELECT position, standing, finished, roadless, flagged, record, checksum FROM asked"
-            " WHERE tile = ?"
-        )
-        row = self._connection.execute(query, (entry.tile_id,)).fetchone()
-        if row is None or digest(row[0], entry.tile_id, *row[1:6]) != row[6]:
+    def _read(self, tile_id: str) -> Line | None:
+        """Return the last line of a tile, None if it is damaged."""
+        content = None
+        if self._file:
+            with contextlib.suppress(OSError):
+                self._file.seek(self._offsets[tile_id])
+                content = _content(self._file.readline())
+        if content is None:
             return None
-        fields = (row[0], entry.tile_id, entry.state, entry.finished, *_marks(entry), link)
-        checksum = digest(*fields)
-        self._connection.execute(
-            "UPDATE asked SET standing = ?, finished = ?, roadless = ?, flagged = ?, record = ?, checksum = ?"
-            " WHERE position = ?",
-            (*fields[2:], checksum, row[0]),
-        )
-        return int.from_bytes(row[6]) ^ int.from_bytes(checksum)
-
-    def _write(self, change: Callable[[], T]) -> T:
-        """Write in one transaction, into a new and empty file if the old one turns out to be damaged."""
-        try:
-            try:
-                if not self._lost:
-                    with self._connection:
-                        return change()
-            except Damage as error:
-                if not is_damage(error):
-                    raise
-            self._connection.close()
-            # A full disk takes no new file: each later write tries again.
-            self._lost = True
-            self._connection = create(self._staged.path, TABLES, VERSION)
-            self._lost = False
-            with self._connection:
-                return change()
-        except Damage as error:
-            raise os_error(error, self._staged.where) from error
+        _, tile, state, record = content.split(b"\t")
+        return json.loads(tile), json.loads(state), _record(json.loads(record))
 
 
-def _marks(record: TileRecord) -> tuple[int, str]:
-    """Return whether a tile has no roads, and the variants in which it has flags, as the list has them."""
-    return int(record.without_roads), SEPARATOR.join(record.flagged)
+def _header(checksums: blake2b) -> bytes:
+    return TITLE + checksums.hexdigest().encode() + b"\n"
 
 
-def digest(*fields: Any) -> bytes:
-    """Return a checksum over the fields of a row and their types."""
-    return hashlib.blake2b(repr(fields).encode(), digest_size=CHECKSUM_BYTES).digest()
+def _line(tile: str, state: TileState, record: TileRecord | None) -> bytes:
+    fields = record and vars(record) | {"failures": [asdict(failure) for failure in record.failures]}
+    content = "".join(f"\t{json.dumps(value)}" for value in (tile, state, fields)).encode() + b"\n"
+    return _checksum(content) + content
 
 
-def _bytes(combined: int) -> bytes:
-    return combined.to_bytes(CHECKSUM_BYTES)
+def _content(line: bytes) -> bytes | None:
+    """Return a line without its checksum, None if the checksum is wrong."""
+    content = line[DIGITS:]
+    return content if line[:DIGITS] == _checksum(content) else None
 
 
-def _record(tile_id: str, finished: Any, text: Any, checksum: Any) -> TileRecord | None:
-    """Return the record in an entry's row, None if it does not have the checksum."""
-    if digest(tile_id, finished, text) != checksum:
+def _checksum(content: bytes) -> bytes:
+    return blake2b(content, digest_size=CHECKSUM_BYTES).hexdigest().encode()
+
+
+def _record(fields: dict[str, Any] | None) -> TileRecord | None:
+    if fields is None:
         return None
-    content = json.loads(text)
-    marker = content["marker"]
     return TileRecord(
-        **content
+        **fields
         | {
-            "rows": tuple(content["rows"]),
-            "failures": tuple(Failure(**failure) for failure in content["failures"]),
-            "marker": (marker[0], marker[1], marker[2]) if marker else None,
-            "stale": tuple(content.get("stale", ())),
-            "left_out": tuple(content.get("left_out", ())),
+            "rows": tuple(fields["rows"]),
+            "failures": tuple(Failure(**failure) for failure in fields["failures"]),
+            "marker": fields["marker"] and tuple(fields["marker"]),
+            "stale": tuple(fields["stale"]),
+            "left_out": tuple(fields["left_out"]),
         }
     )

@@ -194,7 +194,7 @@ class Nights:
 
     def _damage(self) -> None:
         """Damage files of the run."""
-        pattern = self._random.choice(("database.sqlite", "*.*", "tiles/*/*", "store/*/*/*"))
+        pattern = self._random.choice(("database.txt", "*.*", "tiles/*/*", "store/*/*/*"))
         files = [path for path in self._out.glob(pattern) if path.is_file() and path.name not in LEFT_ALONE]
         for path in self._random.sample(sorted(files), min(len(files), 5)):
             self._note(f"{path.relative_to(self._out)} {damage(path, self._random)}")

@@ -24,7 +24,6 @@ from flexroad.catalog.storage.paths import (
     exists,
     listing,
     read,
-    visible_entry,
     write,
 )
 from flexroad.catalog.text import count
@@ -32,7 +31,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.record import Run, check_own
 from flexroad.pipeline.run.status import Track, ended, untracked
 from flexroad.pipeline.run.tile_steps import REMEDY
 from flexroad.tasks.errors import TaskError
@@ -198,12 +197,10 @@ def _begun(out: Location, formats: Collection[str]) -> set[str]:
     """Return the formats of the folder that this or an earlier export has written or begun."""
     own = _formats(out)
     if own is None and exists(out / MANIFEST):
-        raise _foreign(out / MANIFEST)
+        raise ConfigError(f"{out / MANIFEST} is not of an export; choose another folder with -o")
     earlier = own or set()
-    for name in formats:
-        other = None if name in earlier else visible_entry(out / name)
-        if other is not None:
-            raise _foreign(out / name / other)
+    for name in sorted({*formats} - earlier):
+        check_own(out / name, lambda: False, "an export", "-o")
     return {*earlier, *formats}
 
 
@@ -211,13 +208,6 @@ def _formats(out: Location) -> set[str] | None:
     """Return the formats of earlier exports into the folder, None if there was none."""
     begun = out / BEGUN
     return set(read(begun).decode(errors="replace").split()) if exists(begun) else None
-
-
-def _foreign(file: Location) -> ConfigError:
-    return ConfigError(
-        f"{file} is not of an earlier `flexroad export` and would be replaced; "
-        "choose another folder with -o, or move that file away"
-    )
 
 
 def remove_unfinished(folder: Location, below: bool = False) -> None:

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from flexroad.catalog import Bounds, Catalog, Grid, Tile
 from flexroad.catalog.storage.scratch import ScratchFolder
-from flexroad.catalog.text import count, printable, shown
+from flexroad.catalog.text import Notify, count, printable, shown
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.config.options import INPUTS, METHOD, VALIDATION, option
 from flexroad.pipeline.errors import ConfigError
@@ -37,7 +37,6 @@ from flexroad.tools.train.mask_metrics import Quality, judge, together
 from flexroad.tools.train.spatial_split import Block, Split, inside, split, split_tile
 
 Labels = Literal["mask", "vector"]
-Log = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -184,12 +183,12 @@ class Samples(Sequence[Sample]):
         return Sample(data, road, self.tiles.usable_cells(data, road) & select(data.grid, block.bounds))
 
 
-def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> Outcome:
+def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notify) -> Outcome:
     """Train a head on a catalog and validate it.
 
     - `config`: options of its first exported variant: those of `load`, and those of `segment` if it is
       dinov2.
-    - `log`: called with each line of progress.
+    - `notify`: called with each line of progress.
     """
     settings = _settings(options)
     chain = config.chains[config.export.variants[0]]
@@ -198,11 +197,11 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> 
     tiles = LabelledTiles(options, chain["load"], vectors)
     notes: list[str] = []
     sides = _split(list(_labelled(catalog, tiles, notes)), options)
-    log(f"{count(len(sides.train), 'tile')} for training, {len(sides.validate)} for validation")
+    notify(f"{count(len(sides.train), 'tile')} for training, {len(sides.validate)} for validation")
     samples, validation = (Samples(tiles, sides, part) for part in ("train", "validate"))
 
     def progress(done: int, of: int, last: Epoch) -> None:
-        log(f"epoch {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
+        notify(f"epoch {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
 
     trained = fit_head.train(samples, validation, settings, progress)
     with ScratchFolder() as folder:

@@ -21,11 +21,11 @@ from flexroad.catalog.crs import in_plan, name, short, transformer
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.links import contained
-from flexroad.catalog.storage.paths import Location, absolute, exists, read, remove, visible_entry, write
+from flexroad.catalog.storage.paths import Location, absolute, exists, read, remove, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
-from flexroad.pipeline.run.record import Run, check_links
+from flexroad.pipeline.run.record import Run, check_links, check_own
 from flexroad.pipeline.run.status import TileStatus, Track, ended, peek_statuses, untracked
 from flexroad.pipeline.store.records import LEVELS
 from flexroad.pipeline.worker.texture import tile_photo
@@ -51,8 +51,6 @@ shapely = lazy("shapely")
 
 VERSION = 100 * encoding.VERSION + glb.VERSION
 PAGE = "index.html"
-MARK = b'<meta name="generator" content="FlexRoad viewer">'
-"""Text of a page that this program has written."""
 OWNER = ".flexroad-viewer"
 """File with the path of the run whose viewer the folder has."""
 PENDING, DONE, FAILED = range(3)
@@ -169,11 +167,7 @@ def _claim(out: Location, run: Run) -> None:
     # A folder inside the run may have been moved with it.
     if owner and owner != own and absolute(run.path) not in absolute(out).parents:
         raise ConfigError(f"{out} has the viewer of {owner}; choose another folder with -o, or remove it")
-    other = None if owner or (exists(out / PAGE) and MARK in read(out / PAGE)) else visible_entry(out)
-    if other is not None:
-        raise ConfigError(
-            f"{out} has files that are not of a viewer, such as {other}; choose another folder with -o"
-        )
+    check_own(out, lambda: bool(owner), "a viewer", "-o")
     check_links(out, below=True)
     write(out / OWNER, own.encode())
     remove(out / PAGE)

@@ -92,13 +92,13 @@ def test_run_status_summary_and_report_say_what_to_look_at(run, flexroad):
 
 def test_flagged_tiles_are_found_without_database_and_after_another_run(run, flexroad, tmp_path):
     opened = Run.open(run)
-    known = (run / "database.sqlite").read_bytes()
+    known = (run / "database.txt").read_bytes()
     assert summary(opened).flagged == (FLAGGED,)
-    (run / "database.sqlite").write_bytes(b"")
+    (run / "database.txt").write_bytes(b"")
     try:
         assert summary(opened).flagged == (FLAGGED,)
     finally:
-        (run / "database.sqlite").write_bytes(known)
+        (run / "database.txt").write_bytes(known)
     again = flexroad("rerun", run, "--executor", "serial").expected(0).out
     assert "2 done (2 cached)" in again
     assert "; 1 to look at; results in" in again

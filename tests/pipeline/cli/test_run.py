@@ -150,7 +150,7 @@ def test_refused_run_leaves_folders_as_they_were(flexroad, nightly, survey, tmp_
 def test_run_into_folder_with_other_files_changes_nothing(flexroad, nightly, survey):
     before = paths.listing(survey.parent)
     message = (
-        f"{survey.parent} has other files, such as catalog.parquet, and is no run; choose an empty or new"
+        f"{survey.parent} has files that are not of a run, such as catalog.parquet; choose an empty or new"
     )
     for words in (["--dry-run"], []):
         assert message in flexroad(*nightly, "--out", survey.parent, *words, expect=2)

@@ -187,7 +187,7 @@ def test_map_worker_with_other_versions_that_joins_later_is_left_out(processes, 
         yield from islice(iter(lambda: 1 if not lines else None, None), 10_000)
         yield from range(10, 30)
 
-    executor = DaskExecutor(scheduler=processes.address, say=of_workers(lines))
+    executor = DaskExecutor(scheduler=processes.address, notify=of_workers(lines))
     assert sorted(executor.map(double, jobs(), lost))[-20:] == [*range(20, 60, 2)]
     (line,) = lines
     assert "is left out: numpy is 1.0 there and" in line
@@ -209,7 +209,7 @@ def test_map_worker_with_other_code_of_the_same_version_is_left_out(processes, t
     processes.worker()
     wait_for(processes.address, 2)
     lines = []
-    executor = DaskExecutor(scheduler=processes.address, say=of_workers(lines))
+    executor = DaskExecutor(scheduler=processes.address, notify=of_workers(lines))
     assert sorted(executor.map(double, range(20), lost)) == [*range(0, 40, 2)]
     assert len(lines) == 1
 

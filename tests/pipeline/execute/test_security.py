@@ -52,7 +52,7 @@ def test_run_scheduler_without_port_is_refused_before_the_catalog_is_read(flexro
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "127.0.0.1:1", "ws://127.0.0.1:1"])
 def test_scheduler_without_tls_is_said_to_be_open(address):
     said: list[str] = []
-    with open_cluster(Cluster(), None, address, False, say=said.append):
+    with open_cluster(Cluster(), None, address, False, notify=said.append):
         assert said == [
             "a scheduler without tls:// is open to everyone who reaches it, and runs programs as its user"
         ]

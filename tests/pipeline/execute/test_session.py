@@ -246,14 +246,14 @@ def test_session_that_loses_its_only_able_worker_can_be_resumed(working):
 
 
 def join_when_none_is_left(session, worker):
-    say = session.say
+    notify = session.notify
 
     def join(line):
-        say(line)
+        notify(line)
         if line.startswith("no worker is left"):
             session.client.there[worker.address] = worker
 
-    session.say = join
+    session.notify = join
 
 
 def test_able_worker_that_joins_later_gets_the_jobs(working):

@@ -270,15 +270,15 @@ def no_file_above(size: int) -> Iterator[None]:
 def test_run_disk_full_during_write_leaves_no_half_file(
     database_fits, flexroad, night, undisturbed, config, made_survey, out
 ):
-    database = (undisturbed / "database.sqlite").stat().st_size
-    size = database + (1_000 if database_fits else -10_000)
+    database = (undisturbed / "database.txt").stat().st_size
+    size = 2 * database if database_fits else database - 4_000
     too_large = {path.parent for path in undisturbed.glob("tiles/*/*") if path.stat().st_size > size}
     assert 0 < len(too_large) < 4
     Run.create(out, load_config(config), Catalog.read(made_survey / "catalog.parquet"))
     with no_file_above(size):
         said = flexroad("rerun", out, "--executor", "serial")
     assert said.code == 1
-    message = f"{len(too_large)} failed" if database_fits else "database.sqlite"
+    message = f"{len(too_large)} failed" if database_fits else "database.txt"
     assert message in said.out + said.err
     failed = [line for line in said.errors if "File too large" in line]
     assert failed

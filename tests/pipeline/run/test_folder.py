@@ -34,7 +34,7 @@ def test_folder_with_files_of_others_is_refused(folder, names):
     before = paths.listing(folder)
     other = min(name.partition("/")[0] for name in names if not name.startswith(("lock", "log")))
     message = (
-        f"{folder} has other files, such as {other}, and is no run; choose an empty or new one with --out"
+        f"{folder} has files that are not of a run, such as {other}; choose an empty or new folder with --out"
     )
     with pytest.raises(ConfigError) as refusal:
         check_folder(folder)

@@ -26,7 +26,7 @@ def run(made_survey, quick_config, tmp_path) -> Run:
         {"variant": name, "error_estimate_m": estimate, "flags": "patch" if name == "flexroad" else ""}
         for name, estimate in (("rgt", 9.0), ("flexroad", 0.25))
     )
-    with RunDatabase.open(run.path / NAME) as database:
+    with RunDatabase(run.path / NAME, writable=True) as database:
         database.set_states(states)
         database.record(TileRecord(one, "done", "f", rows, finished="2026-11-21T02:00:00+00:00", seconds=1.5))
         database.record(

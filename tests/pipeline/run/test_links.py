@@ -68,7 +68,7 @@ def tile_of(run: Path) -> Path:
         "run.json",
         "config.yaml",
         "catalog.parquet",
-        "database.sqlite",
+        "database.txt",
         "log.jsonl",
     ],
 )

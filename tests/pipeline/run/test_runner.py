@@ -323,7 +323,7 @@ def test_resume_makes_each_graph_once_and_reads_no_marker(finished, monkeypatch)
 
 @pytest.mark.parametrize("state", ["lost", "damaged", "outdated"])
 def test_outdated_database_is_restored_from_markers(state, finished):
-    database = finished.path / "database.sqlite"
+    database = finished.path / "database.txt"
     before = database.read_bytes()
     run = changed(finished, evaluate={"nearest": True})
     run_tiles(run, SerialExecutor())

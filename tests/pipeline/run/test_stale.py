@@ -90,7 +90,7 @@ def test_products_of_failed_tile_stay_and_are_marked(run):
     # A further failure does not forget them, nor does a lost database.
     source(run).write_bytes(b"no raster either")
     run_tiles(run, SerialExecutor())
-    (run.path / "database.sqlite").unlink()
+    (run.path / "database.txt").unlink()
     run_tiles(run, SerialExecutor(), only=lambda tile: False)
     assert (failed(run)["stale"], marked(run)) == (sorted(before), ("failed", True))
     assert not [file for file in find_garbage([run]) if file.kind == "products"]

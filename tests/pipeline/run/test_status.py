@@ -30,7 +30,7 @@ def test_progress_returns_counts_and_rate(run):
         "node7", "m", "b", 4711, 99, (now - timedelta(minutes=2)).isoformat(timespec="seconds"), "t"
     )
     before, lately = ((now - timedelta(minutes=m)).isoformat(timespec="milliseconds") for m in (9, 1))
-    with RunDatabase.open(run.path / NAME) as database:
+    with RunDatabase(run.path / NAME, writable=True) as database:
         database.set_states([(tile.id, "pending") for tile in run.catalog.tiles])
         database.record(TileRecord(one, "done", "f", (), finished=before))
         database.flush()
@@ -49,7 +49,7 @@ def test_progress_returns_counts_and_rate(run):
 
 def test_status_of_active_run_shows_counts_and_owner(run, flexroad):
     one, two, *_ = (tile.id for tile in run.catalog.tiles)
-    with run_lock(run.path), RunDatabase.open(run.path / NAME) as database:
+    with run_lock(run.path), RunDatabase(run.path / NAME, writable=True) as database:
         database.set_states([(tile.id, "pending") for tile in run.catalog.tiles])
         assert "4 tiles: 0 done (0 cached), 0 failed, 4 pending" in flexroad("status", run.path).out
         database.record(TileRecord(one, "failed", "f", (), (Failure(one, "load", "TaskError", "gone"),)))

@@ -53,7 +53,7 @@ def test_artefact_under_the_name_of_another_changes_no_result(stage, out, sound)
     assert len(paths) > 2
     rotate(paths)
     shutil.rmtree(out / "tiles")
-    (out / "database.sqlite").unlink()
+    (out / "database.txt").unlink()
     assert again(out).exit_code == 0
     assert_equal(out, sound)
 

@@ -1,25 +1,24 @@
 """The database returns what was recorded, also after damage to its file and on a full disk."""
 
-import contextlib
 import errno
 import json
 import os
-import sqlite3
-from collections import Counter
+import resource
 from dataclasses import replace
 
 import pytest
 
-from flexroad.pipeline.store.database import NAME, PAGE, Listed, RunDatabase, digest
+from flexroad.pipeline.store.database import NAME, RunDatabase
 from flexroad.pipeline.store.records import Failure, TileRecord
 
-TILES = [f"{i}_{i}" for i in range(2 * PAGE + 7)]
-"""Ids of tiles for more than two pages."""
+TILES = [f"{i}_{i}" for i in range(100)]
+DONE = ("1_1", "2_2")
+"""Tiles of the smallest file that has all kinds of lines."""
 
 
 def entry(tile: str) -> TileRecord:
     failed = int(tile.split("_")[0]) % 3 == 0
-    failures = (Failure(tile, "fit", "TaskError", 'with "quotes", commas', "a.tif"),) if failed else ()
+    failures = (Failure(tile, "fit", "TaskError", 'with "quotes",\ttabs', "a.tif"),) if failed else ()
     rows = ({"tile_id": tile, "l2_road_m": 0.1 + 0.2, "triangles": 7, "nearest_road_m": None},)
     sources = [["dsm", [["dsm.tif", 3, 1700000000000000001]], [], None]]
     marker = ("failed.json" if failed else "item.json", 12, 1700000000000000002)
@@ -29,250 +28,173 @@ def entry(tile: str) -> TileRecord:
     )
 
 
+def lines(path) -> list:
+    with RunDatabase(path) as database:
+        return list(database.entries())
+
+
 @pytest.fixture
 def full(tmp_path):
     """A database with records of all tiles in reverse order, except the last tile, which is pending."""
-    with RunDatabase.open(tmp_path / NAME) as database:
+    with RunDatabase(tmp_path / NAME, writable=True) as database:
         database.set_states((tile, "pending") for tile in TILES)
         for tile in reversed(TILES[:-1]):
             database.record(entry(tile))
     return tmp_path / NAME
 
 
+@pytest.fixture
+def small(tmp_path):
+    """A database of a tile that was recorded twice, and one that was recorded once."""
+    with RunDatabase(tmp_path / NAME, writable=True) as database:
+        database.set_states((tile, "pending") for tile in DONE)
+        for record in (replace(entry(DONE[0]), seconds=9.0), entry(DONE[1]), entry(DONE[0])):
+            database.record(record)
+            database.flush()
+    return tmp_path / NAME
+
+
 def test_recorded_tiles_are_read_in_catalog_order(full):
     records = {tile: entry(tile) for tile in TILES[:-1]}
-    with RunDatabase.open_readonly(full) as database:
+    expected = [(tile, record.state, record) for tile, record in records.items()]
+    assert lines(full) == [*expected, (TILES[-1], "pending", None)]
+    with RunDatabase(full) as database:
         assert {tile: database.get(tile) for tile in TILES} == records | {TILES[-1]: None}
-        entries = list(database.entries())
-        assert [tile for tile, _, _ in entries] == TILES
-        assert [record for _, _, record in entries] == [*records.values(), None]
-        assert list(database.rows()) == [row for record in records.values() for row in record.rows]
-        assert list(database.failures()) == [
-            failure for record in records.values() for failure in record.failures
-        ]
-        states = Counter(record.state for record in records.values())
-        assert database.listed(TILES) == Listed(Counter({**states, "pending": 1}), len(records))
-        assert database.listed(TILES, "2026-01-01").finished == len(records)
-        assert database.listed(TILES, "2026-01-02").finished == 0
+        assert database.lists(TILES)
+        assert not database.lists(TILES[1:])
+        assert not database.lists(reversed(TILES))
 
 
-def test_tables_contain_only_current_tiles(full):
-    with RunDatabase.open(full) as database:
-        vanished = database.set_states([(TILES[5], "pending"), (TILES[3], "failed"), (TILES[4], "cached")])
-        assert vanished == len(TILES) - 1 - 3
-        assert [row["tile_id"] for row in database.rows()] == [TILES[3], TILES[4]]
-        assert [failure.tile_id for failure in database.failures()] == [TILES[3]]
-        assert list(database.states()) == ["pending", "failed", "cached"]
+def test_list_has_only_current_tiles(full):
+    with RunDatabase(full, writable=True) as database:
+        current = [(TILES[5], "pending"), (TILES[3], "failed"), (TILES[4], "cached"), ("new", "pending")]
+        assert database.set_states(current) == len(TILES) - 1 - 3
+        assert [line[:2] for line in database.entries()] == current
         database.record(entry(TILES[5]))
-        assert [row["tile_id"] for row in database.rows()] == [TILES[5], TILES[3], TILES[4]]
+        assert next(database.entries()) == (TILES[5], "done", entry(TILES[5]))
         assert database.get(TILES[0]) is None
+        assert database.get("new") is None
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda data: b"",
-        lambda data: b"no database",
-        lambda data: data[: len(data) // 2],
-        lambda data: data[:8192] + b"\xff" * 4096 + data[12288:],
-        lambda data: data[:60] + b"\0\0\0\x63" + data[64:],
-    ],
-    ids=["empty", "of another kind", "cut off", "overwritten", "of another version"],
-)
-def test_open_damaged_database_starts_empty(damage, full):
-    full.write_bytes(damage(full.read_bytes()))
-    with RunDatabase.open(full) as database:
-        assert database.listed([]) == Listed()
-        assert database.get(TILES[0]) is None
+def test_any_changed_byte_makes_the_database_empty(small):
+    whole = small.read_bytes()
+    assert lines(small) == [(tile, "done", entry(tile)) for tile in DONE]
+    for position in range(len(whole)):
+        for bits in (1, 0x80, 0xFF):
+            damaged = bytearray(whole)
+            damaged[position] ^= bits
+            small.write_bytes(damaged)
+            assert lines(small) == [], position
+
+
+def test_any_missing_or_additional_part_makes_the_database_empty(small):
+    whole = small.read_bytes()
+    header, *rows = whole.splitlines(keepends=True)
+    assert len(rows) == 5
+    damaged = [whole[:end] for end in range(len(whole))]
+    damaged += [whole + b"\n", whole + rows[-1], header, b"no database"]
+    damaged += [header + b"".join(rows[:i] + rows[i + 1 :]) for i in range(len(rows))]
+    damaged += [header + b"".join([*rows[:i], rows[i + 1], rows[i], *rows[i + 2 :]]) for i in range(4)]
+    for data in damaged:
+        small.write_bytes(data)
+        assert lines(small) == []
+    with RunDatabase(small, writable=True) as database:
         database.set_states([(TILES[0], "pending")])
         database.record(entry(TILES[0]))
-    with RunDatabase.open_readonly(full) as database:
-        assert database.get(TILES[0]) == entry(TILES[0])
+    assert lines(small) == [(TILES[0], "failed", entry(TILES[0]))]
 
 
-def change(path, *statements):
-    """Change a database without changing its checksums."""
-    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
-        for statement in statements:
-            connection.execute(statement)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        "UPDATE entry SET record = replace(record, '0.25', '8.25') WHERE tile = '4_4'",
-        "UPDATE entry SET record = substr(record, 2) WHERE tile = '4_4'",
-        "UPDATE entry SET record = CAST(record AS BLOB) WHERE tile = '4_4'",
-        "UPDATE entry SET record = CAST(x'7bff7d' AS TEXT) WHERE tile = '4_4'",
-        "UPDATE entry SET finished = 7 WHERE tile = '4_4'",
-        "UPDATE entry SET checksum = NULL WHERE tile = '4_4'",
-        "UPDATE entry SET tile = '5-5' WHERE tile = '4_4'",
-        "DELETE FROM entry WHERE tile = '4_4'",
-    ],
-)
-def test_damaged_entry_is_recovered_from_marker(damage, full):
-    change(full, damage)
-    asked = []
-
-    def recover(tile):
-        asked.append(tile)
-        return entry(tile)
-
-    for opened in (RunDatabase.open_readonly, RunDatabase.open):
-        with opened(full, recover) as database:
-            assert (database.get("4_4"), database.get("7_7")) == (None, entry("7_7"))
-            assert database.lookup("4_4") == entry("4_4")
-            assert database.listed(TILES) is not None
-            assert list(database.rows()) == [row for tile in TILES[:-1] for row in entry(tile).rows]
-            assert [record for _, _, record in database.entries()] == [*map(entry, TILES[:-1]), None]
-    assert set(asked) <= {"4_4"}
-
-
-def test_entry_of_earlier_write_is_not_taken(full):
-    """A page that was written once more, but is there as before: its rows have valid checksums."""
-    with RunDatabase.open(full) as database:
-        database.record(replace(entry("4_4"), seconds=9.0))
-    with contextlib.closing(sqlite3.connect(full)) as connection:
-        (new,) = connection.execute("SELECT record FROM entry WHERE tile = '4_4'").fetchall()
-    old = json.dumps(json.loads(new[0]) | {"seconds": 0.25})
-    checksum = digest("4_4", "2026-01-01", old).hex()
-    change(full, f"UPDATE entry SET record = '{old.replace(chr(39), chr(39) * 2)}', checksum = x'{checksum}'"
-           " WHERE tile = '4_4'")  # fmt: skip
-    with RunDatabase.open_readonly(full, lambda tile: replace(entry(tile), seconds=9.0)) as database:
-        assert database.get("4_4").seconds == 0.25
-        assert {tile: record.seconds for tile, _, record in database.entries() if record}["4_4"] == 9.0
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        "UPDATE asked SET standing = 'done' WHERE tile = '3_3'",
-        "UPDATE asked SET standing = CAST(x'ff' AS TEXT) WHERE tile = '3_3'",
-        "UPDATE asked SET finished = '' WHERE tile = '3_3'",
-        "UPDATE asked SET roadless = 1 WHERE tile = '3_3'",
-        "UPDATE asked SET position = 5000 WHERE tile = '3_3'",
-        "UPDATE asked SET checksum = x'00' WHERE tile = '3_3'",
-        "DELETE FROM asked WHERE tile = '3_3'",
-        "DELETE FROM asked WHERE position > 3",
-        "DELETE FROM asked",
-        "DELETE FROM total",
-        "UPDATE total SET checksum = zeroblob(16)",
-        "UPDATE total SET checksum = 7",
-    ],
-)
-def test_damaged_list_is_noticed_and_replaced(damage, full):
-    change(full, damage)
-    with RunDatabase.open_readonly(full) as database:
-        assert database.listed(TILES) is None
-    with RunDatabase.open(full) as database:
-        # A record written meanwhile does not hide the damage.
-        database.record(entry("3_3"))
-        assert database.listed(TILES) is None
-        assert database.set_states((tile, "pending") for tile in TILES) == 0
-        assert database.listed(TILES).counts == {"pending": len(TILES)}
-
-
-def test_list_of_earlier_write_is_noticed(full):
-    with contextlib.closing(sqlite3.connect(full)) as connection:
-        (old,) = connection.execute("SELECT * FROM asked WHERE tile = '4_4'").fetchall()
-    with RunDatabase.open(full) as database:
-        database.record(replace(entry("4_4"), state="failed"))
-    with RunDatabase.open_readonly(full) as database:
-        assert database.listed(TILES) is not None
-        assert list(database.states())[4] == "failed"
-    with contextlib.closing(sqlite3.connect(full)) as connection, connection:
-        connection.execute("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?, ?, ?, ?, ?)", old)
-    with RunDatabase.open_readonly(full) as database:
-        assert database.listed(TILES) is None
-
-
-@pytest.mark.parametrize("size", [0, 100, 5000, 60_000])
-def test_database_damaged_while_open_is_made_anew(size, full):
-    with RunDatabase.open(full) as database:
-        database._connection.execute("PRAGMA cache_size = 1")
-        with full.open("r+b") as file:
-            file.truncate(size)
-            file.seek(0)
-            file.write(b"\xff" * min(size, 8192))
-        database.record(replace(entry("4_4"), seconds=9.0))
+def test_state_of_the_file_before_a_write_is_valid(full):
+    """A process that is killed while it adds a line leaves the former file, or one that counts as empty."""
+    before = lines(full)
+    with RunDatabase(full, writable=True) as database:
+        first = full.read_bytes()
+        database.record(entry(TILES[-1]))
         database.flush()
-        assert database.listed(TILES) is None
-        assert database.get("4_4").seconds == 9.0
+        second = full.read_bytes()
+        assert second[: len(first)].splitlines()[1:] == first.splitlines()[1:]
+        for data, expected in ((first, before), (first + second[len(first) :], []), (second[:-5], [])):
+            full.write_bytes(data)
+            assert lines(full) == expected
+
+
+def test_database_damaged_while_open_gives_no_damaged_record(full):
+    with RunDatabase(full, writable=True) as database:
         database.set_states((tile, "done") for tile in TILES)
-        assert database.listed(TILES).counts == {"done": len(TILES)}
-    with RunDatabase.open_readonly(full) as database:
-        assert database.listed(TILES).counts == {"done": len(TILES)}
-
-
-def test_damaged_database_on_a_full_disk_says_so_until_there_is_space(full, monkeypatch):
-    def no_space(path, *_):
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
-
-    with RunDatabase.open(full) as database:
-        database._connection.execute("PRAGMA cache_size = 1")
-        full.write_bytes(b"\xff" * 8192)
-        monkeypatch.setattr("flexroad.pipeline.store.database.create", no_space)
-        for number in ("1_1", "4_4"):
-            database.record(entry(number))
-            with pytest.raises(OSError, match="No space left on device"):
-                database.flush()
-        database._pending.clear()
-        with pytest.raises(OSError, match=f"it is damaged and could not be made anew: .*{NAME}"):
-            list(database.states())
-        monkeypatch.undo()
+        full.write_bytes(full.read_bytes().replace(b"0.25", b"8.25"))
+        assert [database.get(tile) for tile in TILES] == [None] * len(TILES)
         database.record(entry("4_4"))
-    with RunDatabase.open_readonly(full) as database:
         assert database.get("4_4") == entry("4_4")
+        with pytest.raises(OSError, match=f"the list of tiles is damaged.*{NAME}"):
+            list(database.entries())
+        assert not database.load()
+        database.record(entry("5_5"))
+        database.set_states((tile, "done") for tile in TILES)
+        assert database.lists(TILES)
+    assert {tile: record for tile, _, record in lines(full) if record} == {"5_5": entry("5_5")}
+
+
+def test_database_deleted_while_open_is_noticed(full):
+    with RunDatabase(full, writable=True) as database:
+        full.unlink()
+        database.record(entry("4_4"))
+        database.flush()
+        assert not database.load()
+        assert not database.lists(TILES)
 
 
 @pytest.mark.parametrize("mask", [0o002, 0o022, 0o077])
 def test_database_has_the_rights_that_the_umask_gives(tmp_path, mask):
     before = os.umask(mask)
     try:
-        with RunDatabase.open(tmp_path / NAME) as database:
+        with RunDatabase(tmp_path / NAME, writable=True) as database:
             database.set_states([("a", "pending")])
     finally:
         os.umask(before)
     assert (tmp_path / NAME).stat().st_mode & 0o777 == 0o666 & ~mask
 
 
-def test_file_that_calls_itself_read_only_is_replaced(full):
-    data = bytearray(full.read_bytes())
-    data[18] = 9
-    full.write_bytes(data)
-    with RunDatabase.open(full) as database:
-        database.record(entry(TILES[0]))
-    with RunDatabase.open_readonly(full) as database:
-        assert database.get(TILES[0]) == entry(TILES[0])
-
-
-def test_read_while_writing_returns_new_records(full):
-    with RunDatabase.open(full) as writer, RunDatabase.open_readonly(full) as reader:
-        rows = reader.rows()
-        next(rows)
-        writer.set_states((tile, "pending") for tile in TILES)
+def test_reader_has_one_state_of_a_file_that_is_written(full):
+    with RunDatabase(full, writable=True) as writer, RunDatabase(full) as reader:
+        before = lines(full)
         writer.record(entry(TILES[-1]))
         writer.flush()
-        assert reader.get(TILES[-1]) == entry(TILES[-1])
-        assert reader.listed(TILES).counts == {"pending": len(TILES) - 1, "done": 1}
+        assert list(reader.entries()) == before
+        assert lines(full)[-1] == (TILES[-1], "failed", entry(TILES[-1]))
+        writer.set_states((tile, "pending") for tile in TILES)
+        assert list(reader.entries()) == before
+        assert {state for _, state, _ in lines(full)} == {"pending"}
 
 
 def test_open_readonly_missing_database_creates_no_file(tmp_path):
-    with RunDatabase.open_readonly(tmp_path / NAME) as database:
-        assert database.listed([]) == Listed()
+    assert lines(tmp_path / NAME) == []
     assert not list(tmp_path.iterdir())
 
 
+def test_pipe_in_place_of_the_database_is_not_opened(tmp_path):
+    os.mkfifo(tmp_path / NAME)
+    assert lines(tmp_path / NAME) == []
+
+
+def test_database_is_a_text_that_programs_can_read(small):
+    title, *rows = small.read_text().splitlines()
+    assert title.startswith("flexroad database ")
+    fields = [[json.loads(text) for text in row.split("\t")[1:]] for row in rows]
+    assert [(tile, state) for tile, state, _ in fields[2:]] == [(tile, "done") for tile in (*DONE, DONE[0])]
+
+
 def test_records_wait_while_disk_is_full(tmp_path):
-    with RunDatabase.open(tmp_path / NAME) as database:
+    with RunDatabase(tmp_path / NAME, writable=True) as database:
         database.set_states((tile, "pending") for tile in TILES)
-        database._connection.execute("PRAGMA max_page_count = 1")
-        for tile in TILES:
-            database.record(entry(tile))
-        with pytest.raises(OSError, match=f"No space left on device.*{NAME}") as caught:
-            database.flush()
-        assert caught.value.errno == errno.ENOSPC
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / NAME).stat().st_size + 1000, hard))
+        try:
+            for tile in TILES:
+                database.record(entry(tile))
+            with pytest.raises(OSError, match=f"File too large.*{NAME}") as caught:
+                database.flush()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert caught.value.errno == errno.EFBIG
         assert database.get(TILES[0]) == entry(TILES[0])
-        database._connection.execute("PRAGMA max_page_count = 100000")
-    with RunDatabase.open_readonly(tmp_path / NAME) as database:
-        assert [record for _, _, record in database.entries()] == [entry(tile) for tile in TILES]
+    assert [record for _, _, record in lines(tmp_path / NAME)] == [entry(tile) for tile in TILES]
