@@ -31,7 +31,6 @@ from flexroad.tools.export import reference_line as lines
 from flexroad.tools.export.along_line import (
     HeightAt,
     HeightGrid,
-    Profiles,
     across,
     elevation_error,
     grid_error,
@@ -45,10 +44,11 @@ from flexroad.tools.export.ground import SMOOTH, Ground, steps_left_out
 from flexroad.tools.export.local_frame import LocalFrame
 from flexroad.tools.export.network import Network, network
 from flexroad.tools.export.pieces import MARKERS, Encode, Piece, Row, write_pieces, write_whole
+from flexroad.tools.export.profiles import Profiles
 from flexroad.tools.export.reference_line import ReferenceLine
 from flexroad.tools.export.source import Options, Source
 
-VERSION = 7
+VERSION = 8
 """Of the roads themselves: their division, lines, grids and errors."""
 INTERNAL = {"bounds", "lanes_assumed"}
 """Entries of a road's row that the report does not show."""

@@ -84,7 +84,7 @@ class LiftedFile:
         """One line: what has heights, and what has not."""
         parts = [f"{count(len(self.rows), self.noun)}, {_length(self.rows, 'length_m')}"]
         if any(row.without_ground_m > 0 for row in self.rows):
-            kept = "go on level" if self.options.flat_ends else "keep their heights"
+            kept = "go on level" if self.options.beyond == "flat" else "keep their heights"
             parts.append(f"{_length(self.rows, 'without_ground_m')} beyond the tiles {kept}")
         if any(row.unknown_deck_m > 0 for row in self.rows):
             parts.append(f"{_length(self.rows, 'unknown_deck_m')} on decks or in tunnels of unknown height")
@@ -108,7 +108,7 @@ class LiftedFile:
             points = sum(row.points_without_ground for row in without)
             parts = [f"{length:.1f} m"] if length else []
             parts += [count(points, "point")] if points else []
-            kept = "go on level there" if self.options.flat_ends else "keep their heights"
+            kept = "go on level there" if self.options.beyond == "flat" else "keep their heights"
             notes.append(
                 f"{' and '.join(parts)} of {count(len(without), self.noun)} lie beyond the finished tiles "
                 f"and {kept} ({_first(without)})"

@@ -18,8 +18,8 @@ from flexroad.tasks.quality.flagged import Bits, passed
 from flexroad.tasks.roads import level_numbers
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.lift.batches import POINTS
-from flexroad.tools.lift.levels import ANY, Numbers, along
 from flexroad.tools.lift.lines import STEP_M, Line, largest, steepest
+from flexroad.tools.lift.network import ANY, Numbers, along, filled, of_levels
 from flexroad.tools.lift.shapes import POINT, POLYGON, Shape
 from flexroad.tools.lift.types import Lifted, Options, RunSurface, Steep
 
@@ -215,7 +215,7 @@ class _Samples:
         sides = []
         for across in (ACROSS_M, -ACROSS_M):
             heights = run.at(self.east[usable] + across * right, self.north[usable] + across * up)
-            sides.append(_of_levels(heights, numbers))
+            sides.append(of_levels(heights, numbers))
         found[usable] = np.abs(sides[0] - sides[1]) / (2 * ACROSS_M)
         return found
 
@@ -307,14 +307,6 @@ def _on_levels(
     return z, numbers
 
 
-def _of_levels(heights: Heights, numbers: Numbers) -> Floats:
-    """Return the heights of points on given levels; NaN where a point does not have its level."""
-    z = np.full(len(numbers), np.nan)
-    for number, row in zip(heights.numbers, heights.z, strict=True):
-        z[numbers == number] = row[numbers == number]
-    return z
-
-
 def _point(name: str, shape: Shape, at: int, group: _Group) -> tuple[Shape, Lifted]:
     """Return what `_with_heights` does, for a single point: a file may have millions."""
     z = float(group.z[at])
@@ -343,7 +335,10 @@ def _with_heights(
         points = sum(path.code == POINT for path in paths)
         of_lines = length if points < len(paths) else np.nan
         return shape, Lifted(feature.id, of_lines, length, (), points_without_ground=points)
-    z = _filled(group, place, known)
+    z = group.z[place]
+    if group.options.beyond == "keep":
+        z = np.where(known, z, group.samples.values[place, 2])
+    z = filled(group.samples.along[place], z)
     new, kept = list[Floats](), list[NDArray[np.intp]]()
     for path in paths:
         profile = z[path.start - place.start : path.end - place.start]
@@ -358,20 +353,6 @@ def _with_heights(
 
 def _length(path: _Path, samples: _Samples) -> float:
     return float(samples.along[path.end - 1] - samples.along[path.start])
-
-
-def _filled(group: _Group, place: slice, known: Bools) -> Floats:
-    """Return heights of a feature that are known everywhere: as they were, else straight from known to known.
-
-    Beyond the first and the last known point of a feature they are level.
-    """
-    z = group.z[place]
-    if known.all():
-        return z
-    if not group.options.flat_ends:
-        z = np.where(known, z, group.samples.values[place, 2])
-    has, index = np.isfinite(z), np.arange(len(z))
-    return np.where(has, z, np.interp(index, index[has], z[has]))
 
 
 def _line(path: _Path, samples: _Samples) -> Line:

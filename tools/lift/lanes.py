@@ -8,8 +8,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from flexroad.tasks.types import Floats
+from flexroad.tools.export.profiles import value_at
 from flexroad.tools.lift.plan_view import numbers
-from flexroad.tools.lift.profile import value_at
 
 SIDES = ("right", "left")
 HALF_WIDEST_M = 200.0

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Literal
 
 import numpy as np
 
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.lift.profile import AHEAD_M, cubic_pieces
+from flexroad.tools.export.profiles import cubic_pieces, straight_lines
+from flexroad.tools.lift.lines import stretches
+from flexroad.tools.lift.network import NOWHERE, Ends, filled
 
+AHEAD_M = 0.05
+"""Distance over which the slope of a surface is taken (m)."""
 NONE = np.zeros((1, 5))
 """A profile without records: it is 0."""
 STEEPEST = 0.5
@@ -24,8 +27,6 @@ LEAST_ACROSS_M = 0.25
 """Points nearer to the reference line do not say how the cross-section falls (m)."""
 BREAK_M = 1e-3
 """Distance behind the ground at which a profile goes on as it was (m)."""
-
-Beyond = Literal["keep", "flat"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +80,22 @@ def cross_sections(
     return CrossSections(s, t, z, inside, line, grade, joined)
 
 
-def elevation(sections: CrossSections, old: Floats, beyond: Beyond, tolerance: float) -> Floats | None:
-    """Return the pieces of the elevation, ``(k, 5)``; None if the road has no ground."""
-    return _profile(sections, sections.line, sections.grade, old, beyond, tolerance)
+def elevation(
+    sections: CrossSections, old: Floats, flat: bool, tolerance: float, ends: Ends = NOWHERE
+) -> Floats | None:
+    """Return the pieces of the elevation, ``(k, 5)``; None if the road has no ground.
+
+    - `old`: the pieces that it had, which stay beyond the ground.
+    - `flat`: whether it goes on level there instead, or to ``ends``: heights of the nodes, NaN if not known.
+    """
+    return _profile(sections, sections.line, sections.grade, old, flat, tolerance, ends)
 
 
-def superelevation(sections: CrossSections, old: Floats, beyond: Beyond, tolerance: float) -> Floats | None:
+def superelevation(sections: CrossSections, old: Floats, flat: bool, tolerance: float) -> Floats | None:
     """Return the pieces of the superelevation, ``(k, 5)``, radians; None if the road has no ground."""
-    away = np.where(sections.inside & np.isfinite(sections.z), sections.t, 0.0)
-    weight = (away**2).sum(axis=1)
-    rise = np.where(away != 0, sections.z - sections.line[:, None], 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        slope = (away * rise).sum(axis=1) / weight
+    inside = sections.inside & np.isfinite(sections.z)
+    away = np.where(inside, sections.t, 0.0)
+    _, slope = straight_lines(sections.t, sections.z, inside, sections.line)
     known = np.isfinite(sections.line)
     good = known & np.isfinite(slope) & (np.abs(slope) < STEEPEST)
     good &= np.abs(away).max(axis=1, initial=0.0) >= LEAST_ACROSS_M
@@ -101,17 +106,24 @@ def superelevation(sections: CrossSections, old: Floats, beyond: Beyond, toleran
     elif known.any():
         angle[known] = 0.0
     reach = float(np.abs(sections.t).max(initial=1.0))
-    return _profile(sections, angle, _slopes(s, angle), old, beyond, tolerance / max(reach, 1.0))
+    return _profile(sections, angle, _slopes(s, angle), old, flat, tolerance / max(reach, 1.0))
 
 
 def _profile(
-    sections: CrossSections, values: Floats, slopes: Floats, old: Floats, beyond: Beyond, tolerance: float
+    sections: CrossSections,
+    values: Floats,
+    slopes: Floats,
+    old: Floats,
+    flat: bool,
+    tolerance: float,
+    ends: Ends = NOWHERE,
 ) -> Floats | None:
-    """Return pieces along the whole road: of the surface where it is, else by what `beyond` says."""
+    """Return pieces along the whole road: of the surface where it is, else level or as they were."""
     s, known = sections.s, np.isfinite(values)
     both = known[:-1] & known[1:]
     if not both.any():
         return None
+    whole = filled(s, values, ends)
     parts, start = list[Floats](), 0
     for has, group in groupby(both.tolist()):
         end = start + len(list(group))
@@ -120,13 +132,10 @@ def _profile(
             parts.append(cubic_pieces(s[here], values[here], slopes[here], tolerance))
         else:
             outer = start == 0 or end == len(both)
-            bridged = not outer and (beyond == "flat" or bool(sections.joined[start + 1 : end].all()))
-            if bridged:
-                ends = [start, end]
-                parts.append(cubic_pieces(s[ends], values[ends], slopes[ends], np.inf))
-            elif beyond == "flat":
-                level = values[end if start == 0 else start]
-                parts.append(np.array([[s[start], level, 0.0, 0.0, 0.0]]))
+            if flat or (not outer and bool(sections.joined[start + 1 : end].all())):
+                # Beyond the ground both slopes are 0.
+                at = [start, end]
+                parts.append(cubic_pieces(s[at], whole[at], np.zeros(2) if outer else slopes[at], np.inf))
             else:
                 # The last place with ground still has its height.
                 first = float(s[start]) + (BREAK_M if start else 0.0)
@@ -147,10 +156,8 @@ def _part(pieces: Floats, start: float, end: float) -> Floats:
 
 def _slopes(s: Floats, values: Floats) -> Floats:
     """Return the derivative of values along each stretch without NaN."""
-    slopes, start = np.zeros(len(s)), 0
-    for known, group in groupby(np.isfinite(values).tolist()):
-        end = start + len(list(group))
-        if known and end - start > 1:
+    slopes = np.zeros(len(s))
+    for start, end in stretches(np.isfinite(values)):
+        if end - start > 1:
             slopes[start:end] = np.gradient(values[start:end], s[start:end])
-        start = end
     return slopes

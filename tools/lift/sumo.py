@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from flexroad.catalog.text import shown
 from flexroad.pipeline.run.points import Heights
@@ -17,9 +19,18 @@ from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
 from flexroad.tools.lift import xml_text
 from flexroad.tools.lift.batches import with_heights
-from flexroad.tools.lift.levels import ANY, Numbers, along, level_of, tagged_level
 from flexroad.tools.lift.lines import STEP_M, Line, largest
-from flexroad.tools.lift.meetings import Meetings
+from flexroad.tools.lift.network import (
+    ANY,
+    GUESSED,
+    Network,
+    Numbers,
+    along,
+    filled,
+    level_of,
+    of_levels,
+    tagged_level,
+)
 from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options
 from flexroad.tools.lift.xml_text import Part
 
@@ -29,6 +40,8 @@ STEPS = False
 """Whether heights have the steps beside roads."""
 NO_PROJECTION = ("", "!", "-", ".")
 """Values of ``projParameter`` of networks without a CRS."""
+FAR_M = 1e12
+"""A coordinate that is beyond all others."""
 DIGITS = 3
 """Decimal places of heights, and at least of the vertices that are added."""
 
@@ -50,11 +63,11 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
     A second copy follows if the first one has met roads above roads or the limit of the surface: what a line
     has there depends on those that it meets.
     """
-    network = _Network.read(source)
-    copy = _Copy(network, Meetings(), heights, options)
+    network = Network()
+    copy = _Copy(_Places.read(source), network, heights, options)
     rows = list(copy.written(source, out))
-    if copy.meetings.lines or (options.flat_ends and copy.meetings.open):
-        copy.meetings.decide()
+    if network.lines or network.open:
+        network.decide()
         rows = list(replace(copy, decided=True).written(source, out))
     yield from rows
 
@@ -130,14 +143,14 @@ class _Piece:
 
 
 @dataclass(frozen=True, eq=False)
-class _Network:
-    """What is read of a network before it is copied."""
+class _Places:
+    """Where the junctions of a file are."""
 
     places: dict[str, str]
     """``x,y`` of each junction, as the file has it."""
 
     @classmethod
-    def read(cls, source: Path) -> _Network:
+    def read(cls, source: Path) -> _Places:
         places = dict[str, str]()
         with xml_text.opened(source) as file:
             for part in xml_text.parts(file, {"junction"}):
@@ -189,8 +202,8 @@ def _offset(location: ET.Element) -> tuple[float, float, float]:
 class _Copy:
     """A copy of a network with heights."""
 
-    network: _Network
-    meetings: Meetings
+    places: _Places
+    network: Network
     heights: HeightsAt
     options: Options
     decided: bool = False
@@ -199,7 +212,7 @@ class _Copy:
     def written(self, source: Path, out: Path) -> Iterator[Lifted]:
         """Write the copy; yield the rows of the report."""
         with xml_text.opened(source) as file, xml_text.written(out) as copy:
-            pieces = map(self.network.piece, xml_text.parts(file, {"edge", "junction"}))
+            pieces = map(self.places.piece, xml_text.parts(file, {"edge", "junction"}))
             found = with_heights(
                 pieces, lambda each: None if isinstance(each, bytes) else each.points, self.heights
             )
@@ -228,10 +241,10 @@ class _Copy:
                 # A tunnel whose level is not known meets other roads at its ends alone.
                 z[1:-1] = np.nan
             start, taken = end, z
-            if self.options.flat_ends and self.decided:
-                z = self.meetings.going_on(shape.line, None if shape.area else shape.ends, z)
-            elif self.options.flat_ends and not shape.area:
-                self.meetings.note_open(shape.ends, z)
+            if self.options.beyond == "flat" and self.decided:
+                z = self._going_on(shape, z)
+            elif self.options.beyond == "flat" and not shape.area and np.isnan(z).any():
+                self.network.note_open(shape.ends, shape.line.s, z)
             index = shape.line.needed(z, self.options.tolerance_m, self.options.add_vertices is not False)
             self._edit(shape, index, z, edits)
             if shape.element.tag == "lane" and not shape.area:
@@ -242,35 +255,53 @@ class _Copy:
         text = piece.part.replaced(edited)
         if not lanes or element.get("function"):
             return text, None
-        return text, _joined(element.get("id", ""), lanes, unknown=bool(level) and own is None)
+        name = element.get("id", "")
+        note = GUESSED if name in self.network.guessed else ""
+        return text, _joined(name, lanes, bool(level) and own is None, note)
 
     def _heights(
         self, element: ET.Element, shape: _Shape, heights: Heights, own: int | None
     ) -> tuple[Floats, Numbers]:
         """Return the heights of the points of a shape, and the numbers of their levels."""
-        size, ends = len(shape.line.s), shape.ends
+        size, name, network = len(shape.line.s), element.get("id", ""), self.network
         junctions = (element.get("from", ""), element.get("to", "")) if "from" in element.attrib else None
         if shape.area:
-            name = element.get("id", "")
             # Edges within a junction are named ":JUNCTION_NUMBER".
             junction = name[1:].rpartition("_")[0] if name.startswith(":") else name
-            wanted = np.full(size, self.meetings.level(junction), np.int8)
+            wanted = np.full(size, network.level(junction), np.int8)
             z, numbers = along(heights, wanted)
             _complete(shape.line, z, numbers, wanted)
         elif self.decided:
-            known = self.meetings.ends
-            first, last = known.get(ends[0]), known.get(ends[1])
+            ends = network.ends(shape.ends)
             if shape.element is element and junctions:
-                first, last = map(self.meetings.level, junctions)
-            wanted = self.meetings.wanted(heights, first, last)
-            if own is not None:
-                wanted[1:-1] = own
-            z, numbers = along(heights, wanted)
+                own_levels = np.array([network.level(each) for each in junctions], np.int8)
+                first, last = of_levels(heights[np.array([0, -1])], own_levels).tolist()
+                ends = first, last
+            level = network.levels.get(name, ANY) if own is None else own
+            z, numbers = along(heights, np.full(size, level, np.int8), ends)
         else:
-            if shape.element is not element:
-                self.meetings.note(shape.line, ends, heights, own, junctions)
-            z, numbers = along(heights, np.full(size, ANY if own is None else own, np.int8))
+            wanted = np.full(size, ANY if own is None else own, np.int8)
+            if shape.element is not element and heights.several.any():
+                network.note(name, shape.ends, heights, wanted, junctions)
+            z, numbers = along(heights, wanted)
         return z, numbers
+
+    def _going_on(self, shape: _Shape, z: Floats) -> Floats:
+        """Return the heights of a shape that goes on level beyond the surface."""
+        if not shape.area:
+            return filled(shape.line.s, z, self.network.ends(shape.ends, beyond=True))
+        places = np.column_stack([shape.line.x, shape.line.y])
+        open_ = np.isnan(z) & np.isfinite(places).all(axis=1)
+        if open_.any() and self.network.beyond:
+            z = z.copy()
+            z[open_] = np.array(list(self.network.beyond.values()))[self._nearest.query(places[open_])[1]]
+        return z
+
+    @cached_property
+    def _nearest(self) -> cKDTree:
+        """The places of nodes beyond the surface."""
+        places = np.array([[float(number) for number in node] for node in self.network.beyond])
+        return cKDTree(np.where(np.isfinite(places), places, FAR_M))
 
     def _edit(
         self, shape: _Shape, index: NDArray[np.intp], z: Floats, edits: dict[ET.Element, dict[str, str]]
@@ -307,7 +338,7 @@ def _complete(line: Line, z: Floats, numbers: Numbers, wanted: Numbers) -> None:
         z[i] = z[on[np.argmin(np.hypot(line.x[on] - line.x[i], line.y[on] - line.y[i]))]]
 
 
-def _joined(name: str, lanes: list[Lifted], unknown: bool) -> Lifted:
+def _joined(name: str, lanes: list[Lifted], unknown: bool, note: str) -> Lifted:
     """Return the row of an edge: of each figure, the largest one of its lanes."""
     length, without, before, off, grade = (
         largest(np.array(values))
@@ -329,5 +360,6 @@ def _joined(name: str, lanes: list[Lifted], unknown: bool) -> Lifted:
         elevation_m=off,
         grade=grade,
         steep=tuple(place for lane in lanes for place in lane.steep),
+        note=note,
         flags=passed(np.array([lane.flags for lane in lanes], np.uint16)),
     )

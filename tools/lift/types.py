@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.pipeline.config.options import METHOD, OUTPUTS, option
 from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.types import Floats
 
@@ -56,22 +57,34 @@ class Frame:
 class Options:
     """How files get their heights."""
 
-    tolerance_m: float = 0.005
-    """Largest distance of a profile, or of a line between its vertices, from the surface (m)."""
-    lateral: Literal["superelevation", "none"] = "superelevation"
-    """What OpenDRIVE's roads have across."""
-    flat_ends: bool = False
-    """Whether a road without ground beneath goes on level; else it keeps the heights that it had."""
-    add_vertices: bool | None = None
-    """Whether lines get vertices where they leave the surface by more than the tolerance; None: as the format
-    does by default."""
-    columns: bool = False
-    """Whether features get the columns ``grade_max_percent``, ``crossfall_max_percent`` and
-    ``error_estimate_m``."""
-    grade_limit: float | None = None
-    """Places with a steeper grade are listed (m/m)."""
-    crossfall_limit: float | None = None
-    """Places with a steeper crossfall are listed (m/m)."""
+    tolerance_m: float = option(
+        0.005, METHOD, "Largest distance of profiles and lines from the surface (m).", "METRES", min=0.0001
+    )
+    lateral: Literal["superelevation", "none"] = option(
+        "superelevation", METHOD, "What roads of OpenDRIVE have across."
+    )
+    beyond: Literal["keep", "flat"] = option(
+        "keep", METHOD, "Heights where the run has no surface: as they are, or level from there on."
+    )
+    add_vertices: bool | None = option(
+        None,
+        METHOD,
+        "Add vertices where lines leave the surface; default: yes, but not to OSM files.",
+        name="vertices/--no-vertices",
+    )
+    columns: bool = option(
+        False,
+        OUTPUTS,
+        "Add the columns grade_max_percent, crossfall_max_percent and error_estimate_m to features.",
+    )
+    grade_limit: float | None = option(
+        None, OUTPUTS, "Write places with a steeper grade as points beside the report.", "PERCENT", min=0
+    )
+    """In m/m; the command takes percent."""
+    crossfall_limit: float | None = option(
+        None, OUTPUTS, "Write places with a steeper crossfall as points beside the report.", "PERCENT", min=0
+    )
+    """In m/m; the command takes percent."""
 
 
 @dataclass(frozen=True, slots=True)

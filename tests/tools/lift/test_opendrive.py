@@ -1,6 +1,7 @@
 """Roads of OpenDRIVE on surfaces of known heights, read back literally."""
 
 import gzip
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -233,7 +234,7 @@ def test_without_ground_a_road_goes_on_level_if_asked(tmp_path):
     def inner(x, y):
         return np.where((x > 20.5) & (x < 50.5), plane(x, y), np.nan)
 
-    root, (row,) = lifted(write(tmp_path, road()), inner, flat_ends=True)
+    root, (row,) = lifted(write(tmp_path, road()), inner, beyond="flat")
     first = root.find("road")
     for s, z in ((0.0, plane(21, 20)), (11.0, plane(21, 20)), (25, plane(35, 20)), (60, plane(50, 20))):
         assert polynomial(first, "elevationProfile/elevation", s) == pytest.approx(z)
@@ -338,6 +339,42 @@ def test_a_road_with_several_levels_goes_on_where_its_links_do(tmp_path, order):
     }
     assert heights["3"] == pytest.approx(plane(38, 20))
     assert heights["4"] == pytest.approx(plane(66, 20) + 6)
+
+
+def test_a_road_with_several_levels_and_without_links_is_named(tmp_path):
+    def covered(x, y):
+        return Heights((0, 1), np.stack([plane(x, y), plane(x, y) + 6]))
+
+    _, (row,) = lifted(write(tmp_path, linked("1", 8, 0)), covered)
+    assert row.levels == (1,)
+    assert "nothing that it meets says which" in row.note
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_roads_beyond_the_surface_go_on_level_as_those_that_they_are_linked_with(tmp_path, order):
+    """Of four roads in line, the first and the last leave the surface; they differ by 3 m."""
+
+    def ends(x, y):
+        return np.where(np.abs(x - 38) > 24.5, 100 + 0.05 * x, np.nan)
+
+    roads = [
+        linked("1", 8, 0, after="2"),
+        linked("2", 20, 0, before="1", after="3"),
+        linked("3", 32, 0, before="2", after="4"),
+        linked("4", 44, 0, before="3", after="5"),
+        linked("5", 56, 0, before="4"),
+    ]
+    root, rows = lifted(write(tmp_path, *roads[::order]), ends, beyond="flat")
+    z = {
+        each.get("id"): [polynomial(each, "elevationProfile/elevation", s) for s in (0, 6, 12)]
+        for each in root.iter("road")
+    }
+    # The surface ends at x = 13, and begins again at x = 63.
+    assert z["1"] == pytest.approx([100.4, 100.65, 100.65])
+    assert z["5"][:2] == pytest.approx([103.15, 103.15])
+    for a, b in pairwise("12345"):
+        assert z[a][2] == pytest.approx(z[b][0])
+    assert sorted(row.without_ground_m for row in rows) == pytest.approx([7, 7, 12, 12, 12])
 
 
 LANE = '<lane id="{0}" type="driving"><width sOffset="0" a="{1}" b="{2}" c="0" d="0"/></lane>'

@@ -1,11 +1,9 @@
-"""Cubic pieces and vertices against the profile that they stand for."""
+"""Cubic pieces against the profile that they stand for."""
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from flexroad.tools.lift.profile import cubic_pieces, value_at, vertices
+from flexroad.tools.export.profiles import cubic_pieces, value_at
 
 
 def hills(s):
@@ -31,20 +29,3 @@ def test_a_cubic_is_one_piece():
     s = np.linspace(0, 40, 81)
     pieces = cubic_pieces(s, 1 + 0.1 * s - 2e-3 * s**2 + 1e-5 * s**3, 0.1 - 4e-3 * s + 3e-5 * s**2, 1e-9)
     np.testing.assert_allclose(pieces, [[0, 1, 0.1, -2e-3, 1e-5]], atol=1e-12)
-
-
-@given(st.integers(0, 10**6), st.integers(2, 60), st.floats(0.01, 1))
-def test_any_line_stays_within_the_tolerance_with_the_points_that_it_had(seed, number, tolerance):
-    rng = np.random.default_rng(seed)
-    s, z = np.cumsum(rng.random(number)), np.cumsum(rng.normal(0, 0.2, number))
-    kept = rng.random(number) < 0.1
-    kept[[0, -1]] = True
-    chosen = vertices(s, z, kept, tolerance)
-    assert set(np.flatnonzero(kept)) <= set(chosen.tolist())
-    assert np.abs(np.interp(s, s[chosen], z[chosen]) - z).max() <= tolerance + 1e-9
-
-
-def test_a_straight_line_needs_no_vertex_between_those_that_it_had():
-    s = np.arange(50.0)
-    kept = np.isin(s, [0, 20, 49])
-    assert vertices(s, 5 + 0.1 * s, kept, 1e-6).tolist() == [0, 20, 49]
