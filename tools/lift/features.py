@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,10 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.quality.flagged import Bits, passed
 from flexroad.tasks.roads import level_numbers
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.lift.batches import POINTS
 from flexroad.tools.lift.lines import STEP_M, Line, largest, steepest
 from flexroad.tools.lift.network import ANY, Numbers, along, filled, of_levels
 from flexroad.tools.lift.shapes import POINT, POLYGON, Shape
-from flexroad.tools.lift.types import Lifted, Options, RunSurface, Steep
+from flexroad.tools.lift.types import POINTS, Lifted, Options, RunSurface, Steep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -377,6 +376,7 @@ def _row(
             points += int(not known[own][0])
             continue
         lines, s = True, path.of(samples.along)
+        x, y = path.of(samples.values)[:, :2].T
         length += s[-1] - s[0]
         line = _line(path, samples)
         if beyond:
@@ -386,11 +386,11 @@ def _row(
         off.append(largest(np.abs(np.interp(s, s[chosen], z[own][chosen]) - z[own])[known[own]]))
         slopes = np.abs(grades(s, np.where(known[own], z[own], np.nan), 0.999 * STEP_M))
         grade.append(largest(slopes))
-        steep += _steep("grade", slopes, options.grade_limit, path, samples)
+        steep += steepest("grade", slopes, options.grade_limit, x, y)
         if group.crossfalls is not None and path.code != POLYGON:
             slopes = path.of(group.crossfalls)
             crossfall.append(largest(slopes))
-            steep += _steep("crossfall", slopes, options.crossfall_limit, path, samples)
+            steep += steepest("crossfall", slopes, options.crossfall_limit, x, y)
     return Lifted(
         feature.id,
         float(length) if lines else np.nan,
@@ -428,14 +428,3 @@ def grades(s: Floats, z: Floats, over: float) -> Floats:
             break
         found[i] = (z[end] - z[i]) / (s[end] - s[i])
     return found
-
-
-def _steep(
-    kind: Literal["grade", "crossfall"], values: Floats, limit: float | None, path: _Path, samples: _Samples
-) -> list[Steep]:
-    """Return the steepest place of each stretch above a limit."""
-    places = []
-    for at in steepest(values, limit):
-        x, y = path.of(samples.values)[at, :2].tolist()
-        places.append(Steep(kind, float(values[at]), x, y))
-    return places

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,11 +77,8 @@ class Line:
         grade = np.abs(np.diff(z)[at]) / length[at]
         if not len(at):
             return np.nan, ()
-        places = list[Steep]()
-        for most in steepest(grade, limit):
-            x, y = ((values[at[most]] + values[at[most] + 1]) / 2 for values in (self.x, self.y))
-            places.append(Steep("grade", float(grade[most]), float(x), float(y)))
-        return float(grade.max()), tuple(places)
+        x, y = ((values[at] + values[at + 1]) / 2 for values in (self.x, self.y))
+        return float(grade.max()), steepest("grade", grade, limit, x, y)
 
     def length_where(self, places: Bools) -> float:
         """Return the length (m) of some points of the line: each has half of the way to the next ones."""
@@ -93,11 +91,13 @@ def largest(values: Floats | Sequence[float]) -> float:
     return float(np.fmax.reduce(values, initial=np.nan))
 
 
-def steepest(values: Floats, limit: float | None) -> list[int]:
-    """Return the index of the largest value of each stretch above a limit; without a limit, none."""
-    if limit is None:
-        return []
-    return [start + int(np.argmax(values[start:end])) for start, end in stretches(values > limit)]
+def steepest(
+    kind: Literal["grade", "crossfall"], values: Floats, limit: float | None, x: Floats, y: Floats
+) -> tuple[Steep, ...]:
+    """Return the place of the largest value of each stretch above a limit; without a limit, none."""
+    found = [] if limit is None else stretches(values > limit)
+    most = [start + int(np.argmax(values[start:end])) for start, end in found]
+    return tuple(Steep(kind, float(values[at]), float(x[at]), float(y[at])) for at in most)
 
 
 def stretches(places: Bools) -> list[tuple[int, int]]:

@@ -17,8 +17,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.export.profiles import Profiles, cubic_pieces, value_at
-from flexroad.tools.lift import lanes, opendrive_text, plan_view, road_profiles, xml_text
-from flexroad.tools.lift.batches import with_heights
+from flexroad.tools.lift import plan_view, road_profiles, xml_text
 from flexroad.tools.lift.lines import steepest
 from flexroad.tools.lift.network import (
     ANY,
@@ -34,13 +33,13 @@ from flexroad.tools.lift.network import (
 )
 from flexroad.tools.lift.plan_view import numbers
 from flexroad.tools.lift.road_profiles import AHEAD_M, NONE, CrossSections
-from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, Steep
+from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
 NOUN = "road"
 """What a row of the report is."""
 STEPS = False
-"""Whether heights have the steps beside roads: OpenDRIVE has kerbs in its lanes."""
+"""Whether heights have the steps beside roads: OpenDRIVE has kerbs in its plan_view."""
 ALONG_M, LEAST_ALONG = 1.0, 4
 """Distance of the cross-sections of a road (m), and their least number, less one."""
 ACROSS_M = 1.0
@@ -70,7 +69,7 @@ class Road:
     """``(n,)``: the reference line."""
     y: Floats
     heading: Floats
-    extent: lanes.Extent
+    extent: plan_view.Extent
     elevation: Floats
     """The profile that it had, ``(k, 5)``."""
     superelevation: Floats
@@ -190,7 +189,7 @@ def _road(part: Part, name: str) -> Road:
     plan = plan_view.read(element)
     count = max(int(np.ceil(length / ALONG_M)), LEAST_ALONG)
     s = np.linspace(0.0, length, count + 1)
-    extent = lanes.extent(element, s)
+    extent = plan_view.extent(element, s)
     reach = max(float(np.abs(extent.right).max()), float(np.abs(extent.left).max()))
     # In narrow bends the outer lanes are long; kinks between geometries are not bends.
     kept = np.diff(np.searchsorted(plan.start[:, 0], s, side="right")) == 0
@@ -198,7 +197,7 @@ def _road(part: Part, name: str) -> Road:
     if np.isfinite(turned) and turned > ALONG_M:
         finer = int(min(np.ceil(turned / ALONG_M), MOST_FINER, max(1, MOST_FINE // count)))
         s = np.linspace(0.0, length, count * finer + 1)
-        extent = lanes.extent(element, s)
+        extent = plan_view.extent(element, s)
     x, y, heading = plan.at(s)
     if not np.isfinite([x, y, heading]).all():
         raise TaskError("has a planView with places that are no numbers")
@@ -231,7 +230,7 @@ def _structures(road: ET.Element) -> Iterator[Structure]:
 
 def _old(road: ET.Element, path: str) -> Floats:
     """Return the pieces of a profile that a road has; readers take 0 before the first one."""
-    pieces = lanes.records(road.findall(path))
+    pieces = plan_view.records(road.findall(path))
     if not len(pieces):
         return NONE
     pieces = pieces[np.argsort(pieces[:, 0], kind="stable")]
@@ -251,10 +250,10 @@ def _lifted(road: Road, heights: Heights, options: Options, of_links: _Linked) -
         if np.isfinite(ends).any():
             at = np.array([0.0, length])
             level = cubic_pieces(at, filled(at, np.full(2, np.nan), ends), np.zeros(2), tolerance)
-            text = opendrive_text.with_profiles(road.part, opendrive_text.records("elevation", level), None)
+            text = road_profiles.with_profiles(road.part, road_profiles.texts("elevation", level), None)
         return text, Lifted(road.id, length, length, (), unknown_m)
-    lateral = None if options.lateral == "none" else opendrive_text.records("superelevation", across)
-    text = opendrive_text.with_profiles(road.part, opendrive_text.records("elevation", elevation), lateral)
+    lateral = None if options.lateral == "none" else road_profiles.texts("superelevation", across)
+    text = road_profiles.with_profiles(road.part, road_profiles.texts("elevation", elevation), lateral)
     row = _row(road, sections, used, unknown_m, elevation, across, options)
     on_lanes = np.flatnonzero(road.inside)
     numbers = np.array(heights.numbers, np.int8)[np.repeat(rows, len(road.t))[on_lanes]]
@@ -366,17 +365,8 @@ def _row(
         grade=float(np.abs(grade).max()),
         crossfall=float(np.abs(crossfall).max()),
         steep=(
-            *_steep(road, "grade", grade, options.grade_limit),
-            *_steep(road, "crossfall", crossfall, options.crossfall_limit),
+            *steepest("grade", np.abs(grade), options.grade_limit, road.x, road.y),
+            *steepest("crossfall", np.abs(crossfall), options.crossfall_limit, road.x, road.y),
         ),
         note=ALL_LEVEL if road.extent.level and options.lateral != "none" else "",
     )
-
-
-def _steep(
-    road: Road, kind: Literal["grade", "crossfall"], values: Floats, limit: float | None
-) -> Iterator[Steep]:
-    """Yield the steepest place of each stretch that is steeper than a limit."""
-    slopes = np.abs(values)
-    for at in steepest(slopes, limit):
-        yield Steep(kind, float(slopes[at]), float(road.x[at]), float(road.y[at]))

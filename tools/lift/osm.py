@@ -18,7 +18,6 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
 from flexroad.tools.lift import xml_text
-from flexroad.tools.lift.batches import POINTS, with_heights
 from flexroad.tools.lift.lines import Line, largest
 from flexroad.tools.lift.network import (
     ANY,
@@ -31,7 +30,7 @@ from flexroad.tools.lift.network import (
     level_of,
     tagged_level,
 )
-from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options
+from flexroad.tools.lift.types import POINTS, Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
 NOUN = "way"

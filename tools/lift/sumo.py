@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,6 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
 from flexroad.tools.lift import xml_text
-from flexroad.tools.lift.batches import with_heights
 from flexroad.tools.lift.lines import STEP_M, Line, largest
 from flexroad.tools.lift.network import (
     ANY,
@@ -31,7 +30,7 @@ from flexroad.tools.lift.network import (
     of_levels,
     tagged_level,
 )
-from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options
+from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
 NOUN = "edge"
@@ -64,7 +63,7 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
     has there depends on those that it meets.
     """
     network = Network()
-    copy = _Copy(_Places.read(source), network, heights, options)
+    copy = _Copy(_places(source), network, heights, options)
     rows = list(copy.written(source, out))
     if network.lines or network.open:
         network.decide()
@@ -142,42 +141,25 @@ class _Piece:
         return np.concatenate(x), np.concatenate(y)
 
 
-@dataclass(frozen=True, eq=False)
-class _Places:
-    """Where the junctions of a file are."""
+def _places(source: Path) -> dict[str, str]:
+    """Return ``x,y`` of each junction, as the file has it."""
+    places = dict[str, str]()
+    with xml_text.opened(source) as file:
+        for part in xml_text.parts(file, {"junction"}):
+            if isinstance(part, Part) and part.element.get("type") != "internal":
+                x, y = (part.element.get(name, "") for name in "xy")
+                places[part.element.get("id", "")] = f"{x},{y}"
+    return places
 
-    places: dict[str, str]
-    """``x,y`` of each junction, as the file has it."""
 
-    @classmethod
-    def read(cls, source: Path) -> _Places:
-        places = dict[str, str]()
-        with xml_text.opened(source) as file:
-            for part in xml_text.parts(file, {"junction"}):
-                if isinstance(part, Part) and part.element.get("type") != "internal":
-                    x, y = (part.element.get(name, "") for name in "xy")
-                    places[part.element.get("id", "")] = f"{x},{y}"
-        return cls(places)
-
-    def piece(self, part: bytes | Part) -> bytes | _Piece:
-        """Return an edge or junction with its shapes, all other text as it is."""
-        if isinstance(part, bytes):
-            return part
-        if part.path != ("net",):
-            return part.text
-        shapes = self._of_edge(part.element) if part.element.tag == "edge" else _of_junction(part.element)
-        return _Piece(part, tuple(shape for shape in shapes if shape is not None))
-
-    def _of_edge(self, edge: ET.Element) -> Iterator[_Shape | None]:
-        area = edge.get("function") == "walkingarea"
-        for lane in edge.findall("lane"):
-            yield _Shape.of(lane, "shape", lane.get("shape", ""), area)
-            yield _Shape.of(lane, "outlineShape", lane.get("outlineShape", ""), True)
-        ends = [self.places.get(edge.get(name, "")) for name in ("from", "to")]
-        # An edge without a shape is straight, from junction to junction.
-        yield _Shape.of(
-            edge, "shape", edge.get("shape") or ("" if None in ends else " ".join(map(str, ends)))
-        )
+def _of_edge(edge: ET.Element, places: Mapping[str, str]) -> Iterator[_Shape | None]:
+    area = edge.get("function") == "walkingarea"
+    for lane in edge.findall("lane"):
+        yield _Shape.of(lane, "shape", lane.get("shape", ""), area)
+        yield _Shape.of(lane, "outlineShape", lane.get("outlineShape", ""), True)
+    ends = [places.get(edge.get(name, "")) for name in ("from", "to")]
+    # An edge without a shape is straight, from junction to junction.
+    yield _Shape.of(edge, "shape", edge.get("shape") or ("" if None in ends else " ".join(map(str, ends))))
 
 
 def _of_junction(junction: ET.Element) -> Iterator[_Shape | None]:
@@ -202,7 +184,8 @@ def _offset(location: ET.Element) -> tuple[float, float, float]:
 class _Copy:
     """A copy of a network with heights."""
 
-    places: _Places
+    places: Mapping[str, str]
+    """Where the junctions are."""
     network: Network
     heights: HeightsAt
     options: Options
@@ -212,7 +195,7 @@ class _Copy:
     def written(self, source: Path, out: Path) -> Iterator[Lifted]:
         """Write the copy; yield the rows of the report."""
         with xml_text.opened(source) as file, xml_text.written(out) as copy:
-            pieces = map(self.places.piece, xml_text.parts(file, {"edge", "junction"}))
+            pieces = map(self._piece, xml_text.parts(file, {"edge", "junction"}))
             found = with_heights(
                 pieces, lambda each: None if isinstance(each, bytes) else each.points, self.heights
             )
@@ -225,6 +208,16 @@ class _Copy:
                 copy.write(text)
                 if row is not None:
                     yield row
+
+    def _piece(self, part: bytes | Part) -> bytes | _Piece:
+        """Return an edge or junction with its shapes, all other text as it is."""
+        if isinstance(part, bytes):
+            return part
+        if part.path != ("net",):
+            return part.text
+        element = part.element
+        shapes = _of_edge(element, self.places) if element.tag == "edge" else _of_junction(element)
+        return _Piece(part, tuple(shape for shape in shapes if shape is not None))
 
     def _lifted(self, piece: _Piece, heights: Heights) -> tuple[bytes, Lifted | None]:
         """Return an edge or junction with heights, and the row of an edge."""

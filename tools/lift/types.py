@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from flexroad.tasks.types import Floats
 
 HeightsAt = Callable[[Floats, Floats], Heights]
 """Heights at x and y, ``(n,)`` each, in the coordinates of the file."""
+POINTS = 500_000
+"""Number of points of a batch: some 200 MB with their heights and what they belong to."""
+T = TypeVar("T")
 
 
 class RunSurface(Protocol):
@@ -136,3 +139,40 @@ class Lifted:
     def noted(self, note: str) -> Lifted:
         """Return the row with a note."""
         return replace(self, note=note)
+
+
+def with_heights(
+    parts: Iterable[T], points: Callable[[T], tuple[Floats, Floats] | None], heights: HeightsAt
+) -> Iterator[tuple[T, Heights | None]]:
+    """Yield each part, in its order, with the heights of its points: a run reads each tile once per batch.
+
+    - `points`: returns x and y of the points of a part, ``(n,)`` each; None if it needs no heights.
+    - `heights`: heights of a run.
+    """
+    batch, size = list[tuple[T, tuple[Floats, Floats] | None]](), 0
+    for part in parts:
+        batch.append((part, points(part)))
+        own = batch[-1][1]
+        size += 1 if own is None else 1 + len(own[0])
+        if size >= POINTS:
+            yield from _answered(batch, heights)
+            batch, size = [], 0
+    yield from _answered(batch, heights)
+
+
+def _answered(
+    batch: list[tuple[T, tuple[Floats, Floats] | None]], heights: HeightsAt
+) -> Iterator[tuple[T, Heights | None]]:
+    asked = [own for _, own in batch if own is not None]
+    if not asked:
+        yield from ((part, None) for part, _ in batch)
+        return
+    x, y = (np.concatenate(values) for values in zip(*asked, strict=True))
+    found, start = heights(x, y), 0
+    for part, own in batch:
+        if own is None:
+            yield part, None
+        else:
+            end = start + len(own[0])
+            yield part, found[start:end]
+            start = end

@@ -1,9 +1,108 @@
-"""Cubic pieces against the profile that they stand for."""
-
 import numpy as np
 import pytest
 
-from flexroad.tools.export.profiles import cubic_pieces, value_at
+from flexroad.tasks.roads.routes import CentreLine, Route
+from flexroad.tools.export.along_line import HeightGrid, height_grid, profile_error, profiles
+from flexroad.tools.export.profiles import Profiles, cubic_pieces, value_at
+from flexroad.tools.export.reference_line import Options as LineOptions
+from flexroad.tools.export.reference_line import ReferenceLine, reference_line
+
+
+def straight(length: float = 120.0) -> ReferenceLine:
+    """Return a straight road to the east, 6 m wide: s is x, and v is y."""
+    line = reference_line(
+        Route((CentreLine(np.array([[0.0, 0.0], [length, 0.0]]), 6.0),)), LineOptions(increment_m=1.0)
+    )
+    assert line is not None
+    return line
+
+
+def grid(heights_at, length: float = 120.0) -> HeightGrid:
+    return height_grid(straight(length), heights_at)
+
+
+def hill(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a slope of cubics with a crossfall that changes along the road."""
+    return 80 + 0.05 * x - 2e-4 * x**2 + 1e-6 * x**3 + y * np.tan(0.02 + 2e-4 * x)
+
+
+def fitted(heights: HeightGrid) -> tuple[Profiles, float]:
+    result = profiles(heights)
+    return result, profile_error(heights, result)[1]
+
+
+@pytest.mark.parametrize("length", [10.0, 11.0, 25.0, 120.0])
+def test_profiles_cubic_road_is_found(length):
+    result, worst = fitted(grid(hill, length))
+    s = np.linspace(0, length, 37)
+    np.testing.assert_allclose(value_at(result.elevation, s), hill(s, 0 * s), atol=1e-6)
+    np.testing.assert_allclose(value_at(result.superelevation, s), 0.02 + 2e-4 * s, atol=1e-6)
+    assert worst < 1e-6
+
+
+def test_profiles_left_side_higher_is_positive():
+    result, _ = fitted(grid(lambda x, y: 0.1 * y))
+    assert value_at(result.superelevation, 50.0) == pytest.approx(np.arctan(0.1))
+
+
+def test_profiles_verge_does_not_count():
+    # A kerb of 0.3 m from 3 m on, where the carriageway ends; the grid reaches 4 m.
+    result, worst = fitted(grid(lambda x, y: hill(x, y) + 0.3 * (np.abs(y) > 3.01)))
+    assert worst < 1e-6
+    assert value_at(result.elevation, 60.0) == pytest.approx(hill(60.0, 0.0), abs=1e-6)
+
+
+def test_profile_error_of_a_crown_is_what_a_straight_section_misses():
+    crowned = grid(lambda x, y: hill(x, y) - 0.01 * y**2)
+    result, worst = fitted(crowned)
+    # The best line is level at the mean of the squares; the edges miss it most.
+    v = np.arange(-3, 3.1, 0.25)
+    truth = np.abs(0.01 * (v**2 - (v**2).mean()))
+    assert worst == pytest.approx(truth.max(), abs=1e-6)
+    assert profile_error(crowned, result)[0] == pytest.approx(truth.mean(), abs=1e-6)
+
+
+def test_profiles_unknown_cross_sections_are_bridged():
+    whole = grid(hill)
+    holed = whole.heights.copy()
+    holed[50:53] = np.nan
+    result, worst = fitted(HeightGrid(whole.line, whole.v, holed))
+    assert worst < 0.001
+    assert value_at(result.elevation, 51.0) == pytest.approx(hill(51.0, 0.0), abs=0.005)
+
+
+@pytest.mark.parametrize("step", [0.5, -2.0])
+def test_profiles_of_a_crowned_road_do_not_bend_where_its_surface_ends(step):
+    """A tile ends askew: the first and last cross-sections are cut."""
+
+    def crowned(x, y):
+        return 100 + 0.04 * x + 0.01 * y - 0.025 * np.abs(y)
+
+    def ending(x, y):
+        return np.where(np.abs(x - 30 - step * y) < 30.01, crowned(x, y), np.nan)
+
+    s = np.linspace(0, 60, 25)
+    complete, cut = (profiles(grid(heights, 60.0)) for heights in (crowned, ending))
+    np.testing.assert_allclose(value_at(cut.elevation, s), value_at(complete.elevation, s), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(value_at(cut.superelevation, s), np.arctan(0.01), rtol=0, atol=1e-9)
+
+
+def test_profile_error_without_heights_is_nan():
+    whole = grid(hill)
+    nothing = HeightGrid(whole.line, whole.v, whole.heights * np.nan)
+    assert np.isnan(profile_error(nothing, profiles(nothing))[1])
+
+
+def test_profiles_go_on_from_piece_to_piece():
+    s = np.arange(120.0)
+    height = hill(s, 0) + 0.05 * np.sin(s)
+    result, _ = fitted(grid(lambda x, y: hill(x, y) + 0.05 * np.sin(x)))
+    np.testing.assert_allclose(value_at(result.elevation, s), height, rtol=0, atol=0.00051)
+    for pieces in (result.elevation, result.superelevation):
+        at = pieces[1:, 0]
+        before, after = value_at(pieces, at - 1e-7), value_at(pieces, at + 1e-7)
+        np.testing.assert_allclose(before, pieces[1:, 1], atol=1e-6)
+        np.testing.assert_allclose((pieces[1:, 1] - before) / 1e-7, (after - pieces[1:, 1]) / 1e-7, atol=1e-6)
 
 
 def hills(s):

@@ -10,7 +10,7 @@ import pytest
 
 from flexroad.pipeline.run.points import Heights
 from flexroad.tools.lift import opendrive, plan_view
-from flexroad.tools.lift.lanes import extent
+from flexroad.tools.lift.plan_view import extent
 from flexroad.tools.lift.types import Frame, Lifted, Options
 from tests.read_opendrive import place, polynomial
 
