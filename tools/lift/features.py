@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -77,7 +77,7 @@ def with_zero(shape: Shape | None, row: Lifted) -> tuple[Shape | None, Lifted]:
     """Return a geometry and its row for formats in which all have a z: 0, with a note, without ground."""
     if shape is None or shape.z or not (shape.paths or shape.parts):
         return shape and shape.flat(), row
-    return shape.flat(), row.noted(ZERO)
+    return shape.flat(), replace(row, note=ZERO)
 
 
 def lifted(

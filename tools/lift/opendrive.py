@@ -320,10 +320,11 @@ class _Linked:
             lines = (part for part in parts if isinstance(part, Road))
             for road, found in with_heights(lines, Road.middle_and_line, self._heights):
                 assert found is not None
-                n, wanted = len(road.s), _wanted(road, found[: len(road.s)])[0]
-                network.note(road.id, road.nodes, found[:n], wanted)
-                numbers = along(found[:n], wanted)[1]
-                network.note_open(road.nodes, road.s, of_levels(found[n:], numbers))
+                middle, line = found[: len(road.s)], found[len(road.s) :]
+                wanted, joined, _ = _wanted(road, middle)
+                network.note(road.id, road.nodes, middle, wanted)
+                z = of_levels(line, along(middle, wanted)[1])
+                network.note_open(road.nodes, road.s, np.where(joined, np.nan, z))
                 for own, other in road.links:
                     network.join(own, other)
         network.decide()

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -333,25 +334,13 @@ def _complete(line: Line, z: Floats, numbers: Numbers, wanted: Numbers) -> None:
 
 def _joined(name: str, lanes: list[Lifted], unknown: bool, note: str) -> Lifted:
     """Return the row of an edge: of each figure, the largest one of its lanes."""
-    length, without, before, off, grade = (
-        largest(np.array(values))
-        for values in zip(
-            *(
-                (each.length_m, each.without_ground_m, each.before_m, each.elevation_m, each.grade)
-                for each in lanes
-            ),
-            strict=True,
-        )
-    )
+    names = ("length_m", "without_ground_m", "before_m", "elevation_m", "grade")
+    most: dict[str, Any] = {each: largest([getattr(lane, each) for lane in lanes]) for each in names}
     return Lifted(
         name,
-        length_m=length,
-        without_ground_m=without,
+        **most,
         levels=tuple(sorted({number for lane in lanes for number in lane.levels})),
-        unknown_deck_m=length - without if unknown else 0.0,
-        before_m=before,
-        elevation_m=off,
-        grade=grade,
+        unknown_deck_m=most["length_m"] - most["without_ground_m"] if unknown else 0.0,
         steep=tuple(place for lane in lanes for place in lane.steep),
         note=note,
         flags=passed(np.array([lane.flags for lane in lanes], np.uint16)),

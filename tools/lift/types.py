@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, Protocol, TypeVar
 
 import numpy as np
@@ -135,10 +135,6 @@ class Lifted:
     """Number of points where the run has no surface."""
     flags: int = 0
     """Flags of the surface that it passes (`tasks.quality.flagged.flag_names`)."""
-
-    def noted(self, note: str) -> Lifted:
-        """Return the row with a note."""
-        return replace(self, note=note)
 
 
 def with_heights(

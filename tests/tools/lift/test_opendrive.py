@@ -369,6 +369,24 @@ def test_roads_beyond_the_surface_go_on_level_as_those_that_they_are_linked_with
     assert sorted(row.without_ground_m for row in rows) == pytest.approx([7, 7, 12, 12, 12])
 
 
+def test_a_tunnel_in_two_roads_does_not_climb_the_hill(tmp_path):
+    def hill(x, y):
+        return plane(x, y) + np.where((x > 14.5) & (x < 25.5), 9.0, 0.0)
+
+    ends = ((6.0, 6.0), (0.0, 6.0))
+    roads = (linked("1", 8, 0, after="2"), linked("2", 20, 0, before="1"))
+    tunnels = [
+        each.replace("</lanes>", f"</lanes>{structure('tunnel', *end)}")
+        for each, end in zip(roads, ends, strict=True)
+    ]
+    root, _ = lifted(write(tmp_path, *tunnels), hill, beyond="flat")
+    first, second = (
+        [polynomial(each, "elevationProfile/elevation", s) for s in (0, 12)] for each in root.iter("road")
+    )
+    assert first[1] == pytest.approx(second[0])
+    assert max(*first, *second) < 101.6
+
+
 LANE = '<lane id="{0}" type="driving"><width sOffset="0" a="{1}" b="{2}" c="0" d="0"/></lane>'
 OTHER_LANES = [
     # Shifted, and wider along the road.
