@@ -75,11 +75,6 @@ class Work:
     crg: str | None = None
     """Folder of the OpenCRG files, relative to the OpenDRIVE file; None if it refers to none."""
 
-    @classmethod
-    def of(cls, source: Source, roads: Network, **more: Any) -> Work:
-        """Return the work of an export."""
-        return cls(roads.frame, source.vertical, **more)
-
 
 @dataclass(frozen=True, eq=False)
 class RouteUnit:
@@ -179,7 +174,8 @@ def write_crg(
 ) -> dict[str, Any]:
     """Write an OpenCRG file per road and the report; return the summary."""
     roads = network(source, options)
-    rows, _ = write_units(opencrg.VERSION, crg_piece, Work.of(source, roads), roads, tiles, folder, executor)
+    work = Work(roads.frame, source.vertical)
+    rows, _ = write_units(opencrg.VERSION, crg_piece, work, roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
     error, steps = summary["crg_max_mm"], steps_left_out(_metres(summary["crg_steps_max_mm"]))
     surface = SMOOTH if steps else "the surface"
@@ -193,7 +189,7 @@ def write_xodr(
     """Write all roads as one OpenDRIVE file, which refers to the OpenCRG files if there are any."""
     roads = network(source, options)
     crg = "../crg/" if "crg" in options.formats else None
-    work = Work.of(source, roads, left_hand=options.left_hand, crg=crg)
+    work = Work(roads.frame, source.vertical, options.left_hand, crg)
     rows, key = write_units(opendrive.VERSION, xodr_piece, work, roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
     edges = np.array([road["bounds"] for row in rows for road in row["roads"]])

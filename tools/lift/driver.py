@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import shlex
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -115,8 +116,11 @@ class LiftedFile:
             )
         if flagged := {row.id: ", ".join(flag_names(row.flags)) for row in self.rows if row.flags}:
             notes.append(passing(flagged, self.noun))
-        for note, rows in self._by_note.items():
-            notes.append(f"{count(len(rows), self.noun)}: {note} ({_first(rows)})")
+        noted = defaultdict[str, list[Lifted]](list)
+        for row in self.rows:
+            noted[row.note].append(row)
+        for note, rows in noted.items():
+            notes += [f"{count(len(rows), self.noun)}: {note} ({_first(rows)})"] if note else []
         if unknown:
             length = sum(row.unknown_deck_m for row in unknown)
             notes.append(
@@ -130,15 +134,6 @@ class LiftedFile:
                 "--crossfall-limit: crossfalls are not known for this format; only grades are listed"
             )
         return tuple(notes)
-
-    @property
-    def _by_note(self) -> dict[str, list[Lifted]]:
-        """The rows by what is noted of them."""
-        found = dict[str, list[Lifted]]()
-        for row in self.rows:
-            if row.note:
-                found.setdefault(row.note, []).append(row)
-        return found
 
 
 def _first(rows: Sequence[Lifted]) -> str:

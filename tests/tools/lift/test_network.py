@@ -45,16 +45,13 @@ def test_a_road_that_ends_on_a_deck_is_on_it(ends):
     np.testing.assert_array_equal(z, road[order])
 
 
-def test_a_line_with_two_levels_from_end_to_end_is_on_the_higher_one():
-    z, numbers = along(heights(106.0), any_level())
-    assert (z == 106).all()
-    assert (numbers == 1).all()
-
-
-def test_a_line_over_a_tube_from_end_to_end_is_on_the_ground():
-    z, numbers = along(Heights((-1, 0), np.stack([GROUND - 6, GROUND])), any_level())
-    np.testing.assert_array_equal(z, GROUND)
-    assert not numbers.any()
+@pytest.mark.parametrize(("number", "above"), [(1, 106.0), (-1, 94.0)])
+def test_a_line_with_two_levels_from_end_to_end_is_on_the_higher_one(number, above):
+    order = slice(None, None, number)
+    own = Heights((0, number)[order], np.stack([GROUND, np.full(60, above)])[order])
+    z, numbers = along(own, any_level())
+    np.testing.assert_array_equal(z, np.maximum(GROUND, above))
+    assert (numbers == max(number, 0)).all()
 
 
 def test_attributes_decide_where_there_are_any():

@@ -11,6 +11,7 @@ import pytest
 from flexroad.pipeline.run.points import Heights
 from flexroad.tools.lift import opendrive, plan_view
 from flexroad.tools.lift.plan_view import extent
+from flexroad.tools.lift.road_profiles import cross_sections
 from flexroad.tools.lift.types import Frame, Lifted, Options
 from tests.read_opendrive import place, polynomial
 
@@ -493,3 +494,13 @@ def test_places_that_are_no_numbers_leave_the_road(tmp_path):
     _, (bad, good) = lifted(write(tmp_path, road(huge, name="8"), road()), plane)
     assert "places that are no numbers" in bad.note
     assert good.note == ""
+
+
+def test_a_single_place_with_ground_is_no_part_of_a_profile():
+    on = np.array([100.0, 100.1, np.nan, 100.3, np.nan, np.nan, 100.6, 100.7, np.nan, 100.9])
+    s, t = np.arange(10.0), np.array([-2.0, 0.0, 2.0])
+    z = np.broadcast_to(on[:, None], (10, 3))
+    found = cross_sections(s, t, z, (on, on, on), np.ones((10, 3), np.bool_), np.zeros(10, np.bool_))
+    np.testing.assert_array_equal(
+        found.line, [100.0, 100.1, np.nan, np.nan, np.nan, np.nan, 100.6, 100.7, np.nan, np.nan]
+    )
