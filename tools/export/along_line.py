@@ -1,9 +1,4 @@
-"""Heights along a reference line: on a grid as OpenCRG has them, as profiles of OpenDRIVE, metre by metre.
-
-Profiles are elevation and superelevation. At each point of the line the cross-section of the carriageway
-becomes a straight line; its height and its slope become cubic splines along the road. What a road has beside
-that (crown, ruts, kerbs, bumps) is missed; `profile_error` says by how much. OpenCRG has it.
-"""
+"""Heights along a reference line: on a grid as OpenCRG has them, as profiles of OpenDRIVE, metre by metre."""
 
 from __future__ import annotations
 
@@ -11,15 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
+from scipy.interpolate import CubicSpline
 
 from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.export.profiles import Profiles, cubic_pieces, straight_lines, value_at
 from flexroad.tools.export.reference_line import ReferenceLine
 
 HeightAt = Callable[[Floats, Floats], Floats]
 """Heights (m) of the surface at x and y of the reference line's coordinates; NaN where it has none."""
 STEP_M = 1.0
 """Length of a segment (m)."""
+TOLERANCE_M = 0.0005
+"""Largest distance of a profile from the straight lines that fit the cross-sections (m)."""
 ACROSS = np.linspace(-0.5, 0.5, 9)
 """Places across the carriageway at which the crossfall is measured, as shares of its width."""
 
@@ -78,39 +76,37 @@ def grid_error(grid: HeightGrid, height: HeightAt) -> tuple[float, float]:
     return float(np.median(missed)), float(missed.max())
 
 
-@dataclass(frozen=True, eq=False)
-class Profiles:
-    """Cubic splines over the length along the curve, `ReferenceLine.s`."""
-
-    elevation: scipy.interpolate.PPoly
-    """Height on the line (m)."""
-    superelevation: scipy.interpolate.PPoly
-    """Slope across the road (radians), positive where the left side is higher."""
-
-
-def profiles(grid: HeightGrid, knot_m: float = 5.0) -> Profiles:
+def profiles(grid: HeightGrid) -> Profiles:
     """Return the profiles that fit the heights of the carriageway by least squares.
 
     Where the surface ends across the road, a cross-section is compared with the nearest complete one: a line
     through a part of it alone would have the slope of that side of the crown. Cross-sections with less than
-    two heights do not count; what is between their neighbours is used. The length of a cubic piece is
-    ``knot_m``.
+    two heights do not count; what is between their neighbours is used.
     """
-    inside, s = on_carriageway(grid), grid.line.s
-    crown, inside = _crown(grid, inside)
-    height, slope = _straight(np.where(inside, grid.heights - crown, 0.0), grid.v, inside)
-    return Profiles(_spline(s, height, knot_m), _spline(s, np.arctan(slope), knot_m))
+    s, v = grid.line.s, grid.v
+    crown, inside = _crown(grid, on_carriageway(grid))
+    found = np.stack(straight_lines(v, grid.heights - crown, inside))
+    known = np.isfinite(found[1])
+    height, slope = (
+        (np.interp(s, s[known], row[known]) for row in found) if known.any() else np.zeros_like(found)
+    )
+    reach = max(float(np.abs(v).max()), 1.0)
+    return Profiles(_pieces(s, height, TOLERANCE_M), _pieces(s, np.arctan(slope), TOLERANCE_M / reach))
+
+
+def _pieces(s: Floats, values: Floats, tolerance: float) -> Floats:
+    return cubic_pieces(s, values, CubicSpline(s, values)(s, 1), tolerance)
 
 
 def profile_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
     """Return how far profiles miss the heights of the carriageway: mean, largest (m); NaN if it has none."""
-    s = grid.line.s[:, None]
-    return _missed(grid, profiles.elevation(s) + grid.v * np.tan(profiles.superelevation(s)))
+    return _missed(grid, profiles.at(grid.line.s[:, None], grid.v))
 
 
 def elevation_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
     """Return the same as `profile_error` for a reader that takes the elevation alone, across a level road."""
-    return _missed(grid, np.broadcast_to(profiles.elevation(grid.line.s[:, None]), grid.heights.shape))
+    level = value_at(profiles.elevation, grid.line.s[:, None])
+    return _missed(grid, np.broadcast_to(level, grid.heights.shape))
 
 
 def largest_steps(grid: HeightGrid, step: HeightAt) -> tuple[float, float]:
@@ -151,37 +147,12 @@ def _crown(grid: HeightGrid, inside: Bools) -> tuple[Floats, Bools]:
     if not len(complete) or not len(rows):
         return crown, inside
     nearest = complete[np.rint(np.interp(rows, complete, np.arange(len(complete)))).astype(int)]
-    heights = np.where(inside[nearest], grid.heights[nearest], 0.0)
-    height, slope = _straight(heights, grid.v, inside[nearest])
-    crown[rows] = np.where(inside[nearest], heights - height[:, None] - slope[:, None] * grid.v, 0.0)
+    height, slope = straight_lines(grid.v, grid.heights[nearest], inside[nearest])
+    straight = height[:, None] + slope[:, None] * grid.v
+    crown[rows] = np.where(inside[nearest], grid.heights[nearest] - straight, 0.0)
     common = inside.copy()
     common[rows] &= inside[nearest]
     return crown, common
-
-
-def _straight(heights: Floats, v: Floats, inside: Bools) -> tuple[Floats, Floats]:
-    """Return height at v = 0 and slope of the line that fits each row; 0 heights where not inside."""
-    count = inside.sum(axis=1)
-    known = count > 1
-    mean_v = (inside * v).sum(axis=1)[known] / count[known]
-    mean_z = heights.sum(axis=1)[known] / count[known]
-    away = (v - mean_v[:, None]) * inside[known]
-    slope = (away * heights[known]).sum(axis=1) / (away**2).sum(axis=1)
-    rows = np.arange(len(heights))
-    at = rows[known]
-    if not len(at):
-        return np.zeros(len(rows)), np.zeros(len(rows))
-    return np.interp(rows, at, mean_z - slope * mean_v), np.interp(rows, at, slope)
-
-
-def _spline(s: Floats, values: Floats, knot_m: float) -> scipy.interpolate.PPoly:
-    """Return the cubic spline with pieces of about ``knot_m`` that fits values by least squares."""
-    # With at least two values a piece the fit is unique.
-    pieces = max(1, min(round(s[-1] / knot_m), (len(s) - 1) // 2 - 3))
-    knots = np.concatenate([[s[0]] * 3, np.linspace(s[0], s[-1], pieces + 1), [s[-1]] * 3])
-    whole = scipy.interpolate.PPoly.from_spline(scipy.interpolate.make_lsq_spline(s, values, knots, 3))
-    # The repeated knots at the ends have given pieces without length.
-    return scipy.interpolate.PPoly(whole.c[:, 3:-3], whole.x[3:-3])
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,6 @@ from flexroad.tools.export import reference_line as lines
 from flexroad.tools.export.along_line import (
     HeightAt,
     HeightGrid,
-    Profiles,
     across,
     elevation_error,
     grid_error,
@@ -45,13 +44,19 @@ from flexroad.tools.export.ground import SMOOTH, Ground, steps_left_out
 from flexroad.tools.export.local_frame import LocalFrame
 from flexroad.tools.export.network import Network, network
 from flexroad.tools.export.pieces import MARKERS, Encode, Piece, Row, write_pieces, write_whole
+from flexroad.tools.export.profiles import Profiles
 from flexroad.tools.export.reference_line import ReferenceLine
 from flexroad.tools.export.source import Options, Source
 
-VERSION = 7
+VERSION = 8
 """Of the roads themselves: their division, lines, grids and errors."""
 INTERNAL = {"bounds", "lanes_assumed"}
 """Entries of a road's row that the report does not show."""
+SUMMARY = (
+    *("crg_max_mm", "profiles_mean_mm", "profiles_max_mm", "elevation_mean_mm", "elevation_max_mm"),
+    *("crg_steps_max_mm", "carriageway_steps_max_mm", "tile_steps_max_mm"),
+)
+"""Errors in the summary: means over the length of the roads, largest ones over all."""
 REPORT = "roads.csv"
 NO_ROAD = "no road lies on the tiles"
 MOST_NAMED = 3
@@ -69,11 +74,6 @@ class Work:
     left_hand: bool = False
     crg: str | None = None
     """Folder of the OpenCRG files, relative to the OpenDRIVE file; None if it refers to none."""
-
-    @classmethod
-    def of(cls, source: Source, roads: Network, **more: Any) -> Work:
-        """Return the work of an export."""
-        return cls(roads.frame, source.vertical, **more)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +174,8 @@ def write_crg(
 ) -> dict[str, Any]:
     """Write an OpenCRG file per road and the report; return the summary."""
     roads = network(source, options)
-    rows, _ = write_units(opencrg.VERSION, crg_piece, Work.of(source, roads), roads, tiles, folder, executor)
+    work = Work(roads.frame, source.vertical)
+    rows, _ = write_units(opencrg.VERSION, crg_piece, work, roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
     error, steps = summary["crg_max_mm"], steps_left_out(_metres(summary["crg_steps_max_mm"]))
     surface = SMOOTH if steps else "the surface"
@@ -188,7 +189,7 @@ def write_xodr(
     """Write all roads as one OpenDRIVE file, which refers to the OpenCRG files if there are any."""
     roads = network(source, options)
     crg = "../crg/" if "crg" in options.formats else None
-    work = Work.of(source, roads, left_hand=options.left_hand, crg=crg)
+    work = Work(roads.frame, source.vertical, options.left_hand, crg)
     rows, key = write_units(opendrive.VERSION, xodr_piece, work, roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
     edges = np.array([road["bounds"] for row in rows for road in row["roads"]])
@@ -244,52 +245,47 @@ def write_units(
 
 def crg_piece(unit: RouteUnit, work: Work) -> Piece:
     """Return the OpenCRG files of a route."""
-    files, rows = dict[str, bytes](), list[Row]()
-    grids_of, problem = _grids(unit, work)
-    step = unit.step(work)
-    for part, (grid, height) in enumerate(grids_of):
-        road = unit.road_id(part)
-        heights = work.vertical or "as in the run"
-        comment = f"FlexRoad: {grid.line.name}\nx, y: {work.frame.proj}\nheights: {heights}"
-        files[f"{road}{opencrg.NAME}"] = opencrg.encode(grid, comment)
-        found = row(road, grid, height, step, profiles(grid), _tile_step(unit, work, grid))
-        rows.append(found | {"flags": unit.flags(grid.line, work)})
-    return Piece(files, _route_row(unit, rows, problem))
+    roads, problem = _roads(unit, work)
+    heights = work.vertical or "as in the run"
+    comment = "FlexRoad: {}\nx, y: {}\nheights: {}"
+    files = {
+        f"{road}{opencrg.NAME}": opencrg.encode(
+            grid, comment.format(grid.line.name, work.frame.proj, heights)
+        )
+        for road, grid, _, _ in roads
+    }
+    return Piece(files, _route_row(unit, roads, problem))
 
 
 def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
     """Return the roads of a route as XML of OpenDRIVE."""
-    texts, rows = list[bytes](), list[Row]()
-    grids_of, problem = _grids(unit, work)
-    step = unit.step(work)
-    for part, (grid, height) in enumerate(grids_of):
-        road = unit.road_id(part)
-        fitted = profiles(grid)
+    roads, problem = _roads(unit, work)
+    texts = list[bytes]()
+    for road, grid, fitted, _ in roads:
         crg = None if work.crg is None else f"{work.crg}{road}{opencrg.NAME}"
         decks = structures(unit.levels_on(grid.line.x, grid.line.y), grid.line.s)
-        written = opendrive.Road(str(road), grid.line, fitted, crg, decks)
-        texts.append(opendrive.encode(written, work.left_hand))
-        found = row(road, grid, height, step, fitted, _tile_step(unit, work, grid))
-        rows.append(found | {"flags": unit.flags(grid.line, work)})
-    return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, rows, problem))
+        texts.append(
+            opendrive.encode(opendrive.Road(str(road), grid.line, fitted, crg, decks), work.left_hand)
+        )
+    return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, roads, problem))
 
 
 def _fragment(route: int) -> str:
     return f"{MARKERS}/{route}.xml"
 
 
-def _grids(unit: RouteUnit, work: Work) -> tuple[list[tuple[HeightGrid, HeightAt]], str]:
-    """Return the grids of a route's roads, and why it has none."""
-    height = unit.height(work)
+def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Profiles, Row]], str]:
+    """Return numbers, grids, profiles and rows of a route's roads, and why it has none."""
+    height, step = unit.height(work), unit.step(work)
     line, problem = reference_line(unit)
-    if line is None:
-        return [], problem
-    parts = lines.usable(line, height(line.x, line.y), lines.Options())
-    return [(height_grid(part, height), height) for part in parts], ""
-
-
-def _tile_step(unit: RouteUnit, work: Work, grid: HeightGrid) -> float:
-    return unit.tile_step(grid.line, grid.v, on_carriageway(grid), work)
+    parts = [] if line is None else lines.usable(line, height(line.x, line.y), lines.Options())
+    roads = []
+    for part, own in enumerate(parts):
+        grid = height_grid(own, height)
+        fitted, on = profiles(grid), on_carriageway(grid)
+        found = row(unit.road_id(part), grid, height, step, fitted, unit.tile_step(own, grid.v, on, work))
+        roads.append((unit.road_id(part), grid, fitted, found | {"flags": unit.flags(own, work)}))
+    return roads, problem
 
 
 def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
@@ -302,10 +298,10 @@ def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
     return line, f"shorter than {options.min_length_m:g} m" if line is None else ""
 
 
-def _route_row(unit: RouteUnit, rows: list[Row], problem: str) -> Row:
-    if not rows and not problem:
+def _route_row(unit: RouteUnit, roads: list[tuple[int, HeightGrid, Profiles, Row]], problem: str) -> Row:
+    if not roads and not problem:
         problem = "no part of it has a surface for long enough"
-    return {"route": unit.number, "roads": rows, "problem": problem}
+    return {"route": unit.number, "roads": [row for *_, row in roads], "problem": problem}
 
 
 def row(
@@ -370,14 +366,7 @@ def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
     )
     return {
         **totals(rows, roads),
-        "crg_max_mm": _largest(every, "crg_max_mm"),
-        "profiles_mean_mm": _mean(every, "profiles_mean_mm"),
-        "profiles_max_mm": _largest(every, "profiles_max_mm"),
-        "elevation_mean_mm": _mean(every, "elevation_mean_mm"),
-        "elevation_max_mm": _largest(every, "elevation_max_mm"),
-        "crg_steps_max_mm": _largest(every, "crg_steps_max_mm"),
-        "carriageway_steps_max_mm": _largest(every, "carriageway_steps_max_mm"),
-        "tile_steps_max_mm": _largest(every, "tile_steps_max_mm"),
+        **{name: (_mean if "_mean_" in name else _largest)(every, name) for name in SUMMARY},
         "faults": tile_faults(every),
     }
 

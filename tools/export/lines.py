@@ -46,7 +46,7 @@ def write_lines(
 ) -> dict[str, Any]:
     """Write all roads as one GeoPackage; return the summary."""
     roads = network(source, options)
-    work = Work.of(source, roads)
+    work = Work(roads.frame, source.vertical)
     rows, key = write_units(road_lines.VERSION, lines_piece, work, roads, tiles, folder, executor)
     found = sum(len(row["roads"]) for row in rows)
     if not found:

@@ -19,8 +19,8 @@ import numpy as np
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.text import printable
 from flexroad.tasks.types import Floats
-from flexroad.tools.export.along_line import Profiles
 from flexroad.tools.export.along_route import Structure
+from flexroad.tools.export.profiles import Profiles
 from flexroad.tools.export.reference_line import ReferenceLine
 
 if TYPE_CHECKING:
@@ -111,12 +111,12 @@ def _road(road: Road, left_hand: bool) -> ET.Element:
     for piece in zip(ends[:-1], ends[1:], lengths[:-1], lengths[1:], strict=True):
         plan.append(_geometry(road.line.curve, *map(float, piece)))
     elevation, lateral = ET.SubElement(element, "elevationProfile"), ET.SubElement(element, "lateralProfile")
-    for parent, tag, spline in (
+    for parent, tag, pieces in (
         (elevation, "elevation", road.profiles.elevation),
         (lateral, "superelevation", road.profiles.superelevation),
     ):
-        for s, (d, c, b, a) in zip(spline.x[:-1], spline.c.T, strict=True):
-            ET.SubElement(parent, tag, _attributes(s=s, a=a, b=b, c=c, d=d))
+        for piece in pieces:
+            ET.SubElement(parent, tag, _attributes(**dict(zip("sabcd", piece, strict=True))))
     element.append(_lanes(road.line, left_hand))
     if road.structures:
         element.append(_objects(road))

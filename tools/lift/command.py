@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -23,6 +24,7 @@ app = group()
 
 
 @app.command(cls=Command)
+@options.with_options
 def lift(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Road network or features without heights.")],
     path: options.Run,
@@ -36,6 +38,7 @@ def lift(
             rich_help_panel=OUTPUTS,
         ),
     ],
+    *,
     crs: Annotated[
         str | None,
         typer.Option(metavar="CRS", help="CRS of FILE, if it does not say it.", rich_help_panel=INPUTS),
@@ -48,32 +51,6 @@ def lift(
             rich_help_panel=INPUTS,
         ),
     ] = None,
-    tolerance: Annotated[
-        float,
-        typer.Option(min=0.0001, metavar="METRES", help="Largest distance of profiles from the surface (m)."),
-    ] = 0.005,
-    lateral: Annotated[
-        Literal["superelevation", "none"],
-        typer.Option(help="What roads of OpenDRIVE have across."),
-    ] = "superelevation",
-    beyond: Annotated[
-        Literal["keep", "flat"],
-        typer.Option(help="Heights where the run has no surface: as they are, or level from there on."),
-    ] = "keep",
-    vertices: Annotated[
-        bool | None,
-        typer.Option(
-            "--vertices/--no-vertices",
-            help="Add vertices where lines leave the surface; default: yes, but not to OSM files.",
-        ),
-    ] = None,
-    columns: Annotated[
-        bool,
-        typer.Option(
-            "--columns",
-            help="Add the columns grade_max_percent, crossfall_max_percent and error_estimate_m to features.",
-        ),
-    ] = False,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -82,24 +59,7 @@ def lift(
             rich_help_panel=OUTPUTS,
         ),
     ] = None,
-    grade_limit: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            metavar="PERCENT",
-            help="Write places with a steeper grade as points beside the report.",
-            rich_help_panel=OUTPUTS,
-        ),
-    ] = None,
-    crossfall_limit: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            metavar="PERCENT",
-            help="Write places with a steeper crossfall as points beside the report.",
-            rich_help_panel=OUTPUTS,
-        ),
-    ] = None,
+    wanted: Options,
     allow_steps: Annotated[
         bool,
         typer.Option("--allow-steps", help="End with exit code 0 although the tiles below do not meet."),
@@ -115,17 +75,12 @@ def lift(
     FILE is OpenDRIVE (.xodr), a network of SUMO (.net.xml), OSM or Lanelet2 (.osm), or a vector file
     (GeoPackage, GeoJSON, FlatGeobuf, Shapefile). All else in it stays as it is.
     """
-    if report is None and (grade_limit is not None or crossfall_limit is not None):
-        raise ConfigError("places above limits are written beside the report; give --report FILE.csv")
-    wanted = Options(
-        tolerance_m=tolerance,
-        lateral=lateral,
-        flat_ends=beyond == "flat",
-        add_vertices=vertices,
-        columns=columns,
-        grade_limit=None if grade_limit is None else grade_limit / 100,
-        crossfall_limit=None if crossfall_limit is None else crossfall_limit / 100,
+    grade, crossfall = (
+        None if percent is None else percent / 100 for percent in (wanted.grade_limit, wanted.crossfall_limit)
     )
+    if report is None and (grade, crossfall) != (None, None):
+        raise ConfigError("places above limits are written beside the report; give --report FILE.csv")
+    wanted = replace(wanted, grade_limit=grade, crossfall_limit=crossfall)
     ground = Ground.open(path, variant, allow or (), earlier=True)
     result = lift_file(ground, file, output, wanted, crs, offset, report)
     echo(f"{output}: {result.summary}")

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import shlex
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -84,7 +85,7 @@ class LiftedFile:
         """One line: what has heights, and what has not."""
         parts = [f"{count(len(self.rows), self.noun)}, {_length(self.rows, 'length_m')}"]
         if any(row.without_ground_m > 0 for row in self.rows):
-            kept = "go on level" if self.options.flat_ends else "keep their heights"
+            kept = "go on level" if self.options.beyond == "flat" else "keep their heights"
             parts.append(f"{_length(self.rows, 'without_ground_m')} beyond the tiles {kept}")
         if any(row.unknown_deck_m > 0 for row in self.rows):
             parts.append(f"{_length(self.rows, 'unknown_deck_m')} on decks or in tunnels of unknown height")
@@ -108,15 +109,18 @@ class LiftedFile:
             points = sum(row.points_without_ground for row in without)
             parts = [f"{length:.1f} m"] if length else []
             parts += [count(points, "point")] if points else []
-            kept = "go on level there" if self.options.flat_ends else "keep their heights"
+            kept = "go on level there" if self.options.beyond == "flat" else "keep their heights"
             notes.append(
                 f"{' and '.join(parts)} of {count(len(without), self.noun)} lie beyond the finished tiles "
                 f"and {kept} ({_first(without)})"
             )
         if flagged := {row.id: ", ".join(flag_names(row.flags)) for row in self.rows if row.flags}:
             notes.append(passing(flagged, self.noun))
-        for note, rows in self._by_note.items():
-            notes.append(f"{count(len(rows), self.noun)}: {note} ({_first(rows)})")
+        noted = defaultdict[str, list[Lifted]](list)
+        for row in self.rows:
+            noted[row.note].append(row)
+        for note, rows in noted.items():
+            notes += [f"{count(len(rows), self.noun)}: {note} ({_first(rows)})"] if note else []
         if unknown:
             length = sum(row.unknown_deck_m for row in unknown)
             notes.append(
@@ -130,15 +134,6 @@ class LiftedFile:
                 "--crossfall-limit: crossfalls are not known for this format; only grades are listed"
             )
         return tuple(notes)
-
-    @property
-    def _by_note(self) -> dict[str, list[Lifted]]:
-        """The rows by what is noted of them."""
-        found = dict[str, list[Lifted]]()
-        for row in self.rows:
-            if row.note:
-                found.setdefault(row.note, []).append(row)
-        return found
 
 
 def _first(rows: Sequence[Lifted]) -> str:

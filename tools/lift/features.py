@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,10 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.quality.flagged import Bits, passed
 from flexroad.tasks.roads import level_numbers
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.lift.batches import POINTS
-from flexroad.tools.lift.levels import ANY, Numbers, along
 from flexroad.tools.lift.lines import STEP_M, Line, largest, steepest
+from flexroad.tools.lift.network import ANY, Numbers, along, filled, of_levels
 from flexroad.tools.lift.shapes import POINT, POLYGON, Shape
-from flexroad.tools.lift.types import Lifted, Options, RunSurface, Steep
+from flexroad.tools.lift.types import POINTS, Lifted, Options, RunSurface, Steep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,7 +77,7 @@ def with_zero(shape: Shape | None, row: Lifted) -> tuple[Shape | None, Lifted]:
     """Return a geometry and its row for formats in which all have a z: 0, with a note, without ground."""
     if shape is None or shape.z or not (shape.paths or shape.parts):
         return shape and shape.flat(), row
-    return shape.flat(), row.noted(ZERO)
+    return shape.flat(), replace(row, note=ZERO)
 
 
 def lifted(
@@ -215,7 +214,7 @@ class _Samples:
         sides = []
         for across in (ACROSS_M, -ACROSS_M):
             heights = run.at(self.east[usable] + across * right, self.north[usable] + across * up)
-            sides.append(_of_levels(heights, numbers))
+            sides.append(of_levels(heights, numbers))
         found[usable] = np.abs(sides[0] - sides[1]) / (2 * ACROSS_M)
         return found
 
@@ -307,14 +306,6 @@ def _on_levels(
     return z, numbers
 
 
-def _of_levels(heights: Heights, numbers: Numbers) -> Floats:
-    """Return the heights of points on given levels; NaN where a point does not have its level."""
-    z = np.full(len(numbers), np.nan)
-    for number, row in zip(heights.numbers, heights.z, strict=True):
-        z[numbers == number] = row[numbers == number]
-    return z
-
-
 def _point(name: str, shape: Shape, at: int, group: _Group) -> tuple[Shape, Lifted]:
     """Return what `_with_heights` does, for a single point: a file may have millions."""
     z = float(group.z[at])
@@ -343,7 +334,10 @@ def _with_heights(
         points = sum(path.code == POINT for path in paths)
         of_lines = length if points < len(paths) else np.nan
         return shape, Lifted(feature.id, of_lines, length, (), points_without_ground=points)
-    z = _filled(group, place, known)
+    z = group.z[place]
+    if group.options.beyond == "keep":
+        z = np.where(known, z, group.samples.values[place, 2])
+    z = filled(group.samples.along[place], z)
     new, kept = list[Floats](), list[NDArray[np.intp]]()
     for path in paths:
         profile = z[path.start - place.start : path.end - place.start]
@@ -358,20 +352,6 @@ def _with_heights(
 
 def _length(path: _Path, samples: _Samples) -> float:
     return float(samples.along[path.end - 1] - samples.along[path.start])
-
-
-def _filled(group: _Group, place: slice, known: Bools) -> Floats:
-    """Return heights of a feature that are known everywhere: as they were, else straight from known to known.
-
-    Beyond the first and the last known point of a feature they are level.
-    """
-    z = group.z[place]
-    if known.all():
-        return z
-    if not group.options.flat_ends:
-        z = np.where(known, z, group.samples.values[place, 2])
-    has, index = np.isfinite(z), np.arange(len(z))
-    return np.where(has, z, np.interp(index, index[has], z[has]))
 
 
 def _line(path: _Path, samples: _Samples) -> Line:
@@ -396,6 +376,7 @@ def _row(
             points += int(not known[own][0])
             continue
         lines, s = True, path.of(samples.along)
+        x, y = path.of(samples.values)[:, :2].T
         length += s[-1] - s[0]
         line = _line(path, samples)
         if beyond:
@@ -405,11 +386,11 @@ def _row(
         off.append(largest(np.abs(np.interp(s, s[chosen], z[own][chosen]) - z[own])[known[own]]))
         slopes = np.abs(grades(s, np.where(known[own], z[own], np.nan), 0.999 * STEP_M))
         grade.append(largest(slopes))
-        steep += _steep("grade", slopes, options.grade_limit, path, samples)
+        steep += steepest("grade", slopes, options.grade_limit, x, y)
         if group.crossfalls is not None and path.code != POLYGON:
             slopes = path.of(group.crossfalls)
             crossfall.append(largest(slopes))
-            steep += _steep("crossfall", slopes, options.crossfall_limit, path, samples)
+            steep += steepest("crossfall", slopes, options.crossfall_limit, x, y)
     return Lifted(
         feature.id,
         float(length) if lines else np.nan,
@@ -447,14 +428,3 @@ def grades(s: Floats, z: Floats, over: float) -> Floats:
             break
         found[i] = (z[end] - z[i]) / (s[end] - s[i])
     return found
-
-
-def _steep(
-    kind: Literal["grade", "crossfall"], values: Floats, limit: float | None, path: _Path, samples: _Samples
-) -> list[Steep]:
-    """Return the steepest place of each stretch above a limit."""
-    places = []
-    for at in steepest(values, limit):
-        x, y = path.of(samples.values)[at, :2].tolist()
-        places.append(Steep(kind, float(values[at]), x, y))
-    return places

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.lift.levels import stretches
-from flexroad.tools.lift.profile import vertices
 from flexroad.tools.lift.types import Steep
 
 STEP_M = 0.5
@@ -67,7 +68,7 @@ class Line:
         around = np.concatenate([[True], known, [True]])
         ends = known & ~(around[:-2] & around[2:])
         index = vertices(self.s, np.where(known, z, 0.0), self.own | ends, tolerance)
-        return index[known[index] | self.own[index]]
+        return np.asarray(index[known[index] | self.own[index]])
 
     def grades(self, z: Floats, limit: float | None) -> tuple[float, tuple[Steep, ...]]:
         """Return the largest grade (m/m), NaN if none is known, and the steepest place of each steep part."""
@@ -76,11 +77,8 @@ class Line:
         grade = np.abs(np.diff(z)[at]) / length[at]
         if not len(at):
             return np.nan, ()
-        places = list[Steep]()
-        for most in steepest(grade, limit):
-            x, y = ((values[at[most]] + values[at[most] + 1]) / 2 for values in (self.x, self.y))
-            places.append(Steep("grade", float(grade[most]), float(x), float(y)))
-        return float(grade.max()), tuple(places)
+        x, y = ((values[at] + values[at + 1]) / 2 for values in (self.x, self.y))
+        return float(grade.max()), steepest("grade", grade, limit, x, y)
 
     def length_where(self, places: Bools) -> float:
         """Return the length (m) of some points of the line: each has half of the way to the next ones."""
@@ -93,8 +91,47 @@ def largest(values: Floats | Sequence[float]) -> float:
     return float(np.fmax.reduce(values, initial=np.nan))
 
 
-def steepest(values: Floats, limit: float | None) -> list[int]:
-    """Return the index of the largest value of each stretch above a limit; without a limit, none."""
-    if limit is None:
-        return []
-    return [start + int(np.argmax(values[start:end])) for start, end in stretches(values > limit)]
+def steepest(
+    kind: Literal["grade", "crossfall"], values: Floats, limit: float | None, x: Floats, y: Floats
+) -> tuple[Steep, ...]:
+    """Return the place of the largest value of each stretch above a limit; without a limit, none."""
+    found = [] if limit is None else stretches(values > limit)
+    most = [start + int(np.argmax(values[start:end])) for start, end in found]
+    return tuple(Steep(kind, float(values[at]), float(x[at]), float(y[at])) for at in most)
+
+
+def stretches(places: Bools) -> list[tuple[int, int]]:
+    """Return start and end of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], places, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in pairwise(edges)][::2]
+
+
+@compiled()
+def vertices(s: Floats, z: Floats, kept: Bools, tolerance: float) -> NDArray[np.intp]:
+    """Return the indices of the points that a line needs so that it stays within a tolerance.
+
+    - `s`, `z` ``(n,)``: distances along the line and heights (m).
+    - `kept` ``(n,)``: the points that the line has in any case; the first and last one are.
+    - `tolerance`: largest distance of the line from the heights of the points that it does not have (m).
+    """
+    chosen, start, last = [0], 0, len(s) - 1
+    while start < last:
+        end = start + 1
+        # Slopes from the start with which the line stays within the tolerance of all points passed.
+        low, high = -np.inf, np.inf
+        while True:
+            away = s[end] - s[start]
+            rise = z[end] - z[start]
+            if kept[end] or end == last:
+                if away > 0 and not low <= rise / away <= high and end - 1 > start:
+                    end -= 1
+                break
+            if away > 0:
+                if not low <= rise / away <= high and end - 1 > start:
+                    end -= 1
+                    break
+                low, high = max(low, (rise - tolerance) / away), min(high, (rise + tolerance) / away)
+            end += 1
+        chosen.append(end)
+        start = end
+    return np.array(chosen)

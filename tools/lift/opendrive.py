@@ -16,20 +16,30 @@ from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.lift import lanes, levels, opendrive_text, plan_view, road_levels, road_profiles, xml_text
-from flexroad.tools.lift.batches import with_heights
-from flexroad.tools.lift.levels import ANY, Numbers
+from flexroad.tools.export.profiles import Profiles, cubic_pieces, value_at
+from flexroad.tools.lift import plan_view, road_profiles, xml_text
 from flexroad.tools.lift.lines import steepest
+from flexroad.tools.lift.network import (
+    ANY,
+    GUESSED,
+    NOWHERE,
+    Network,
+    Node,
+    Numbers,
+    along,
+    complete,
+    filled,
+    of_levels,
+)
 from flexroad.tools.lift.plan_view import numbers
-from flexroad.tools.lift.profile import AHEAD_M, value_at
-from flexroad.tools.lift.road_profiles import NONE, CrossSections
-from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, Steep
+from flexroad.tools.lift.road_profiles import AHEAD_M, NONE, CrossSections
+from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
 NOUN = "road"
 """What a row of the report is."""
 STEPS = False
-"""Whether heights have the steps beside roads: OpenDRIVE has kerbs in its lanes."""
+"""Whether heights have the steps beside roads: OpenDRIVE has kerbs in its plan_view."""
 ALONG_M, LEAST_ALONG = 1.0, 4
 """Distance of the cross-sections of a road (m), and their least number, less one."""
 ACROSS_M = 1.0
@@ -59,7 +69,7 @@ class Road:
     """``(n,)``: the reference line."""
     y: Floats
     heading: Floats
-    extent: lanes.Extent
+    extent: plan_view.Extent
     elevation: Floats
     """The profile that it had, ``(k, 5)``."""
     superelevation: Floats
@@ -78,10 +88,24 @@ class Road:
         middle = (self.extent.right + self.extent.left) / 2
         return np.asarray(np.abs(self.t - middle[:, None]).argmin(axis=1))
 
-    def middle(self) -> tuple[Floats, Floats]:
-        """Return x and y in the middle of the lanes, ``(n,)`` each."""
+    @property
+    def nodes(self) -> tuple[Node, Node]:
+        """Its start and its end."""
+        return (self.id, "start"), (self.id, "end")
+
+    @property
+    def links(self) -> Iterator[tuple[Node, Node]]:
+        """Its ends that are linked with other roads, and the ends of those."""
+        for name, node in zip(("predecessor", "successor"), self.nodes, strict=True):
+            link = self.part.element.find(f"link/{name}")
+            if link is not None and link.get("elementType") == "road":
+                yield node, (link.get("elementId"), link.get("contactPoint"))
+
+    def middle_and_line(self) -> tuple[Floats, Floats]:
+        """Return x and y in the middle of the lanes, then on the reference line, ``(2 n,)`` each."""
         away = self.t[self.column]
-        return self.x - away * np.sin(self.heading), self.y + away * np.cos(self.heading)
+        x, y = self.x - away * np.sin(self.heading), self.y + away * np.cos(self.heading)
+        return np.concatenate([x, self.x]), np.concatenate([y, self.y])
 
     def places(self) -> tuple[Floats, Floats]:
         """Return x and y of the points: cross-sections, the line, before and after its points."""
@@ -123,7 +147,7 @@ def frame(source: Path) -> Frame:
 
 def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Iterator[Lifted]:
     """Copy a file with heights; yield the rows of the report."""
-    of_links = LinkedLevels(source, heights)
+    of_links = _Linked(source, heights)
     with xml_text.opened(source) as file, xml_text.written(out) as copy:
         parts = map(_read, xml_text.parts(file, {"road"}))
         for part, found in with_heights(parts, _places, heights):
@@ -165,7 +189,7 @@ def _road(part: Part, name: str) -> Road:
     plan = plan_view.read(element)
     count = max(int(np.ceil(length / ALONG_M)), LEAST_ALONG)
     s = np.linspace(0.0, length, count + 1)
-    extent = lanes.extent(element, s)
+    extent = plan_view.extent(element, s)
     reach = max(float(np.abs(extent.right).max()), float(np.abs(extent.left).max()))
     # In narrow bends the outer lanes are long; kinks between geometries are not bends.
     kept = np.diff(np.searchsorted(plan.start[:, 0], s, side="right")) == 0
@@ -173,7 +197,7 @@ def _road(part: Part, name: str) -> Road:
     if np.isfinite(turned) and turned > ALONG_M:
         finer = int(min(np.ceil(turned / ALONG_M), MOST_FINER, max(1, MOST_FINE // count)))
         s = np.linspace(0.0, length, count * finer + 1)
-        extent = lanes.extent(element, s)
+        extent = plan_view.extent(element, s)
     x, y, heading = plan.at(s)
     if not np.isfinite([x, y, heading]).all():
         raise TaskError("has a planView with places that are no numbers")
@@ -206,41 +230,48 @@ def _structures(road: ET.Element) -> Iterator[Structure]:
 
 def _old(road: ET.Element, path: str) -> Floats:
     """Return the pieces of a profile that a road has; readers take 0 before the first one."""
-    pieces = lanes.records(road.findall(path))
+    pieces = plan_view.records(road.findall(path))
     if not len(pieces):
         return NONE
     pieces = pieces[np.argsort(pieces[:, 0], kind="stable")]
     return pieces if pieces[0, 0] <= 0 else np.vstack([NONE, pieces])
 
 
-def _lifted(road: Road, heights: Heights, options: Options, of_links: LinkedLevels) -> tuple[bytes, Lifted]:
+def _lifted(road: Road, heights: Heights, options: Options, of_links: _Linked) -> tuple[bytes, Lifted]:
     """Return the text of a road with heights, and its row."""
     sections, used, unknown_m, rows = _sections(road, heights, of_links)
-    beyond: road_profiles.Beyond = "flat" if options.flat_ends else "keep"
-    tolerance = options.tolerance_m
-    elevation = road_profiles.elevation(sections, road.elevation, beyond, tolerance)
-    across = road_profiles.superelevation(sections, road.superelevation, beyond, tolerance)
+    flat, tolerance, ends = options.beyond == "flat", options.tolerance_m, NOWHERE
+    if flat and not np.isfinite(sections.line).all():
+        ends = of_links.network.ends(road.nodes, beyond=True)
+    elevation = road_profiles.elevation(sections, road.elevation, flat, tolerance, ends)
+    across = road_profiles.superelevation(sections, road.superelevation, flat, tolerance)
     if elevation is None or across is None:
-        length = float(road.s[-1])
-        return road.part.text, Lifted(road.id, length, length, (), unknown_m)
-    lateral = None if options.lateral == "none" else opendrive_text.records("superelevation", across)
-    text = opendrive_text.with_profiles(road.part, opendrive_text.records("elevation", elevation), lateral)
+        text, length = road.part.text, float(road.s[-1])
+        if np.isfinite(ends).any():
+            at = np.array([0.0, length])
+            level = cubic_pieces(at, filled(at, np.full(2, np.nan), ends), np.zeros(2), tolerance)
+            text = road_profiles.with_profiles(road.part, road_profiles.texts("elevation", level), None)
+        return text, Lifted(road.id, length, length, (), unknown_m)
+    lateral = None if options.lateral == "none" else road_profiles.texts("superelevation", across)
+    text = road_profiles.with_profiles(road.part, road_profiles.texts("elevation", elevation), lateral)
     row = _row(road, sections, used, unknown_m, elevation, across, options)
     on_lanes = np.flatnonzero(road.inside)
     numbers = np.array(heights.numbers, np.int8)[np.repeat(rows, len(road.t))[on_lanes]]
+    if road.id in of_links.guessed:
+        row = replace(row, note=GUESSED)
     return text, replace(row, flags=passed(heights[on_lanes].flags_on(numbers)))
 
 
 def _sections(
-    road: Road, heights: Heights, of_links: LinkedLevels
+    road: Road, heights: Heights, of_links: _Linked
 ) -> tuple[CrossSections, Numbers, float, NDArray[np.intp]]:
     """Return the cross-sections, their levels, the length of unknown ones (m), their rows of `Heights.z`."""
     n, m = len(road.s), len(road.t)
     line = heights[np.arange(n) * m + road.column]
     wanted, joined, unknown_m = _wanted(road, line)
-    if (wanted == ANY).all() and road_levels.several(line):
-        wanted[:] = of_links.get(road.id, ANY)
-    _, chosen = levels.along(line, wanted)
+    if (wanted == ANY).all() and len(complete(line)) > 1:
+        wanted[:] = of_links.network.levels.get(road.id, int(ANY))
+    _, chosen = along(line, wanted)
     rows = np.searchsorted(np.array(heights.numbers), chosen)
     of_point = np.concatenate([np.repeat(rows, m), *[rows] * 3])
     z = heights.z[of_point, np.arange(len(of_point))]
@@ -270,39 +301,34 @@ def _wanted(road: Road, line: Heights) -> tuple[Numbers, Bools, float]:
     return wanted, joined, unknown_m
 
 
-class LinkedLevels:
-    """The levels of roads that have several from end to end, by the roads linked with them.
+class _Linked:
+    """The roads of a file as a network, for levels and heights that other roads decide.
 
-    The file is read for them when the first such road comes.
+    The file is read for it when the first such road comes.
     """
 
     def __init__(self, source: Path, heights: HeightsAt) -> None:
         self._source, self._heights = source, heights
-
-    def get(self, name: str, otherwise: np.int8) -> int:
-        """Return the level of a road; `otherwise` if its links do not say it."""
-        return self._levels.get(name, int(otherwise))
+        self.guessed = set[str]()
 
     @cached_property
-    def _levels(self) -> dict[str, int]:
-        roads = dict[str, road_levels.Ends]()
+    def network(self) -> Network:
+        """The solved network."""
+        network = Network(guessed=self.guessed)
         with xml_text.opened(self._source) as file:
             parts = map(_read, xml_text.parts(file, {"road"}))
             lines = (part for part in parts if isinstance(part, Road))
-            for road, line in with_heights(lines, Road.middle, self._heights):
-                assert line is not None
-                roads[road.id] = _ends(road, line)
-        return road_levels.decided(roads)
-
-
-def _ends(road: Road, line: Heights) -> road_levels.Ends:
-    wanted, _, _ = _wanted(road, line)
-    z, numbers = levels.along(line, wanted)
-    known = {int(numbers[0]): (float(z[0]), float(z[-1]))}
-    if (wanted == ANY).all() and (numbers_of := road_levels.several(line)):
-        rows = {number: line.z[line.numbers.index(number)] for number in numbers_of}
-        known = {number: (float(row[0]), float(row[-1])) for number, row in rows.items()}
-    return road_levels.Ends(known, road_levels.links(road.part.element))
+            for road, found in with_heights(lines, Road.middle_and_line, self._heights):
+                assert found is not None
+                middle, line = found[: len(road.s)], found[len(road.s) :]
+                wanted, joined, _ = _wanted(road, middle)
+                network.note(road.id, road.nodes, middle, wanted)
+                z = of_levels(line, along(middle, wanted)[1])
+                network.note_open(road.nodes, road.s, np.where(joined, np.nan, z))
+                for own, other in road.links:
+                    network.join(own, other)
+        network.decide()
+        return network
 
 
 def _row(
@@ -321,7 +347,7 @@ def _row(
     t_read = np.broadcast_to(road.extent.middle[:, None] if road.extent.level else t, seen.shape)
 
     def missed(profile: Floats, lateral: Floats) -> float:
-        z = value_at(profile, s)[:, None] + t_read * np.tan(value_at(lateral, s))[:, None]
+        z = Profiles(profile, lateral).at(s[:, None], t_read)
         return float(np.abs(z - sections.z)[seen].max(initial=0.0))
 
     lateral = road.superelevation if options.lateral == "none" else across
@@ -340,17 +366,8 @@ def _row(
         grade=float(np.abs(grade).max()),
         crossfall=float(np.abs(crossfall).max()),
         steep=(
-            *_steep(road, "grade", grade, options.grade_limit),
-            *_steep(road, "crossfall", crossfall, options.crossfall_limit),
+            *steepest("grade", np.abs(grade), options.grade_limit, road.x, road.y),
+            *steepest("crossfall", np.abs(crossfall), options.crossfall_limit, road.x, road.y),
         ),
         note=ALL_LEVEL if road.extent.level and options.lateral != "none" else "",
     )
-
-
-def _steep(
-    road: Road, kind: Literal["grade", "crossfall"], values: Floats, limit: float | None
-) -> Iterator[Steep]:
-    """Yield the steepest place of each stretch that is steeper than a limit."""
-    slopes = np.abs(values)
-    for at in steepest(slopes, limit):
-        yield Steep(kind, float(slopes[at]), float(road.x[at]), float(road.y[at]))

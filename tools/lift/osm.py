@@ -18,11 +18,19 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
 from flexroad.tools.lift import xml_text
-from flexroad.tools.lift.batches import POINTS, with_heights
-from flexroad.tools.lift.levels import Numbers, along, level_of, tagged_level
 from flexroad.tools.lift.lines import Line, largest
-from flexroad.tools.lift.meetings import Meetings
-from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options
+from flexroad.tools.lift.network import (
+    ANY,
+    GUESSED,
+    NOWHERE,
+    Network,
+    Node,
+    Numbers,
+    along,
+    level_of,
+    tagged_level,
+)
+from flexroad.tools.lift.types import POINTS, Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
 NOUN = "way"
@@ -44,13 +52,13 @@ def frame(source: Path) -> Frame:
 
 def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Iterator[Lifted]:
     """Copy a file with heights; yield the rows of the report."""
-    network = _Network.read(source, _names(source))
-    network.find_heights(heights)
-    copy = _Added(network, options)
-    streets = [way for way in network.ways if way.row]
-    rows = [copy.row(way, line, found) for way, line, found in network.lines(heights, streets)]
-    if options.flat_ends:
-        network.go_on_level()
+    streets = _Streets.read(source, _names(source))
+    streets.find_heights(heights)
+    copy = _Added(streets, options)
+    named = [way for way in streets.ways if way.row]
+    rows = [copy.row(way, line, found) for way, line, found in streets.lines(heights, named)]
+    if options.beyond == "flat":
+        streets.go_on_level()
     with xml_text.opened(source) as file, xml_text.written(out) as target:
         for text in copy.texts(xml_text.parts(file, {"node", "way"})):
             target.write(text)
@@ -111,7 +119,7 @@ class _Way:
 
 
 @dataclass(frozen=True, eq=False)
-class _Network:
+class _Streets:
     """Nodes in the order of the file, and the ways that have levels or a row of the report."""
 
     ids: NDArray[np.int64]
@@ -126,10 +134,10 @@ class _Network:
     """Whether x and y are degrees; else they are metres."""
     z: Floats
     """New heights of the nodes (m); NaN where they keep those that they had."""
-    meetings: Meetings = field(default_factory=Meetings)
+    network: Network = field(default_factory=Network)
 
     @classmethod
-    def read(cls, source: Path, names: tuple[str, str]) -> _Network:
+    def read(cls, source: Path, names: tuple[str, str]) -> _Streets:
         ids, values = array("q"), array("d")
         ways = list[tuple[str, NDArray[np.int64], int, bool]]()
         with xml_text.opened(source) as file:
@@ -164,9 +172,11 @@ class _Network:
         keeps, meets = np.zeros((2, len(self.ids)), np.bool_)
         some = [way for way in self.ways if way.level or not self.by_tags]
         if not self.by_tags:
-            for way, line, found in self.lines(heights, some):
-                self.meetings.note(line, self._ends(way), found, way.level or None, None)
-            self.meetings.decide()
+            for way, _, found in self.lines(heights, some):
+                if found.several.any():
+                    wanted = np.full(found.z.shape[1], level_of(found, way.level) or ANY, np.int8)
+                    self.network.note(way.id, _ends(way), found, wanted)
+            self.network.decide()
         for way, line, found in self.lines(heights, some):
             z, numbers, known = self.along(way, found)
             raised = (numbers != 0) & np.isfinite(z)
@@ -201,35 +211,30 @@ class _Network:
         east = 111412.84 * np.cos(middle) - 93.5 * np.cos(3 * middle)
         return float(east), float(111132.95 - 559.82 * np.cos(2 * middle) + 1.175 * np.cos(4 * middle))
 
-    def _ends(self, way: _Way) -> tuple[tuple[str], tuple[str]]:
-        return (str(way.nodes[0]),), (str(way.nodes[-1]),)
-
     def along(self, way: _Way, heights: Heights) -> tuple[Floats, Numbers, bool]:
         """Return heights along a way, the numbers of their levels, and whether its level is known."""
         own = level_of(heights, way.level) if way.level else None
+        level, ends = own or 0, NOWHERE
         if own is None and not self.by_tags:
-            first, last = (self.meetings.ends.get(end) for end in self._ends(way))
-            wanted = self.meetings.wanted(heights, first, last)
-        else:
-            wanted = np.full(heights.z.shape[1], own or 0, np.int8)
-        return *along(heights, wanted), own is not None or not way.level
+            level, ends = self.network.levels.get(way.id, int(ANY)), self.network.ends(_ends(way))
+        wanted = np.full(heights.z.shape[1], level, np.int8)
+        return *along(heights, wanted, ends), own is not None or not way.level
 
     def go_on_level(self) -> None:
         """Give nodes beyond the surface the heights of the nearest ones along their ways."""
-        rest = self.ways
-        while rest:
-            left = list[_Way]()
-            for way in rest:
-                nodes = way.nodes[way.nodes >= 0]
-                known = np.isfinite(self.z[nodes])
-                if known.any() and not known.all():
-                    line = self._line(replace(way, nodes=nodes))
-                    at = line.s[line.own]
-                    self.z[nodes[~known]] = np.interp(at[~known], at[known], self.z[nodes[known]])
-                left += [] if known.any() else [way]
-            if len(left) == len(rest):
-                break
-            rest = left
+        network = Network()
+        for way in self.ways:
+            nodes = way.nodes[way.nodes >= 0]
+            if np.isnan(self.z[nodes]).any():
+                line = self._line(replace(way, nodes=nodes))
+                network.open.append((nodes.tolist(), line.s[line.own], self.z[nodes]))
+        network.decide()
+        for node, height in network.beyond.items():
+            self.z[node] = height
+
+
+def _ends(way: _Way) -> tuple[Node, Node]:
+    return int(way.nodes[0]), int(way.nodes[-1])
 
 
 def _find(ids: NDArray[np.int64], order: Indices, refs: NDArray[np.int64]) -> Indices:
@@ -243,15 +248,14 @@ def _find(ids: NDArray[np.int64], order: Indices, refs: NDArray[np.int64]) -> In
 class _Added:
     """What a copy of the file has more than the file."""
 
-    network: _Network
+    streets: _Streets
     options: Options
     segments: dict[tuple[int, int], list[tuple[float, float, float]]] = field(default_factory=dict)
     """New nodes (x, y, height) between two others, by their ids, the lower one first."""
 
     def row(self, way: _Way, line: Line, heights: Heights) -> Lifted:
         """Return the row of a way; note the nodes that it needs."""
-        network = self.network
-        z, numbers, known = network.along(way, heights)
+        z, numbers, known = self.streets.along(way, heights)
         surface = np.isfinite(z)
         if way.level < 0 and not known:
             z = np.full(len(z), np.nan)
@@ -260,7 +264,7 @@ class _Added:
         self._note(way, line, index, z)
         grade, steep = line.grades(z, self.options.grade_limit)
         without = line.length_where(~surface)
-        before = np.where(way.nodes < 0, np.nan, network.before[way.nodes])
+        before = np.where(way.nodes < 0, np.nan, self.streets.before[way.nodes])
         return Lifted(
             way.id,
             length_m=float(line.s[-1]),
@@ -271,6 +275,7 @@ class _Added:
             elevation_m=largest(np.abs(np.interp(line.s, line.s[index], z[index]) - z)),
             grade=grade,
             steep=steep,
+            note=GUESSED if way.id in self.streets.network.guessed else "",
             flags=passed(heights.flags_on(numbers)),
         )
 
@@ -280,7 +285,7 @@ class _Added:
         for i, (a, b) in enumerate(zip(way.nodes[:-1].tolist(), way.nodes[1:].tolist(), strict=True)):
             new = index[(index > ends[i]) & (index < ends[i + 1])]
             if len(new) and a >= 0 and b >= 0:
-                first, last = int(self.network.ids[a]), int(self.network.ids[b])
+                first, last = int(self.streets.ids[a]), int(self.streets.ids[b])
                 new = new if first < last else new[::-1]
                 places = list(zip(*(values[new].tolist() for values in (line.x, line.y, z)), strict=True))
                 self.segments.setdefault((min(first, last), max(first, last)), places)
@@ -292,7 +297,7 @@ class _Added:
             if isinstance(part, bytes):
                 yield part
             elif part.element.tag == "node":
-                yield _with_ele(part, float(self.network.z[number]))
+                yield _with_ele(part, float(self.streets.z[number]))
                 number += 1
             else:
                 if ids and not named:
@@ -303,7 +308,7 @@ class _Added:
 
     def _new_ids(self) -> dict[tuple[int, int], list[int]]:
         """Return the ids of new nodes: below zero and below all others, as of nodes without one in OSM."""
-        next_id = min(int(self.network.ids.min(initial=0)), 0) - 1
+        next_id = min(int(self.streets.ids.min(initial=0)), 0) - 1
         ids = dict[tuple[int, int], list[int]]()
         for segment, places in self.segments.items():
             ids[segment] = [next_id - i for i in range(len(places))]
@@ -311,7 +316,7 @@ class _Added:
         return ids
 
     def _new_nodes(self, ids: dict[tuple[int, int], list[int]]) -> Iterator[bytes]:
-        local = not self.network.geographic
+        local = not self.streets.geographic
         for segment, numbers in ids.items():
             for name, (x, y, z) in zip(numbers, self.segments[segment], strict=True):
                 tags = [("ele", f"{z:.3f}")]

@@ -1,4 +1,4 @@
-"""Profiles of a road of OpenDRIVE from heights beside its reference line: elevation and superelevation.
+"""Profiles of a road of OpenDRIVE, elevation and superelevation: from heights, and in its text.
 
 The elevation is the surface at the reference line. At both ends of a road it has the height and the grade of
 the surface there, so that roads that meet in plan meet in height. The superelevation is the slope of the
@@ -7,15 +7,20 @@ straight line through it that fits the cross-section best.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Literal
 
 import numpy as np
 
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.lift.profile import AHEAD_M, cubic_pieces
+from flexroad.tools.export.profiles import cubic_pieces, straight_lines
+from flexroad.tools.lift.lines import stretches
+from flexroad.tools.lift.network import NOWHERE, Ends, filled
+from flexroad.tools.lift.xml_text import Part
 
+AHEAD_M = 0.05
+"""Distance over which the slope of a surface is taken (m)."""
 NONE = np.zeros((1, 5))
 """A profile without records: it is 0."""
 STEEPEST = 0.5
@@ -24,8 +29,9 @@ LEAST_ACROSS_M = 0.25
 """Points nearer to the reference line do not say how the cross-section falls (m)."""
 BREAK_M = 1e-3
 """Distance behind the ground at which a profile goes on as it was (m)."""
-
-Beyond = Literal["keep", "flat"]
+LATERAL = ("superelevation", "crossfall", "shape", "crossSectionSurface")
+"""The elements of a lateral profile that are replaced."""
+Edit = tuple[int, int, bytes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +85,22 @@ def cross_sections(
     return CrossSections(s, t, z, inside, line, grade, joined)
 
 
-def elevation(sections: CrossSections, old: Floats, beyond: Beyond, tolerance: float) -> Floats | None:
-    """Return the pieces of the elevation, ``(k, 5)``; None if the road has no ground."""
-    return _profile(sections, sections.line, sections.grade, old, beyond, tolerance)
+def elevation(
+    sections: CrossSections, old: Floats, flat: bool, tolerance: float, ends: Ends = NOWHERE
+) -> Floats | None:
+    """Return the pieces of the elevation, ``(k, 5)``; None if the road has no ground.
+
+    - `old`: the pieces that it had, which stay beyond the ground.
+    - `flat`: whether it goes on level there instead, or to ``ends``: heights of the nodes, NaN if not known.
+    """
+    return _profile(sections, sections.line, sections.grade, old, flat, tolerance, ends)
 
 
-def superelevation(sections: CrossSections, old: Floats, beyond: Beyond, tolerance: float) -> Floats | None:
+def superelevation(sections: CrossSections, old: Floats, flat: bool, tolerance: float) -> Floats | None:
     """Return the pieces of the superelevation, ``(k, 5)``, radians; None if the road has no ground."""
-    away = np.where(sections.inside & np.isfinite(sections.z), sections.t, 0.0)
-    weight = (away**2).sum(axis=1)
-    rise = np.where(away != 0, sections.z - sections.line[:, None], 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        slope = (away * rise).sum(axis=1) / weight
+    inside = sections.inside & np.isfinite(sections.z)
+    away = np.where(inside, sections.t, 0.0)
+    _, slope = straight_lines(sections.t, sections.z, inside, sections.line)
     known = np.isfinite(sections.line)
     good = known & np.isfinite(slope) & (np.abs(slope) < STEEPEST)
     good &= np.abs(away).max(axis=1, initial=0.0) >= LEAST_ACROSS_M
@@ -101,17 +111,24 @@ def superelevation(sections: CrossSections, old: Floats, beyond: Beyond, toleran
     elif known.any():
         angle[known] = 0.0
     reach = float(np.abs(sections.t).max(initial=1.0))
-    return _profile(sections, angle, _slopes(s, angle), old, beyond, tolerance / max(reach, 1.0))
+    return _profile(sections, angle, _slopes(s, angle), old, flat, tolerance / max(reach, 1.0))
 
 
 def _profile(
-    sections: CrossSections, values: Floats, slopes: Floats, old: Floats, beyond: Beyond, tolerance: float
+    sections: CrossSections,
+    values: Floats,
+    slopes: Floats,
+    old: Floats,
+    flat: bool,
+    tolerance: float,
+    ends: Ends = NOWHERE,
 ) -> Floats | None:
-    """Return pieces along the whole road: of the surface where it is, else by what `beyond` says."""
+    """Return pieces along the whole road: of the surface where it is, else level or as they were."""
     s, known = sections.s, np.isfinite(values)
     both = known[:-1] & known[1:]
     if not both.any():
         return None
+    whole = filled(s, values, ends)
     parts, start = list[Floats](), 0
     for has, group in groupby(both.tolist()):
         end = start + len(list(group))
@@ -120,13 +137,10 @@ def _profile(
             parts.append(cubic_pieces(s[here], values[here], slopes[here], tolerance))
         else:
             outer = start == 0 or end == len(both)
-            bridged = not outer and (beyond == "flat" or bool(sections.joined[start + 1 : end].all()))
-            if bridged:
-                ends = [start, end]
-                parts.append(cubic_pieces(s[ends], values[ends], slopes[ends], np.inf))
-            elif beyond == "flat":
-                level = values[end if start == 0 else start]
-                parts.append(np.array([[s[start], level, 0.0, 0.0, 0.0]]))
+            if flat or (not outer and bool(sections.joined[start + 1 : end].all())):
+                # Beyond the ground both slopes are 0.
+                at = [start, end]
+                parts.append(cubic_pieces(s[at], whole[at], np.zeros(2) if outer else slopes[at], np.inf))
             else:
                 # The last place with ground still has its height.
                 first = float(s[start]) + (BREAK_M if start else 0.0)
@@ -147,10 +161,78 @@ def _part(pieces: Floats, start: float, end: float) -> Floats:
 
 def _slopes(s: Floats, values: Floats) -> Floats:
     """Return the derivative of values along each stretch without NaN."""
-    slopes, start = np.zeros(len(s)), 0
-    for known, group in groupby(np.isfinite(values).tolist()):
-        end = start + len(list(group))
-        if known and end - start > 1:
+    slopes = np.zeros(len(s))
+    for start, end in stretches(np.isfinite(values)):
+        if end - start > 1:
             slopes[start:end] = np.gradient(values[start:end], s[start:end])
-        start = end
     return slopes
+
+
+def texts(name: str, pieces: Floats) -> list[str]:
+    """Return the elements of cubic pieces, ``(k, 5)``: s, a, b, c, d."""
+    values = (zip("sabcd", row, strict=True) for row in pieces.tolist())
+    texts = (" ".join(f'{key}="{value:.12g}"' for key, value in each) for each in values)
+    return [f"<{name} {text}/>" for text in texts]
+
+
+def with_profiles(road: Part, elevation: Sequence[str], lateral: Sequence[str] | None) -> bytes:
+    """Return the text of a road with the elements of its profiles; missing ones are added in their place.
+
+    - `elevation`, `lateral`: elements in ``elevationProfile`` and in ``lateralProfile``; None leaves the
+      latter as it is.
+    """
+    around, within = _indents(road)
+    edits, added = list[Edit](), ""
+    place = _end(road, "planView")
+    for name, old, new in (
+        ("elevationProfile", ("elevation",), elevation),
+        ("lateralProfile", LATERAL, lateral),
+    ):
+        if new is None:
+            continue
+        body = "".join(within + each for each in new)
+        if road.element.find(name) is not None:
+            if added:
+                edits.append((place, place, added.encode("ascii")))
+            place, added = _end(road, name), ""
+            edits += _replaced(road, name, old, body, around)
+        else:
+            added += f"{around}<{name}>{body}{around}</{name}>"
+    if added:
+        edits.append((place, place, added.encode("ascii")))
+    return road.replaced(edits)
+
+
+def _end(road: Part, name: str) -> int:
+    """Return where the last element of a name ends."""
+    return road.spans[road.element.findall(name)[-1]][1]
+
+
+def _replaced(road: Part, name: str, old: Sequence[str], body: str, around: str) -> list[Edit]:
+    """Return the edits that replace some children of an element by others; the new ones come first."""
+    element = road.element.find(name)
+    assert element is not None
+    place = road.inside(element)
+    if place is None:
+        start, end = road.start_tag(element)
+        head = road.text[start:end].removesuffix(b"/>").rstrip()
+        return [(start, end, head + f">{body}{around}</{name}>".encode("ascii"))] if body else []
+    edits = [(place[0], place[0], body.encode("ascii"))]
+    for child in element:
+        if child.tag in old:
+            start, end = road.spans[child]
+            blank = len(road.text[place[0] : start]) - len(road.text[place[0] : start].rstrip())
+            edits.append((start - blank, end, b""))
+    return edits
+
+
+def _indents(road: Part) -> tuple[str, str]:
+    """Return the white space before the children of a road and before theirs; empty if it has no lines."""
+    plan = road.element.find("planView")
+    assert plan is not None
+    found = []
+    for element in (plan, plan[0]):
+        before = road.text[: road.spans[element][0]]
+        blank = before[len(before.rstrip()) :]
+        found.append(blank[blank.rfind(b"\n") :].decode("ascii") if b"\n" in blank else "")
+    return found[0], found[1]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from flexroad.catalog.text import shown
 from flexroad.pipeline.run.points import Heights
@@ -16,11 +19,19 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
 from flexroad.tools.lift import xml_text
-from flexroad.tools.lift.batches import with_heights
-from flexroad.tools.lift.levels import ANY, Numbers, along, level_of, tagged_level
 from flexroad.tools.lift.lines import STEP_M, Line, largest
-from flexroad.tools.lift.meetings import Meetings
-from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options
+from flexroad.tools.lift.network import (
+    ANY,
+    GUESSED,
+    Network,
+    Numbers,
+    along,
+    filled,
+    level_of,
+    of_levels,
+    tagged_level,
+)
+from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
 NOUN = "edge"
@@ -29,6 +40,8 @@ STEPS = False
 """Whether heights have the steps beside roads."""
 NO_PROJECTION = ("", "!", "-", ".")
 """Values of ``projParameter`` of networks without a CRS."""
+FAR_M = 1e12
+"""A coordinate that is beyond all others."""
 DIGITS = 3
 """Decimal places of heights, and at least of the vertices that are added."""
 
@@ -50,11 +63,11 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
     A second copy follows if the first one has met roads above roads or the limit of the surface: what a line
     has there depends on those that it meets.
     """
-    network = _Network.read(source)
-    copy = _Copy(network, Meetings(), heights, options)
+    network = Network()
+    copy = _Copy(_places(source), network, heights, options)
     rows = list(copy.written(source, out))
-    if copy.meetings.lines or (options.flat_ends and copy.meetings.open):
-        copy.meetings.decide()
+    if network.lines or network.open:
+        network.decide()
         rows = list(replace(copy, decided=True).written(source, out))
     yield from rows
 
@@ -129,42 +142,25 @@ class _Piece:
         return np.concatenate(x), np.concatenate(y)
 
 
-@dataclass(frozen=True, eq=False)
-class _Network:
-    """What is read of a network before it is copied."""
+def _places(source: Path) -> dict[str, str]:
+    """Return ``x,y`` of each junction, as the file has it."""
+    places = dict[str, str]()
+    with xml_text.opened(source) as file:
+        for part in xml_text.parts(file, {"junction"}):
+            if isinstance(part, Part) and part.element.get("type") != "internal":
+                x, y = (part.element.get(name, "") for name in "xy")
+                places[part.element.get("id", "")] = f"{x},{y}"
+    return places
 
-    places: dict[str, str]
-    """``x,y`` of each junction, as the file has it."""
 
-    @classmethod
-    def read(cls, source: Path) -> _Network:
-        places = dict[str, str]()
-        with xml_text.opened(source) as file:
-            for part in xml_text.parts(file, {"junction"}):
-                if isinstance(part, Part) and part.element.get("type") != "internal":
-                    x, y = (part.element.get(name, "") for name in "xy")
-                    places[part.element.get("id", "")] = f"{x},{y}"
-        return cls(places)
-
-    def piece(self, part: bytes | Part) -> bytes | _Piece:
-        """Return an edge or junction with its shapes, all other text as it is."""
-        if isinstance(part, bytes):
-            return part
-        if part.path != ("net",):
-            return part.text
-        shapes = self._of_edge(part.element) if part.element.tag == "edge" else _of_junction(part.element)
-        return _Piece(part, tuple(shape for shape in shapes if shape is not None))
-
-    def _of_edge(self, edge: ET.Element) -> Iterator[_Shape | None]:
-        area = edge.get("function") == "walkingarea"
-        for lane in edge.findall("lane"):
-            yield _Shape.of(lane, "shape", lane.get("shape", ""), area)
-            yield _Shape.of(lane, "outlineShape", lane.get("outlineShape", ""), True)
-        ends = [self.places.get(edge.get(name, "")) for name in ("from", "to")]
-        # An edge without a shape is straight, from junction to junction.
-        yield _Shape.of(
-            edge, "shape", edge.get("shape") or ("" if None in ends else " ".join(map(str, ends)))
-        )
+def _of_edge(edge: ET.Element, places: Mapping[str, str]) -> Iterator[_Shape | None]:
+    area = edge.get("function") == "walkingarea"
+    for lane in edge.findall("lane"):
+        yield _Shape.of(lane, "shape", lane.get("shape", ""), area)
+        yield _Shape.of(lane, "outlineShape", lane.get("outlineShape", ""), True)
+    ends = [places.get(edge.get(name, "")) for name in ("from", "to")]
+    # An edge without a shape is straight, from junction to junction.
+    yield _Shape.of(edge, "shape", edge.get("shape") or ("" if None in ends else " ".join(map(str, ends))))
 
 
 def _of_junction(junction: ET.Element) -> Iterator[_Shape | None]:
@@ -189,8 +185,9 @@ def _offset(location: ET.Element) -> tuple[float, float, float]:
 class _Copy:
     """A copy of a network with heights."""
 
-    network: _Network
-    meetings: Meetings
+    places: Mapping[str, str]
+    """Where the junctions are."""
+    network: Network
     heights: HeightsAt
     options: Options
     decided: bool = False
@@ -199,7 +196,7 @@ class _Copy:
     def written(self, source: Path, out: Path) -> Iterator[Lifted]:
         """Write the copy; yield the rows of the report."""
         with xml_text.opened(source) as file, xml_text.written(out) as copy:
-            pieces = map(self.network.piece, xml_text.parts(file, {"edge", "junction"}))
+            pieces = map(self._piece, xml_text.parts(file, {"edge", "junction"}))
             found = with_heights(
                 pieces, lambda each: None if isinstance(each, bytes) else each.points, self.heights
             )
@@ -212,6 +209,16 @@ class _Copy:
                 copy.write(text)
                 if row is not None:
                     yield row
+
+    def _piece(self, part: bytes | Part) -> bytes | _Piece:
+        """Return an edge or junction with its shapes, all other text as it is."""
+        if isinstance(part, bytes):
+            return part
+        if part.path != ("net",):
+            return part.text
+        element = part.element
+        shapes = _of_edge(element, self.places) if element.tag == "edge" else _of_junction(element)
+        return _Piece(part, tuple(shape for shape in shapes if shape is not None))
 
     def _lifted(self, piece: _Piece, heights: Heights) -> tuple[bytes, Lifted | None]:
         """Return an edge or junction with heights, and the row of an edge."""
@@ -228,10 +235,10 @@ class _Copy:
                 # A tunnel whose level is not known meets other roads at its ends alone.
                 z[1:-1] = np.nan
             start, taken = end, z
-            if self.options.flat_ends and self.decided:
-                z = self.meetings.going_on(shape.line, None if shape.area else shape.ends, z)
-            elif self.options.flat_ends and not shape.area:
-                self.meetings.note_open(shape.ends, z)
+            if self.options.beyond == "flat" and self.decided:
+                z = self._going_on(shape, z)
+            elif self.options.beyond == "flat" and not shape.area and np.isnan(z).any():
+                self.network.note_open(shape.ends, shape.line.s, z)
             index = shape.line.needed(z, self.options.tolerance_m, self.options.add_vertices is not False)
             self._edit(shape, index, z, edits)
             if shape.element.tag == "lane" and not shape.area:
@@ -242,35 +249,53 @@ class _Copy:
         text = piece.part.replaced(edited)
         if not lanes or element.get("function"):
             return text, None
-        return text, _joined(element.get("id", ""), lanes, unknown=bool(level) and own is None)
+        name = element.get("id", "")
+        note = GUESSED if name in self.network.guessed else ""
+        return text, _joined(name, lanes, bool(level) and own is None, note)
 
     def _heights(
         self, element: ET.Element, shape: _Shape, heights: Heights, own: int | None
     ) -> tuple[Floats, Numbers]:
         """Return the heights of the points of a shape, and the numbers of their levels."""
-        size, ends = len(shape.line.s), shape.ends
+        size, name, network = len(shape.line.s), element.get("id", ""), self.network
         junctions = (element.get("from", ""), element.get("to", "")) if "from" in element.attrib else None
         if shape.area:
-            name = element.get("id", "")
             # Edges within a junction are named ":JUNCTION_NUMBER".
             junction = name[1:].rpartition("_")[0] if name.startswith(":") else name
-            wanted = np.full(size, self.meetings.level(junction), np.int8)
+            wanted = np.full(size, network.level(junction), np.int8)
             z, numbers = along(heights, wanted)
             _complete(shape.line, z, numbers, wanted)
         elif self.decided:
-            known = self.meetings.ends
-            first, last = known.get(ends[0]), known.get(ends[1])
+            ends = network.ends(shape.ends)
             if shape.element is element and junctions:
-                first, last = map(self.meetings.level, junctions)
-            wanted = self.meetings.wanted(heights, first, last)
-            if own is not None:
-                wanted[1:-1] = own
-            z, numbers = along(heights, wanted)
+                own_levels = np.array([network.level(each) for each in junctions], np.int8)
+                first, last = of_levels(heights[np.array([0, -1])], own_levels).tolist()
+                ends = first, last
+            level = network.levels.get(name, ANY) if own is None else own
+            z, numbers = along(heights, np.full(size, level, np.int8), ends)
         else:
-            if shape.element is not element:
-                self.meetings.note(shape.line, ends, heights, own, junctions)
-            z, numbers = along(heights, np.full(size, ANY if own is None else own, np.int8))
+            wanted = np.full(size, ANY if own is None else own, np.int8)
+            if shape.element is not element and heights.several.any():
+                network.note(name, shape.ends, heights, wanted, junctions)
+            z, numbers = along(heights, wanted)
         return z, numbers
+
+    def _going_on(self, shape: _Shape, z: Floats) -> Floats:
+        """Return the heights of a shape that goes on level beyond the surface."""
+        if not shape.area:
+            return filled(shape.line.s, z, self.network.ends(shape.ends, beyond=True))
+        places = np.column_stack([shape.line.x, shape.line.y])
+        open_ = np.isnan(z) & np.isfinite(places).all(axis=1)
+        if open_.any() and self.network.beyond:
+            z = z.copy()
+            z[open_] = np.array(list(self.network.beyond.values()))[self._nearest.query(places[open_])[1]]
+        return z
+
+    @cached_property
+    def _nearest(self) -> cKDTree:
+        """The places of nodes beyond the surface."""
+        places = np.array([[float(number) for number in node] for node in self.network.beyond])
+        return cKDTree(np.where(np.isfinite(places), places, FAR_M))
 
     def _edit(
         self, shape: _Shape, index: NDArray[np.intp], z: Floats, edits: dict[ET.Element, dict[str, str]]
@@ -307,27 +332,16 @@ def _complete(line: Line, z: Floats, numbers: Numbers, wanted: Numbers) -> None:
         z[i] = z[on[np.argmin(np.hypot(line.x[on] - line.x[i], line.y[on] - line.y[i]))]]
 
 
-def _joined(name: str, lanes: list[Lifted], unknown: bool) -> Lifted:
+def _joined(name: str, lanes: list[Lifted], unknown: bool, note: str) -> Lifted:
     """Return the row of an edge: of each figure, the largest one of its lanes."""
-    length, without, before, off, grade = (
-        largest(np.array(values))
-        for values in zip(
-            *(
-                (each.length_m, each.without_ground_m, each.before_m, each.elevation_m, each.grade)
-                for each in lanes
-            ),
-            strict=True,
-        )
-    )
+    names = ("length_m", "without_ground_m", "before_m", "elevation_m", "grade")
+    most: dict[str, Any] = {each: largest([getattr(lane, each) for lane in lanes]) for each in names}
     return Lifted(
         name,
-        length_m=length,
-        without_ground_m=without,
+        **most,
         levels=tuple(sorted({number for lane in lanes for number in lane.levels})),
-        unknown_deck_m=length - without if unknown else 0.0,
-        before_m=before,
-        elevation_m=off,
-        grade=grade,
+        unknown_deck_m=most["length_m"] - most["without_ground_m"] if unknown else 0.0,
         steep=tuple(place for lane in lanes for place in lane.steep),
+        note=note,
         flags=passed(np.array([lane.flags for lane in lanes], np.uint16)),
     )

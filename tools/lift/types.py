@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.pipeline.config.options import METHOD, OUTPUTS, option
 from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.types import Floats
 
 HeightsAt = Callable[[Floats, Floats], Heights]
 """Heights at x and y, ``(n,)`` each, in the coordinates of the file."""
+POINTS = 500_000
+"""Number of points of a batch: some 200 MB with their heights and what they belong to."""
+T = TypeVar("T")
 
 
 class RunSurface(Protocol):
@@ -56,22 +60,34 @@ class Frame:
 class Options:
     """How files get their heights."""
 
-    tolerance_m: float = 0.005
-    """Largest distance of a profile, or of a line between its vertices, from the surface (m)."""
-    lateral: Literal["superelevation", "none"] = "superelevation"
-    """What OpenDRIVE's roads have across."""
-    flat_ends: bool = False
-    """Whether a road without ground beneath goes on level; else it keeps the heights that it had."""
-    add_vertices: bool | None = None
-    """Whether lines get vertices where they leave the surface by more than the tolerance; None: as the format
-    does by default."""
-    columns: bool = False
-    """Whether features get the columns ``grade_max_percent``, ``crossfall_max_percent`` and
-    ``error_estimate_m``."""
-    grade_limit: float | None = None
-    """Places with a steeper grade are listed (m/m)."""
-    crossfall_limit: float | None = None
-    """Places with a steeper crossfall are listed (m/m)."""
+    tolerance_m: float = option(
+        0.005, METHOD, "Largest distance of profiles and lines from the surface (m).", "METRES", min=0.0001
+    )
+    lateral: Literal["superelevation", "none"] = option(
+        "superelevation", METHOD, "What roads of OpenDRIVE have across."
+    )
+    beyond: Literal["keep", "flat"] = option(
+        "keep", METHOD, "Heights where the run has no surface: as they are, or level from there on."
+    )
+    add_vertices: bool | None = option(
+        None,
+        METHOD,
+        "Add vertices where lines leave the surface; default: yes, but not to OSM files.",
+        name="vertices/--no-vertices",
+    )
+    columns: bool = option(
+        False,
+        OUTPUTS,
+        "Add the columns grade_max_percent, crossfall_max_percent and error_estimate_m to features.",
+    )
+    grade_limit: float | None = option(
+        None, OUTPUTS, "Write places with a steeper grade as points beside the report.", "PERCENT", min=0
+    )
+    """In m/m; the command takes percent."""
+    crossfall_limit: float | None = option(
+        None, OUTPUTS, "Write places with a steeper crossfall as points beside the report.", "PERCENT", min=0
+    )
+    """In m/m; the command takes percent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +136,39 @@ class Lifted:
     flags: int = 0
     """Flags of the surface that it passes (`tasks.quality.flagged.flag_names`)."""
 
-    def noted(self, note: str) -> Lifted:
-        """Return the row with a note."""
-        return replace(self, note=note)
+
+def with_heights(
+    parts: Iterable[T], points: Callable[[T], tuple[Floats, Floats] | None], heights: HeightsAt
+) -> Iterator[tuple[T, Heights | None]]:
+    """Yield each part, in its order, with the heights of its points: a run reads each tile once per batch.
+
+    - `points`: returns x and y of the points of a part, ``(n,)`` each; None if it needs no heights.
+    - `heights`: heights of a run.
+    """
+    batch, size = list[tuple[T, tuple[Floats, Floats] | None]](), 0
+    for part in parts:
+        batch.append((part, points(part)))
+        own = batch[-1][1]
+        size += 1 if own is None else 1 + len(own[0])
+        if size >= POINTS:
+            yield from _answered(batch, heights)
+            batch, size = [], 0
+    yield from _answered(batch, heights)
+
+
+def _answered(
+    batch: list[tuple[T, tuple[Floats, Floats] | None]], heights: HeightsAt
+) -> Iterator[tuple[T, Heights | None]]:
+    asked = [own for _, own in batch if own is not None]
+    if not asked:
+        yield from ((part, None) for part, _ in batch)
+        return
+    x, y = (np.concatenate(values) for values in zip(*asked, strict=True))
+    found, start = heights(x, y), 0
+    for part, own in batch:
+        if own is None:
+            yield part, None
+        else:
+            end = start + len(own[0])
+            yield part, found[start:end]
+            start = end

@@ -81,7 +81,7 @@ def read(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         module.frame(path)
-        options = Options(flat_ends=True, add_vertices=True)
+        options = Options(beyond="flat", add_vertices=True)
         list(module.lift(path, out, heights, options))
     # Nodes are added to OSM files.
     assert _count(path) <= _count(out)

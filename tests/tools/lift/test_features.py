@@ -8,7 +8,7 @@ from shapely import LineString, Point, Polygon
 from flexroad.pipeline.run.points import Heights
 from flexroad.tools.lift import features
 from flexroad.tools.lift.features import Feature, grades, level_columns, lifted, wanted_levels
-from flexroad.tools.lift.levels import ANY
+from flexroad.tools.lift.network import ANY
 from flexroad.tools.lift.shapes import of_wkb, to_wkb
 from flexroad.tools.lift.types import Options
 

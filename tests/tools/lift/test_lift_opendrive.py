@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flexroad.tools.lift import plan_view
-from flexroad.tools.lift.lanes import extent
+from flexroad.tools.lift.plan_view import extent
 from tests import validators
 from tests.read_opendrive import polynomial, quality_issues
 from tests.tools.lift.test_opendrive import LINE, lifted, places, road, write

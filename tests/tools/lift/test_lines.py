@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from flexroad.tools.lift.lines import Line
+from flexroad.tools.lift.lines import Line, vertices
 
 X, Y = np.array([0.0, 30, 30]), np.array([0.0, 0, 40])
 
@@ -69,3 +71,20 @@ def test_a_line_with_wrong_coordinates_has_a_bounded_number_of_points():
     line = Line.of(np.array([0, 1e308, 5.0, 6.0, 1e12]), np.zeros(5))
     assert line.own.sum() == 5
     assert len(line.x) <= 1_000_010
+
+
+@given(st.integers(0, 10**6), st.integers(2, 60), st.floats(0.01, 1))
+def test_any_line_stays_within_the_tolerance_with_the_points_that_it_had(seed, number, tolerance):
+    rng = np.random.default_rng(seed)
+    s, z = np.cumsum(rng.random(number)), np.cumsum(rng.normal(0, 0.2, number))
+    kept = rng.random(number) < 0.1
+    kept[[0, -1]] = True
+    chosen = vertices(s, z, kept, tolerance)
+    assert set(np.flatnonzero(kept)) <= set(chosen.tolist())
+    assert np.abs(np.interp(s, s[chosen], z[chosen]) - z).max() <= tolerance + 1e-9
+
+
+def test_a_straight_line_needs_no_vertex_between_those_that_it_had():
+    s = np.arange(50.0)
+    kept = np.isin(s, [0, 20, 49])
+    assert vertices(s, 5 + 0.1 * s, kept, 1e-6).tolist() == [0, 20, 49]

@@ -1,6 +1,7 @@
 """Roads of OpenDRIVE on surfaces of known heights, read back literally."""
 
 import gzip
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -9,7 +10,8 @@ import pytest
 
 from flexroad.pipeline.run.points import Heights
 from flexroad.tools.lift import opendrive, plan_view
-from flexroad.tools.lift.lanes import extent
+from flexroad.tools.lift.plan_view import extent
+from flexroad.tools.lift.road_profiles import cross_sections
 from flexroad.tools.lift.types import Frame, Lifted, Options
 from tests.read_opendrive import place, polynomial
 
@@ -233,7 +235,7 @@ def test_without_ground_a_road_goes_on_level_if_asked(tmp_path):
     def inner(x, y):
         return np.where((x > 20.5) & (x < 50.5), plane(x, y), np.nan)
 
-    root, (row,) = lifted(write(tmp_path, road()), inner, flat_ends=True)
+    root, (row,) = lifted(write(tmp_path, road()), inner, beyond="flat")
     first = root.find("road")
     for s, z in ((0.0, plane(21, 20)), (11.0, plane(21, 20)), (25, plane(35, 20)), (60, plane(50, 20))):
         assert polynomial(first, "elevationProfile/elevation", s) == pytest.approx(z)
@@ -333,11 +335,57 @@ def test_a_road_with_several_levels_goes_on_where_its_links_do(tmp_path, order):
     root, rows = lifted(write(tmp_path, *roads[::order]), covered)
     levels = {row.id: row.levels for row in rows}
     assert levels == {"1": (0,), "2": (0,), "3": (0,), "4": (1,)}
+    assert [row.id for row in rows if "nothing that it meets says which" in row.note] == ["4"]
     heights = {
         each.get("id"): polynomial(each, "elevationProfile/elevation", 6) for each in root.iter("road")
     }
     assert heights["3"] == pytest.approx(plane(38, 20))
     assert heights["4"] == pytest.approx(plane(66, 20) + 6)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_roads_beyond_the_surface_go_on_level_as_those_that_they_are_linked_with(tmp_path, order):
+    """Of five roads in line, the first and the last leave the surface; they differ by 2.5 m."""
+
+    def ends(x, y):
+        return np.where(np.abs(x - 38) > 24.5, 100 + 0.05 * x, np.nan)
+
+    roads = [
+        linked("1", 8, 0, after="2"),
+        linked("2", 20, 0, before="1", after="3"),
+        linked("3", 32, 0, before="2", after="4"),
+        linked("4", 44, 0, before="3", after="5"),
+        linked("5", 56, 0, before="4"),
+    ]
+    root, rows = lifted(write(tmp_path, *roads[::order]), ends, beyond="flat")
+    z = {
+        each.get("id"): [polynomial(each, "elevationProfile/elevation", s) for s in (0, 6, 12)]
+        for each in root.iter("road")
+    }
+    # The surface ends at x = 13, and begins again at x = 63.
+    assert z["1"] == pytest.approx([100.4, 100.65, 100.65])
+    assert z["5"][:2] == pytest.approx([103.15, 103.15])
+    for a, b in pairwise("12345"):
+        assert z[a][2] == pytest.approx(z[b][0])
+    assert sorted(row.without_ground_m for row in rows) == pytest.approx([7, 7, 12, 12, 12])
+
+
+def test_a_tunnel_in_two_roads_does_not_climb_the_hill(tmp_path):
+    def hill(x, y):
+        return plane(x, y) + np.where((x > 14.5) & (x < 25.5), 9.0, 0.0)
+
+    ends = ((6.0, 6.0), (0.0, 6.0))
+    roads = (linked("1", 8, 0, after="2"), linked("2", 20, 0, before="1"))
+    tunnels = [
+        each.replace("</lanes>", f"</lanes>{structure('tunnel', *end)}")
+        for each, end in zip(roads, ends, strict=True)
+    ]
+    root, _ = lifted(write(tmp_path, *tunnels), hill, beyond="flat")
+    first, second = (
+        [polynomial(each, "elevationProfile/elevation", s) for s in (0, 12)] for each in root.iter("road")
+    )
+    assert first[1] == pytest.approx(second[0])
+    assert max(*first, *second) < 101.6
 
 
 LANE = '<lane id="{0}" type="driving"><width sOffset="0" a="{1}" b="{2}" c="0" d="0"/></lane>'
@@ -446,3 +494,13 @@ def test_places_that_are_no_numbers_leave_the_road(tmp_path):
     _, (bad, good) = lifted(write(tmp_path, road(huge, name="8"), road()), plane)
     assert "places that are no numbers" in bad.note
     assert good.note == ""
+
+
+def test_a_single_place_with_ground_is_no_part_of_a_profile():
+    on = np.array([100.0, 100.1, np.nan, 100.3, np.nan, np.nan, 100.6, 100.7, np.nan, 100.9])
+    s, t = np.arange(10.0), np.array([-2.0, 0.0, 2.0])
+    z = np.broadcast_to(on[:, None], (10, 3))
+    found = cross_sections(s, t, z, (on, on, on), np.ones((10, 3), np.bool_), np.zeros(10, np.bool_))
+    np.testing.assert_array_equal(
+        found.line, [100.0, 100.1, np.nan, np.nan, np.nan, np.nan, 100.6, 100.7, np.nan, np.nan]
+    )

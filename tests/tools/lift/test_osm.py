@@ -145,7 +145,7 @@ def test_nodes_are_added_where_asked_to_all_ways_of_a_segment(lifted):
 
 @pytest.mark.parametrize("ends", [False, True])
 def test_nodes_beyond_the_surface_keep_what_they_had_or_go_on_level(lifted, ends):
-    copy, rows = lifted(over(plane, lambda x, y: y < 20), options=Options(flat_ends=ends))
+    copy, rows = lifted(over(plane, lambda x, y: y < 20), options=Options(beyond="flat" if ends else "keep"))
     found = nodes(copy)
     assert found[3][2] == (found[2][2] if ends else 90)
     assert -6 not in found

@@ -197,7 +197,9 @@ def test_a_network_without_projection_names_no_crs(tmp_path, crs):
 @pytest.mark.parametrize("ends", [False, True])
 def test_beyond_the_surface_lines_keep_what_they_had_or_go_on_level(lifted, ends):
     text = NET.replace("95.00,30.00", "95.00,30.00,7.5")
-    copy, rows = lifted(over(plane, lambda x, y: x - 500000 <= 70), text, options=Options(flat_ends=ends))
+    copy, rows = lifted(
+        over(plane, lambda x, y: x - 500000 <= 70), text, options=Options(beyond="flat" if ends else "keep")
+    )
     shape = re.search(r'"bc_0".*shape="(.*?)"', copy)[1].split()
     x, y = np.array([vertex.split(",")[:2] for vertex in shape], float).T
     assert 69 < x[1] <= 70
@@ -311,6 +313,33 @@ def test_edges_on_a_deck_and_below_it_go_on_as_those_that_they_meet(lifted, para
         assert f'z="{place:.3f}"' in re.search(rf'<junction id="{name}".*', copy)[0]
         found = points(copy, f'junction id="{name}"')
         np.testing.assert_allclose(found[:, 2], 94 if name == "u" else 100 + 0.02 * found[:, 0], atol=6e-4)
+
+
+def rough_deck(x, y):
+    """The crossing with a deck that is rougher than the ground where both have one height."""
+    found = crossing(x, y)
+    return Heights((0, 1), found.z + [[0.0], [0.01]] * np.sin(3 * x))
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_lanes_from_abutment_to_abutment_are_on_their_deck(lifted, order):
+    edges = [
+        lane("ap", 'from="a" to="p"', "0,30 40.2,30", "0,31 40.2,31"),
+        lane("pq", 'from="p" to="q"', "40.2,30 59.8,30", "40.2,31 59.8,31"),
+        lane("qb", 'from="q" to="b"', "59.8,30 100,30", "59.8,31 100,31"),
+    ]
+    copy, rows = lifted(rough_deck, HEAD.format(z="", crs="!") + "".join(edges[::order]) + "</net>")
+    found = points(copy)
+    np.testing.assert_allclose(found[:, 2], 100 + 0.02 * found[:, 0], atol=0.016)
+    assert rows["pq"].levels in ((1,), (0, 1))
+    assert {row.note for row in rows.values()} == {""}
+
+
+def test_an_edge_whose_level_nothing_says_is_named(lifted):
+    text = HEAD.format(z="", crs="!") + lane("pq", 'from="p" to="q"', "45,30 55,30") + "</net>"
+    copy, rows = lifted(crossing, text)
+    np.testing.assert_allclose(points(copy)[:, 2], [100.9, 101.1], atol=6e-4)
+    assert "nothing that it meets says which" in rows["pq"].note
 
 
 def test_a_bridge_without_its_level_is_told_and_a_tunnel_keeps_what_it_had(lifted):

@@ -1,8 +1,14 @@
-"""Profiles along roads: cubic pieces of OpenDRIVE, and vertices of lines, as few as a tolerance allows."""
+"""Profiles along roads: elevation and superelevation as cubic pieces of OpenDRIVE, within a tolerance.
+
+Each cross-section of a road becomes a straight line: its height on the reference line, and its slope. Along
+the road both become cubic pieces, which go on from piece to piece with one value and one slope. What a road
+has beside that (crown, ruts, kerbs, bumps) is missed.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,16 +16,51 @@ from numpy.typing import NDArray
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats
 
-AHEAD_M = 0.05
-"""Distance over which the slope of a surface is taken (m)."""
+
+@dataclass(frozen=True, eq=False)
+class Profiles:
+    """Cubic pieces over the length of a road, ``(k, 5)``: s, a, b, c, d as OpenDRIVE has them."""
+
+    elevation: Floats
+    """Height on the line (m)."""
+    superelevation: Floats
+    """Slope across the road (radians), positive where the left side is higher."""
+
+    def at(self, s: Floats, t: Floats) -> Floats:
+        """Return heights at distances along the road and from its reference line."""
+        return value_at(self.elevation, s) + t * np.tan(value_at(self.superelevation, s))
+
+
+def straight_lines(
+    t: Floats, z: Floats, inside: Bools, through: Floats | None = None
+) -> tuple[Floats, Floats]:
+    """Return height at t = 0 and slope of the straight line that fits each cross-section best, ``(n,)`` each.
+
+    NaN where a cross-section has too few points.
+
+    - `t` ``(m,)``: distances from the reference line (m).
+    - `z` ``(n, m)``: heights (m).
+    - `inside` ``(n, m)``: the points that count; their heights are known.
+    - `through` ``(n,)``: heights at t = 0 that the lines have; None: those of the best lines.
+    """
+    known = np.where(inside, z, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if through is None:
+            number = inside.sum(axis=1)
+            middle, height = (inside * t).sum(axis=1) / number, known.sum(axis=1) / number
+        else:
+            middle, height = np.zeros(len(z)), through
+        away = np.where(inside, t - middle[:, None], 0.0)
+        rise = np.where(away != 0, known - height[:, None], 0.0)
+        slope = (away * rise).sum(axis=1) / (away**2).sum(axis=1)
+    return height - slope * middle, slope
 
 
 def cubic_pieces(s: Floats, z: Floats, slope: Floats, tolerance: float) -> Floats:
     """Return the cubic pieces of a profile, ``(k, 5)``: s, a, b, c, d as OpenDRIVE has them.
 
-    They have the values and slopes of the profile at the ends of the pieces, so that value and slope go on
-    from piece to piece, and profiles that meet with one value and slope meet exactly. Each piece is as long
-    as the tolerance allows.
+    They have the values and slopes of the profile at the ends of the pieces, so that profiles that meet with
+    one value and slope meet exactly. Each piece is as long as the tolerance allows.
 
     - `s` ``(n,)``: distances along the road, ascending (m); at least two.
     - `z`, `slope` ``(n,)``: values of the profile there, and their derivatives by s.
@@ -37,19 +78,9 @@ def cubic_pieces(s: Floats, z: Floats, slope: Floats, tolerance: float) -> Float
 def value_at(pieces: Floats, s: Floats) -> Floats:
     """Return the values of cubic pieces, ``(k, 5)``, at distances s."""
     at = np.maximum(np.searchsorted(pieces[:, 0], s, side="right") - 1, 0)
-    start, a, b, c, d = pieces[at].T
+    start, a, b, c, d = np.moveaxis(pieces[at], -1, 0)
     along = s - start
     return np.asarray(a + along * (b + along * (c + along * d)))
-
-
-def vertices(s: Floats, z: Floats, kept: Bools, tolerance: float) -> NDArray[np.intp]:
-    """Return the indices of the points that a line needs so that it stays within a tolerance.
-
-    - `s`, `z` ``(n,)``: distances along the line and heights (m).
-    - `kept` ``(n,)``: the points that the line has in any case; the first and last one are.
-    - `tolerance`: largest distance of the line from the heights of the points that it does not have (m).
-    """
-    return _vertices(s, z, kept, tolerance)
 
 
 @compiled()
@@ -87,28 +118,3 @@ def _cubic_fits(s: Floats, z: Floats, slope: Floats, a: int, b: int, tolerance: 
         if not math.fabs(z[a] + along * (slope[a] + along * (c + along * d)) - z[i]) <= tolerance:
             return False
     return True
-
-
-@compiled()
-def _vertices(s: Floats, z: Floats, kept: Bools, tolerance: float) -> NDArray[np.intp]:
-    chosen, start, last = [0], 0, len(s) - 1
-    while start < last:
-        end = start + 1
-        # Slopes from the start with which the line stays within the tolerance of all points passed.
-        low, high = -np.inf, np.inf
-        while True:
-            away = s[end] - s[start]
-            rise = z[end] - z[start]
-            if kept[end] or end == last:
-                if away > 0 and not low <= rise / away <= high and end - 1 > start:
-                    end -= 1
-                break
-            if away > 0:
-                if not low <= rise / away <= high and end - 1 > start:
-                    end -= 1
-                    break
-                low, high = max(low, (rise - tolerance) / away), min(high, (rise + tolerance) / away)
-            end += 1
-        chosen.append(end)
-        start = end
-    return np.array(chosen)

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from flexroad.tasks.roads.routes import CentreLine, Route
-from flexroad.tools.export.along_line import HeightGrid, Profiles, height_grid, profile_error, profiles
+from flexroad.tools.export.along_line import HeightGrid, height_grid, profile_error, profiles
+from flexroad.tools.export.profiles import Profiles, cubic_pieces, value_at
 from flexroad.tools.export.reference_line import Options as LineOptions
 from flexroad.tools.export.reference_line import ReferenceLine, reference_line
 
@@ -34,21 +35,21 @@ def fitted(heights: HeightGrid) -> tuple[Profiles, float]:
 def test_profiles_cubic_road_is_found(length):
     result, worst = fitted(grid(hill, length))
     s = np.linspace(0, length, 37)
-    np.testing.assert_allclose(result.elevation(s), hill(s, 0 * s), atol=1e-6)
-    np.testing.assert_allclose(result.superelevation(s), 0.02 + 2e-4 * s, atol=1e-6)
+    np.testing.assert_allclose(value_at(result.elevation, s), hill(s, 0 * s), atol=1e-6)
+    np.testing.assert_allclose(value_at(result.superelevation, s), 0.02 + 2e-4 * s, atol=1e-6)
     assert worst < 1e-6
 
 
 def test_profiles_left_side_higher_is_positive():
     result, _ = fitted(grid(lambda x, y: 0.1 * y))
-    assert result.superelevation(50.0) == pytest.approx(np.arctan(0.1))
+    assert value_at(result.superelevation, 50.0) == pytest.approx(np.arctan(0.1))
 
 
 def test_profiles_verge_does_not_count():
     # A kerb of 0.3 m from 3 m on, where the carriageway ends; the grid reaches 4 m.
     result, worst = fitted(grid(lambda x, y: hill(x, y) + 0.3 * (np.abs(y) > 3.01)))
     assert worst < 1e-6
-    assert result.elevation(60.0) == pytest.approx(hill(60.0, 0.0), abs=1e-6)
+    assert value_at(result.elevation, 60.0) == pytest.approx(hill(60.0, 0.0), abs=1e-6)
 
 
 def test_profile_error_of_a_crown_is_what_a_straight_section_misses():
@@ -67,7 +68,7 @@ def test_profiles_unknown_cross_sections_are_bridged():
     holed[50:53] = np.nan
     result, worst = fitted(HeightGrid(whole.line, whole.v, holed))
     assert worst < 0.001
-    assert result.elevation(51.0) == pytest.approx(hill(51.0, 0.0), abs=0.005)
+    assert value_at(result.elevation, 51.0) == pytest.approx(hill(51.0, 0.0), abs=0.005)
 
 
 @pytest.mark.parametrize("step", [0.5, -2.0])
@@ -82,8 +83,8 @@ def test_profiles_of_a_crowned_road_do_not_bend_where_its_surface_ends(step):
 
     s = np.linspace(0, 60, 25)
     complete, cut = (profiles(grid(heights, 60.0)) for heights in (crowned, ending))
-    np.testing.assert_allclose(cut.elevation(s), complete.elevation(s), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(cut.superelevation(s), np.arctan(0.01), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(value_at(cut.elevation, s), value_at(complete.elevation, s), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(value_at(cut.superelevation, s), np.arctan(0.01), rtol=0, atol=1e-9)
 
 
 def test_profile_error_without_heights_is_nan():
@@ -92,10 +93,38 @@ def test_profile_error_without_heights_is_nan():
     assert np.isnan(profile_error(nothing, profiles(nothing))[1])
 
 
-def test_profiles_are_smooth_at_their_knots():
+def test_profiles_go_on_from_piece_to_piece():
+    s = np.arange(120.0)
+    height = hill(s, 0) + 0.05 * np.sin(s)
     result, _ = fitted(grid(lambda x, y: hill(x, y) + 0.05 * np.sin(x)))
-    for spline in (result.elevation, result.superelevation):
-        assert np.diff(spline.x).min() > 1
-        for order in range(3):
-            before, after = spline(spline.x[1:-1] - 1e-9, order), spline(spline.x[1:-1] + 1e-9, order)
-            np.testing.assert_allclose(before, after, atol=1e-6)
+    np.testing.assert_allclose(value_at(result.elevation, s), height, rtol=0, atol=0.00051)
+    for pieces in (result.elevation, result.superelevation):
+        at = pieces[1:, 0]
+        before, after = value_at(pieces, at - 1e-7), value_at(pieces, at + 1e-7)
+        np.testing.assert_allclose(before, pieces[1:, 1], atol=1e-6)
+        np.testing.assert_allclose((pieces[1:, 1] - before) / 1e-7, (after - pieces[1:, 1]) / 1e-7, atol=1e-6)
+
+
+def hills(s):
+    return 100 + 3 * np.sin(s / 20) + 0.02 * s, 3 / 20 * np.cos(s / 20) + 0.02
+
+
+@pytest.mark.parametrize("tolerance", [0.05, 0.005, 0.0005])
+def test_pieces_stay_within_the_tolerance_and_go_on_smoothly(tolerance):
+    s = np.linspace(0, 300, 601)
+    z, slope = hills(s)
+    pieces = cubic_pieces(s, z, slope, tolerance)
+    assert np.abs(value_at(pieces, s) - z).max() <= tolerance
+    begin, a, b, c, d = pieces.T
+    length = np.diff(np.append(begin, s[-1]))
+    np.testing.assert_allclose((a + b * length + c * length**2 + d * length**3)[:-1], a[1:], atol=1e-9)
+    np.testing.assert_allclose((b + 2 * c * length + 3 * d * length**2)[:-1], b[1:], atol=1e-9)
+    # The fourth derivative bounds the length of a piece: (384 tolerance / |z''''|) ** (1 / 4).
+    shortest = (384 * tolerance / (3 / 20**4)) ** 0.25
+    assert len(pieces) <= np.ceil(300 / (shortest - 1)) + 1
+
+
+def test_a_cubic_is_one_piece():
+    s = np.linspace(0, 40, 81)
+    pieces = cubic_pieces(s, 1 + 0.1 * s - 2e-3 * s**2 + 1e-5 * s**3, 0.1 - 4e-3 * s + 3e-5 * s**2, 1e-9)
+    np.testing.assert_allclose(pieces, [[0, 1, 0.1, -2e-3, 1e-5]], atol=1e-12)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from flexroad.pipeline.run.points import Heights
-from flexroad.tools.lift import batches
+from flexroad.tools.lift import types
 
 
 def test_each_part_has_its_heights_in_order_whatever_the_batch(monkeypatch):
@@ -15,8 +15,8 @@ def test_each_part_has_its_heights_in_order_whatever_the_batch(monkeypatch):
 
     parts = [*"ab", 3, 0, *"c", 5]
     for size in (1, 4, 100):
-        monkeypatch.setattr(batches, "POINTS", size)
-        found = batches.with_heights(
+        monkeypatch.setattr(types, "POINTS", size)
+        found = types.with_heights(
             parts, lambda part: None if isinstance(part, str) else (np.arange(part), np.ones(part)), heights
         )
         result = [(part, own if own is None else own.ground.tolist()) for part, own in found]
