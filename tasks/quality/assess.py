@@ -43,52 +43,30 @@ FLAGS = {
     "dropped": "dropped_road",
     "weights": "bounded_weights",
 }
-"""Figure of each flag; the flag is raised if the figure exceeds the option with the figure's name."""
+"""Figure of each flag."""
+LIMITS = {
+    "error-estimate": 0.1,  # m
+    "worst-error": 0.5,  # m; good roads have at most 0.32
+    "patch": 50.0,  # m2
+    "spike": 0.2,  # 1/m; a speed hump has less
+    "edge-step": 0.15,  # m; higher than a kerb
+    "loose": 0.5,  # m
+    "off-dtm": 0.1,  # shares of the road from here on
+    "inferred": 0.05,
+    "dropped": 0.5,
+    "weights": 0.25,  # share of the NURBS weights
+}
+"""Threshold of each flag. The flag is raised if its figure is larger."""
 NO_ROAD = "no-road"
 """The flag of a tile without road: its mask has none, or the filter dropped all of it. With an empty mask it
 is the only flag."""
 
 
 class Options(base.Options):
-    """Tolerance between two heights of the same ground, and the threshold of each flag."""
+    """Tolerance between two heights of the same ground, and the check of the error estimate."""
 
     agree_m: float = Field(
         AGREE_M, gt=0, description="largest difference between two heights of the same ground (m)"
-    )
-    error_estimate_m: float = Field(
-        0.1,
-        gt=0,
-        description="flag error-estimate: mean estimated error of the surface on the road (m)",
-    )
-    worst_error_estimate_m: float = Field(
-        0.5,
-        gt=0,
-        description="flag worst-error: largest estimated error of a connected 25 m2 of road (m); sound roads "
-        "have at most 0.32",
-    )
-    suspect_m2: float = Field(
-        50.0, gt=0, description="flag patch: largest patch of road farther than agree_m from DSM and DTM (m2)"
-    )
-    curvature_per_m: float = Field(
-        0.2, gt=0, description="flag spike: largest curvature on the road (1/m); a speed hump has less"
-    )
-    edge_step_m: float = Field(
-        0.15, gt=0, description="flag edge-step: p95 of the step at the road's edge (m); higher than a kerb"
-    )
-    residual_p95_m: float = Field(
-        0.5, gt=0, description="flag loose: p95 distance of the kept points to the surface (m)"
-    )
-    off_dtm_road: float = Field(
-        0.1, ge=0, le=1, description="flag off-dtm: share of the road more than agree_m off the DTM"
-    )
-    inferred_road: float = Field(
-        0.05, ge=0, le=1, description="flag inferred: share of the road without a height in the fit"
-    )
-    dropped_road: float = Field(
-        0.5, ge=0, le=1, description="flag dropped: share of the mask that the filter dropped"
-    )
-    bounded_weights: float = Field(
-        0.25, ge=0, le=1, description="flag weights: share of the NURBS weights at a bound"
     )
     holdout: float = Field(
         0.0,
@@ -118,7 +96,7 @@ def assess(
     clusters : RoadClusters
         The road cells that the filter kept.
     options : Options
-        Tolerance, thresholds and the share of the road that is withheld.
+        Tolerance, and the share of the road that is withheld.
     refit : callable, optional
         Fits other data of the tile as the surface was fitted; needed if a share is withheld.
 
@@ -180,14 +158,13 @@ def _assess(
         "suspect_m2": _largest_patch(on_road & (cells.deviation > options.agree_m)) * cell**2,
     }
     judged = figures | {"inferred_road": mean(cells.lacking[on_road])}
-    flags = [flag for flag, name in FLAGS.items() if judged[name] > getattr(options, name)]
+    flags = [flag for flag, name in FLAGS.items() if judged[name] > LIMITS[flag]]
     if not on_road.any():
         figures["suspect_m2"] = float("nan")
         flags = []
     if not kept.any():
         flags = [NO_ROAD, *flags]
-    limits = {flag: getattr(options, name) for flag, name in FLAGS.items()}
-    flagged = flagged_cells(cells, cell, limits, options.agree_m, flags)
+    flagged = flagged_cells(cells, cell, LIMITS, options.agree_m, flags)
     return Quality(**figures, flags=tuple(flags), support=classes, flagged=flagged)
 
 

@@ -28,7 +28,6 @@ from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
 from flexroad.tasks.roads.extent import beyond_extent
-from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.roads.mask_metrics import Quality, judge, together
 from flexroad.tasks.segment.dinov2 import segment as segmenter
 from flexroad.tasks.types import Bools, RoadMask, TileData
@@ -231,7 +230,7 @@ def segment_options(config: Config, model: Path) -> segmenter.Options:
     """Return the options of `segment` for validation: as configured, but without cleanup."""
     configured = _chain(config)["segment"]
     given = configured.model_dump() if isinstance(configured, segmenter.Options) else {}
-    return segmenter.Options(**given | {"model": model, "cleanup": NOTHING})
+    return segmenter.Options(**given | {"model": model, "cleanup": "none"})
 
 
 def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], RoadMask]) -> Evaluation:
