@@ -104,10 +104,6 @@ def lift(
         bool,
         typer.Option("--allow-steps", help="End with exit code 0 although the tiles below do not meet."),
     ] = False,
-    variant: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Variant of the surface; default: the exported one."),
-    ] = None,
     allow: options.Allow = None,
 ) -> None:
     """Write a road network or features with heights of a run.
@@ -126,7 +122,7 @@ def lift(
         grade_limit=None if grade_limit is None else grade_limit / 100,
         crossfall_limit=None if crossfall_limit is None else crossfall_limit / 100,
     )
-    ground = Ground.open(path, variant, allow or (), earlier=True)
+    ground = Ground.open(path, allow=allow or (), earlier=True)
     result = lift_file(ground, file, output, wanted, crs, offset, report)
     echo(f"{output}: {result.summary}")
     if result.earlier:

@@ -46,9 +46,8 @@ class TrainOptions:
     labels: Labels = option(
         MISSING, INPUTS, "mask: the catalog's reference road or road mask; vector: its vector roads."
     )
-    validation: float = option(
-        0.3, VALIDATION, "Share of the tiles for validation.", "SHARE", min=0.05, max=0.9
-    )
+    validation: float = 0.3
+    """Share of the tiles for validation."""
     gap_m: float = option(
         50.0,
         VALIDATION,
@@ -57,15 +56,8 @@ class TrainOptions:
         min=0,
         name="gap-m",
     )
-    ignore_m: float = option(
-        1.0,
-        VALIDATION,
-        "Distance of training cells from edges of labels (m).",
-        "METRES",
-        min=0,
-        name="ignore-m",
-    )
-    """Edges of labels are never exact."""
+    ignore_m: float = 1.0
+    """Distance of training cells from edges of labels (m): edges are never exact."""
     seed: int = option(0, METHOD, "Seed of the split and of the training.", "N", min=0)
     settings: Mapping[str, Any] | None = None
     """Options of the head's training, by name; None for the defaults."""

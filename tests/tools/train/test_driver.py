@@ -221,5 +221,5 @@ def test_run_missing_model_raises_before_start(land, tmp_path, quick_config):
 
 def test_train_help_lists_options():
     text = flexroad("train", "--help")
-    for word in ("--labels", "--validation", "--gap-m", "--ignore-m", "--set", "--seed"):
+    for word in ("--labels", "--gap-m", "--set", "--seed"):
         assert word in text
