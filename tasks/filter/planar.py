@@ -41,7 +41,7 @@ REACH_M = 4.0
 GROUND_SHARE = 0.2
 """A cluster is on the ground if this share of its cells is: a deck is one cluster with its approaches."""
 BEYOND_M = 3.0
-"""Distance beyond the verge up to which a smooth surface may not follow the ground yet (m)."""
+"""Distance beyond the shoulder up to which a smooth surface may not follow the ground yet (m)."""
 UNKNOWN_M = 2.0
 """Assumed height of a cluster above the DTM where the DTM is unknown (m)."""
 NO_NEIGHBOURS, INCONSISTENT, CONSISTENT = np.uint8(0), np.uint8(1), np.uint8(2)
@@ -83,7 +83,7 @@ class Options(base.Options):
     keep_largest: int | None = Field(
         None, ge=1, description="number of the largest remaining clusters to keep; null keeps all"
     )
-    verge_m: float = Field(
+    shoulder_m: float = Field(
         0.0,
         ge=0,
         le=50,
@@ -107,8 +107,8 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     RoadClusters
         Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if
         no cluster is large enough. ``dtm_invalid`` marks the dropped cells where the DTM is not the road's
-        height either (under a car on a bridge it is the valley's), and the verge. ``beside`` are the cells
-        of the verge and those up to `BEYOND_M` from it. With levels, it is once for each of them.
+        height either (under a car on a bridge it is the valley's), and the shoulder. ``beside`` are the cells
+        of the shoulder and those up to `BEYOND_M` from it. With levels, it is once for each of them.
     """
     return ecsrc_near(data, road, options, (slice(0, data.grid.height), slice(0, data.grid.width)))
 
@@ -126,7 +126,7 @@ def ecsrc_near(data: TileData, road: RoadMask, options: Options, near: Slices) -
             # A deck that is named needs no area.
             return _clusters_of(seen, road, options, near, 0.0 if other else RAISED_M2_PER_M)
 
-        return level_clusters(data, road, of_level, options.verge_m, BEYOND_M)
+        return level_clusters(data, road, of_level, options.shoulder_m, BEYOND_M)
     return _clusters_of(data, road, options, near, RAISED_M2_PER_M)
 
 
@@ -149,14 +149,14 @@ def _clusters_of(
     kept[alone] = np.abs(data.dsm[alone] - data.dtm[alone]) <= theta
     labels = _labels(data.dsm, kept, patches, cell, options)
     dtm_invalid = invalid_dtm(data, road, labels > 0, near)
-    if options.verge_m == 0:
+    if options.shoulder_m == 0:
         return RoadClusters(data.grid, labels, dtm_invalid)
-    reach = math.ceil((options.verge_m + BEYOND_M) / cell) + 1
+    reach = math.ceil((options.shoulder_m + BEYOND_M) / cell) + 1
     around = tuple(slice(max(part.start - reach, 0), part.stop + reach) for part in near)
     mask, beside = road.mask[around], np.zeros_like(dtm_invalid)
-    verge = ~mask & within(_streets(road.mask, labels > 0)[around], cell, options.verge_m)
-    dtm_invalid[around] |= verge
-    beside[around] = ~mask & within(verge, cell, BEYOND_M)
+    shoulder = ~mask & within(_streets(road.mask, labels > 0)[around], cell, options.shoulder_m)
+    dtm_invalid[around] |= shoulder
+    beside[around] = ~mask & within(shoulder, cell, BEYOND_M)
     return RoadClusters(data.grid, labels, dtm_invalid, beside)
 
 

@@ -24,7 +24,7 @@ from flexroad.tasks.quality.holdout import Refit, holdout
 from flexroad.tasks.quality.structures import STRUCTURE_FLAGS, structures
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.quality.worst import worst_piece
-from flexroad.tasks.roads.dtm_validity import AGREE_M
+from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
@@ -34,7 +34,7 @@ VERSION = 6
 FLAGS = {
     "error-estimate": "error_estimate_m",
     "worst-error": "worst_error_estimate_m",
-    "patch": "suspect_m2",
+    "patch": "max_unexplained_area_m2",
     "spike": "curvature_per_m",
     "edge-step": "edge_step_m",
     "loose": "residual_p95_m",
@@ -65,8 +65,8 @@ is the only flag."""
 class Options(base.Options):
     """Tolerance between two heights of the same ground, and the check of the error estimate."""
 
-    agree_m: float = Field(
-        AGREE_M, gt=0, description="largest difference between two heights of the same ground (m)"
+    dsm_dtm_tolerance_m: float = Field(
+        DSM_DTM_TOLERANCE_M, gt=0, description="largest difference between two heights of the same ground (m)"
     )
     holdout: float = Field(
         0.0,
@@ -134,7 +134,7 @@ def _assess(
     refit: Refit | None = None,
 ) -> Quality:
     """Return the figures of one level."""
-    cells = compare(data, road, clusters, surface, options.agree_m, only_road=True)
+    cells = compare(data, road, clusters, surface, options.dsm_dtm_tolerance_m, only_road=True)
     on_road, kept, classes, height = cells.on_road, cells.kept, cells.classes, cells.height
     estimate, cell = cells.estimate, data.core.cell
     residuals, to_dtm = _finite(cells.off_dsm[kept]), _finite(cells.off_dtm[on_road])
@@ -150,21 +150,22 @@ def _assess(
         "dropped_road": mean(~kept[on_road]),
         "dsm_excess_m": _quantile(_finite(cells.excess[kept]), 50),
         "off_dtm_m": _quantile(to_dtm, 50),
-        "off_dtm_road": mean(np.abs(to_dtm) > options.agree_m),
+        "off_dtm_road": mean(np.abs(to_dtm) > options.dsm_dtm_tolerance_m),
         "bounded_weights": _share_at_bound(surface),
         "error_estimate_m": mean(_finite(estimate[on_road])),
         **_worst(cells, data.core),
-        **asdict(holdout(data, road, clusters, refit, options.agree_m, options.holdout)),
-        "suspect_m2": _largest_patch(on_road & (cells.deviation > options.agree_m)) * cell**2,
+        **asdict(holdout(data, road, clusters, refit, options.dsm_dtm_tolerance_m, options.holdout)),
+        "max_unexplained_area_m2": _largest_patch(on_road & (cells.deviation > options.dsm_dtm_tolerance_m))
+        * cell**2,
     }
     judged = figures | {"inferred_road": mean(cells.lacking[on_road])}
     flags = [flag for flag, name in FLAGS.items() if judged[name] > LIMITS[flag]]
     if not on_road.any():
-        figures["suspect_m2"] = float("nan")
+        figures["max_unexplained_area_m2"] = float("nan")
         flags = []
     if not kept.any():
         flags = [NO_ROAD, *flags]
-    flagged = flagged_cells(cells, cell, LIMITS, options.agree_m, flags)
+    flagged = flagged_cells(cells, cell, LIMITS, options.dsm_dtm_tolerance_m, flags)
     return Quality(**figures, flags=tuple(flags), support=classes, flagged=flagged)
 
 
@@ -192,7 +193,7 @@ def cell_errors(
     if own and isinstance(surface, LevelledSurface):
         data, road, surface = level_data(data, clusters, number), level_road(road, number), surface.at(number)
         clusters = own[0]
-    cells = compare(data, road, clusters, surface, options.agree_m)
+    cells = compare(data, road, clusters, surface, options.dsm_dtm_tolerance_m)
     classes = _hidden(cells.classes) if number < 0 else cells.classes
     return np.where(classes == Support.NONE, np.nan, cells.estimate), classes
 

@@ -60,7 +60,7 @@ PENDING, DONE, FAILED = range(3)
 MEASURES = {
     "error_estimate_m": ("Error estimate", "m"),
     "worst_error_estimate_m": ("Error estimate of the worst 25 m²", "m"),
-    "suspect_m2": ("Largest suspect patch", "m²"),
+    "max_unexplained_area_m2": ("Largest unexplained patch", "m²"),
     "measured_road": ("Road measured by the scan", "%"),
     "dtm_road": ("Road from the terrain model", "%"),
     "inferred_road": ("Road inferred", "%"),

@@ -7,12 +7,12 @@ from flexroad.pipeline.errors import ConfigError
 def test_setting_replaces_an_option_and_names_the_configuration():
     base, config = (
         load_config("production"),
-        load_config("production", ["fit.spacing_m=5", "ecsrc.verge_m=2"]),
+        load_config("production", ["fit.spacing_m=5", "ecsrc.shoulder_m=2"]),
     )
     assert config.chains["flexroad"]["fit"].spacing_m == 5
     assert config.chains["flexroad"]["fit"].huber_m == base.chains["flexroad"]["fit"].huber_m
     assert config.raw["fit"]["spacing_m"] == 5
-    assert config.name == "production --set fit.spacing_m=5 --set ecsrc.verge_m=2"
+    assert config.name == "production --set fit.spacing_m=5 --set ecsrc.shoulder_m=2"
     # A variant with a method of its own keeps it.
     assert load_config("paper", ["fit.degree=2"]).chains["plane"]["fit"].method == "plane"
 
@@ -67,9 +67,9 @@ def test_settings_as_texts_and_as_dict_are_equal(settings):
 
 
 def test_settings_as_a_dict_are_part_of_the_name_and_keep_small_numbers():
-    config = load_config("production", {"ecsrc.verge_m": 1e-5, "fit": {"spacing_m": 5}})
-    assert config.name == "production --set ecsrc.verge_m=1.0e-05 --set fit={spacing_m: 5}"
-    assert config.chains["flexroad"]["ecsrc"].verge_m == 1e-5
+    config = load_config("production", {"ecsrc.shoulder_m": 1e-5, "fit": {"spacing_m": 5}})
+    assert config.name == "production --set ecsrc.shoulder_m=1.0e-05 --set fit={spacing_m: 5}"
+    assert config.chains["flexroad"]["ecsrc"].shoulder_m == 1e-5
 
 
 def test_settings_with_a_value_that_is_not_yaml_raise():

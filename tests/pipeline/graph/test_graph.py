@@ -58,7 +58,7 @@ def test_equal_inputs_give_equal_fingerprints(survey):
         ({"fit": {"degree": 2}}, ["fit", "sample", "evaluate", "assess"]),
         ({"sample": {"road_m": 2}}, ["sample", "evaluate"]),
         ({"evaluate": {"nearest": True}}, ["evaluate"]),
-        ({"assess": {"agree_m": 0.2}}, ["assess"]),
+        ({"assess": {"dsm_dtm_tolerance_m": 0.2}}, ["assess"]),
         ({"export": {"formats": ["glb"]}}, []),
     ],
 )

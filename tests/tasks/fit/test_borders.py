@@ -24,7 +24,7 @@ from flexroad.tools.synthetic import make_scene
 from tests import exact_fit
 
 AROUND_M = 100
-FILTER = planar.Options(verge_m=5)
+FILTER = planar.Options(shoulder_m=5)
 OPTIONS = smoothing_spline.Options()
 ALL = Grid("EPSG:25832", 500000, 5600500, 1.0, 500, 500)
 """Two by two tiles of 250 m."""
