@@ -1,6 +1,7 @@
-"""Print how large the project is: lines, files, public classes, imports in functions, words of the docs.
+"""Print how large the project is: lines, files, public classes, words of the docs, options, parameters.
 
-Counted is what git tracks. Public classes stand at the top level of a module, without a leading underscore.
+Only files that git tracks are counted. A public class is at the top level of a module, without a leading
+underscore.
 """
 
 from __future__ import annotations
@@ -8,6 +9,12 @@ from __future__ import annotations
 import ast
 import subprocess
 from pathlib import Path
+from typing import Any
+
+import typer
+
+from flexroad.pipeline.cli.main import app
+from flexroad.pipeline.config.schema import schema
 
 ROOT = Path(__file__).parents[1]
 CORE = ("catalog", "tasks", "pipeline", "flexroad")
@@ -36,6 +43,29 @@ def inner_imports(tree: ast.Module) -> int:
     return sum(isinstance(node, ast.Import | ast.ImportFrom) for node in inside)
 
 
+def keys(node: Any) -> set[str]:
+    """Return the keys that a JSON schema names, those of its definitions included."""
+    if isinstance(node, list):
+        return {key for item in node for key in keys(item)}
+    if not isinstance(node, dict):
+        return set()
+    return {*node.get("properties", {})} | keys([*node.values()])
+
+
+def configuration_keys() -> int:
+    """Return the number of keys of a configuration; each counts once in its section, also for two methods."""
+    sections = schema()["properties"]
+    inner = [keys(part) for section, part in sections.items() if section != "variants"]
+    return len(sections) + sum(map(len, inner))
+
+
+def parameters(command: Any) -> int:
+    """Return the number of options and arguments of a command and its subcommands, without ``--help``."""
+    own = sum(parameter.name != "help" for parameter in command.params)
+    names = command.list_commands(None) if hasattr(command, "list_commands") else ()
+    return own + sum(parameters(command.get_command(None, name)) for name in names)
+
+
 def main() -> None:
     core, tools = (
         [file for file in tracked(*folders) if file.suffix == ".py"] for folders in (CORE, ["tools"])
@@ -55,6 +85,8 @@ def main() -> None:
         "tests, bench: lines of Python": lines(tests),
         "tests, bench: files": len(tests),
         "README: lines": lines([ROOT / "README.md"]),
+        "configuration keys": configuration_keys(),
+        "parameters of commands": parameters(typer.main.get_command(app)),
         "docs: words": words(live),
         "docs: words of results": words(pages) - words(live),
     }

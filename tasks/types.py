@@ -181,7 +181,7 @@ class RoadClusters:
     hide a road the DTM may be that of other ground; beside a road it is smoothed."""
     beside: Bools | None = None
     """Cells beside the streets whose ground has its own height (`tasks.spline.stepped`), ``(H, W)``: the
-    verge, whose DTM is left out of the fit, and cells near it. None if there is no verge."""
+    shoulder, whose DTM is left out of the fit, and cells near it. None if there is no shoulder."""
     level: Level | None = None
     """The level that these clusters are of; None: level 0."""
     levels: tuple[RoadClusters, ...] = ()
@@ -346,7 +346,7 @@ class Quality:
     worst_easting: float
     """Easting of the cell with the largest estimate in that piece of road (m)."""
     worst_northing: float
-    suspect_m2: float
+    max_unexplained_area_m2: float
     """Area of the largest road patch whose distance to scan and DTM exceeds that of two heights of the same
     ground (m2); 0 if the road has none."""
     holdout_squares: float

@@ -7,6 +7,8 @@ import numpy as np
 import scipy
 from scipy.interpolate import BSpline
 
+from flexroad.tasks.fit import smoothing_spline
+
 FINAL_M, INITIAL_M, COOLING = 0.003, 0.03, 0.6
 
 
@@ -32,7 +34,7 @@ def huber(differences, limit):
     return np.where(size <= limit, size**2 / (2 * limit), size - limit / 2) if limit else size
 
 
-def minimum(space, heights, weight, stiffness, first, held, options):
+def minimum(space, heights, weight, stiffness, first, held, huber_m, tolerance):
     """Take the place of ``smoothing_spline._minimum``."""
     valid = np.isfinite(heights)
     target, factor = np.where(valid, heights, 0).ravel(), np.where(valid, weight, 0).ravel() / valid.sum()
@@ -42,11 +44,11 @@ def minimum(space, heights, weight, stiffness, first, held, options):
     bending, free = bending_matrix(space, stiffness / valid.sum()), ~held.ravel()
 
     def loss(z):
-        return factor @ huber(matrix @ z - target, options.huber_m) + z @ (bending @ z) / 2
+        return factor @ huber(matrix @ z - target, huber_m) + z @ (bending @ z) / 2
 
     z, losses = first.ravel().copy(), [loss(first.ravel())]
-    floor = options.huber_m or FINAL_M
-    for number in range(options.iterations):
+    floor = huber_m or FINAL_M
+    for number in range(smoothing_spline.ITERATIONS):
         least, residuals = INITIAL_M * COOLING**number, matrix @ z - target
         weights = factor / np.maximum(np.abs(residuals), max(least, floor))
         normal = (matrix.T @ scipy.sparse.diags_array(weights) @ matrix + bending).tocsc()
@@ -60,6 +62,6 @@ def minimum(space, heights, weight, stiffness, first, held, options):
         if line.fun < losses[-1]:
             z = z + line.x * step
         losses.append(min(line.fun, losses[-1]))
-        if least <= floor and losses[-2] - losses[-1] <= options.stop_tolerance * losses[-2]:
+        if least <= floor and losses[-2] - losses[-1] <= tolerance * losses[-2]:
             break
     return z.reshape(first.shape)

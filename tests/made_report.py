@@ -126,7 +126,7 @@ def many_rows(ids, seed=0):
                         "measured_road",
                         "dtm_road",
                         "completeness",
-                        "suspect_m2",
+                        "max_unexplained_area_m2",
                     ),
                     rng.normal(0, 1, 6),
                     strict=True,

@@ -74,7 +74,7 @@ class Survey:
         chain = {
             "load": load.Options(halo_m=HALO_M),
             "segment": segment,
-            "ecsrc": planar.Options(verge_m=5),
+            "ecsrc": planar.Options(shoulder_m=5),
             "fit": smoothing_spline.Options(),
         }
         parts: list[Any] = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
 
 import yaml
 from pydantic import BaseModel
@@ -37,19 +36,8 @@ def page() -> str:
                 default = ", the default" if DEFAULTS[stage] in names else ""
                 title = f"`method: {'` or `'.join(names)}`{default}"
                 parts.append(f"{title}\n\n{rows(model, without='method')}")
-        inner = {name: part for module in modules.values() for name, part in parts_of(module.Options)}
-        parts += [f"`{name}`\n\n{rows(part)}" for name, part in inner.items()]
     parts += [f"## {name}\n\n{rows(part)}" for name, part in (("export", Export), ("cluster", Cluster))]
     return "\n".join(parts)
-
-
-def parts_of(model: type[BaseModel]) -> list[tuple[str, type[BaseModel]]]:
-    """Return the fields of a model that hold models."""
-    fields = model.model_fields.items()
-    kinds = [
-        (name, kind) for name, field in fields for kind in (field.annotation, *get_args(field.annotation))
-    ]
-    return [(name, kind) for name, kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)]
 
 
 def rows(model: type[BaseModel], without: str = "") -> str:
@@ -61,8 +49,8 @@ def rows(model: type[BaseModel], without: str = "") -> str:
 def row(name: str, field: FieldInfo) -> str:
     meaning = " ".join((field.description or "").split())
     value = field.get_default(call_default_factory=True)
-    if field.is_required() or isinstance(value, BaseModel):
-        return f"- `{name}`{' (required)' if field.is_required() else ''}: {meaning}"
+    if field.is_required():
+        return f"- `{name}` (required): {meaning}"
     plain = [*value] if isinstance(value, tuple) else value
     text = yaml.safe_dump(plain, default_flow_style=True, width=1000).splitlines()[0]
     bounds = [

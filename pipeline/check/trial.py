@@ -104,16 +104,21 @@ def _trial(tile: Tile, chain: Mapping[str, Any]) -> Trial:
         open_offset(*models),
         offset_note(*models),
         units,
-        {} if road is None else _on_road(models[0] - models[1], road[core], chain["assess"].agree_m),
+        {}
+        if road is None
+        else _on_road(models[0] - models[1], road[core], chain["assess"].dsm_dtm_tolerance_m),
     )
 
 
-def _on_road(above: Floats, road: Bools, agree_m: float) -> dict[str, float]:
+def _on_road(above: Floats, road: Bools, dsm_dtm_tolerance_m: float) -> dict[str, float]:
     """Return how far the DSM is above the DTM on the road, as in metrics; empty without road."""
     cells = above[road & np.isfinite(above)]
     if not cells.size:
         return {}
-    return {"off_dtm_m": float(np.median(cells)), "off_dtm_road": float(np.mean(np.abs(cells) > agree_m))}
+    return {
+        "off_dtm_m": float(np.median(cells)),
+        "off_dtm_road": float(np.mean(np.abs(cells) > dsm_dtm_tolerance_m)),
+    }
 
 
 def _sample(tiles: Sequence[Tile], doubtful: Collection[str]) -> list[Tile]:

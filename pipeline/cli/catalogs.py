@@ -207,8 +207,6 @@ def catalog_gerod(
     ],
     output: Output,
     layout: Layout = "gerod",
-    date: Date = None,
-    strict: Strict = False,
 ) -> None:
     """List the tiles of the GeRoD dataset.
 
@@ -224,8 +222,8 @@ def catalog_gerod(
         for question in layouts.questions(found):
             echo(f"question: {question}")
     derived = output.parent / f"{output.stem}_points"
-    result = templates.index(root, dataset, templates.GEROD, date=date, derived=derived)
-    _write_catalog(result, output, strict, layout)
+    result = templates.index(root, dataset, templates.GEROD, derived=derived)
+    _write_catalog(result, output, config=layout)
 
 
 def _note(line: str) -> None:
@@ -237,15 +235,15 @@ def catalog_dsc3d(
     root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder of rasters of DSC3D's scenes.")],
     output: Output,
     layout: Layout = "dsc3d",
-    date: Date = None,
-    strict: Strict = False,
 ) -> None:
     """List the scenes of the DSC3D dataset, one tile each."""
-    result = templates.index(root, load_config(layout).dataset, templates.DSC3D, date=date)
-    _write_catalog(result, output, strict, layout)
+    result = templates.index(root, load_config(layout).dataset, templates.DSC3D)
+    _write_catalog(result, output, config=layout)
 
 
-def _write_catalog(result: TilingResult, output: Path, strict: bool, config: str | None = None) -> None:
+def _write_catalog(
+    result: TilingResult, output: Path, strict: bool = False, config: str | None = None
+) -> None:
     for note in result.notes:
         echo(f"note: {note}", err=True)
     for line in result.left_out:

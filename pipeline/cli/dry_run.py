@@ -14,7 +14,7 @@ from flexroad.pipeline.check.failures import expected_failures
 from flexroad.pipeline.check.reasons import Kind, reason
 from flexroad.pipeline.execute.adaptive import decision, workers_of
 from flexroad.pipeline.graph.borders import STAGE as BORDER
-from flexroad.pipeline.graph.graph import Node, TileGraph, layers_read, own_files_missing
+from flexroad.pipeline.graph.graph import Node, layers_read, own_files_missing
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
@@ -56,9 +56,7 @@ class Verdict:
         return f"expected exit code: {self.exit_code}{told}"
 
 
-def plan(
-    run: Run, tiles: Collection[Tile], verdict: Verdict, verbose: bool = False, workers: int | None = None
-) -> Iterator[str]:
+def plan(run: Run, tiles: Collection[Tile], verdict: Verdict, workers: int | None = None) -> Iterator[str]:
     """Yield one line per tile with the reason why it is computed, the totals, what would fail, the verdict.
 
     After the number of tiles follows whether worker processes would be started.
@@ -70,7 +68,6 @@ def plan(
     - `run`: the run, which need not exist yet (`Run.planned`).
     - `tiles`: the selected tiles.
     - `verdict`: is filled in.
-    - `verbose`: whether each tile also has a line per node.
     - `workers`: largest number of worker processes; by default that of the configuration.
     """
     place, totals, reasons = RunPlace.of(run), Counter[tuple[str, str]](), Counter[Kind]()
@@ -92,8 +89,6 @@ def plan(
                 totals[node.stage, states[name]] += 1
             # Corners and edges are nodes of several tiles.
             counted |= {name} if node.border else set()
-        if verbose:
-            yield from _nodes(graph, states)
     numbers = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
     yield f"{count(reasons.total(), 'tile')}: {numbers}"
     if todo and not run.config.cluster.needs_workers:
@@ -133,21 +128,3 @@ def _state(node: Node, place: RunPlace, borders: dict[str, str]) -> str:
     if node.border:
         borders[node.fingerprint] = state
     return state
-
-
-def _nodes(graph: TileGraph, states: dict[str, str]) -> Iterator[str]:
-    """Yield a line per node of a tile: stage, fingerprint, state, inputs and variants."""
-    users = _users(graph)
-    for name, node in graph.nodes.items():
-        inputs = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in (*node.inputs, *node.frame)) or "files"
-        yield f"  {node.stage:9}{name[:8]}  {states[name]:7} <- {inputs}  ({', '.join(users[name])})"
-
-
-def _users(graph: TileGraph) -> dict[str, list[str]]:
-    """Return the variants that use each node, by the node's fingerprint."""
-    users: dict[str, list[str]] = {}
-    for variant, nodes in graph.variants.items():
-        shared = graph.nodes[nodes["fit"]].frame
-        for fingerprint in (*nodes.values(), *shared):
-            users.setdefault(fingerprint, []).append(variant)
-    return users

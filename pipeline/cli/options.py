@@ -61,11 +61,17 @@ MostWorkers = Annotated[
         rich_help_panel=WORK,
     ),
 ]
-Executor = Annotated[
-    Literal["dask", "serial"],
-    typer.Option(help="dask: worker processes; serial: one process, for debugging.", rich_help_panel=WORK),
+Parallel = Annotated[
+    int,
+    typer.Option(
+        "--workers",
+        min=1,
+        metavar="N",
+        help="Worker processes; default: this process alone.",
+        rich_help_panel=WORK,
+    ),
 ]
-RunExecutor = Annotated[
+Executor = Annotated[
     Literal["auto", "dask", "serial"],
     typer.Option(
         "--executor",

@@ -117,16 +117,13 @@ def run(
     bbox: options.Box = None,
     area: options.Area = None,
     area_layer: options.AreaLayer = None,
-    executor: options.RunExecutor = "auto",
+    executor: options.Executor = "auto",
     workers: options.MostWorkers = None,
     scheduler: Scheduler = None,
     dashboard: options.Dashboard = False,
     dry_run: Annotated[
         bool,
         typer.Option("--dry-run", help="Print why each tile would be computed, and what would fail."),
-    ] = False,
-    verbose: Annotated[
-        bool, typer.Option("-v", "--verbose", help="With --dry-run: also the stages of each tile.")
     ] = False,
 ) -> None:
     """Bring every tile of a run up to date.
@@ -140,7 +137,7 @@ def run(
         selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
         tiles, selected = selection.of(path, source, allow or (), chosen)
         planned, verdict = Run.planned(path, chosen, tiles, root, checksum), Verdict()
-        for line in plan(planned, selected.tiles, verdict, verbose, workers):
+        for line in plan(planned, selected.tiles, verdict, workers):
             echo(line)
         raise typer.Exit(verdict.exit_code)
     with interruptible() as outcome:
@@ -183,11 +180,8 @@ def rerun(
     ] = None,
     settings: options.WorkerSettings = None,
     allow: options.Allow = None,
-    verify: options.Verify = False,
-    executor: options.RunExecutor = "auto",
-    workers: options.MostWorkers = None,
+    executor: options.Executor = "auto",
     scheduler: Scheduler = None,
-    dashboard: options.Dashboard = False,
 ) -> None:
     """Bring tiles of a run up to date again.
 
@@ -203,10 +197,10 @@ def rerun(
             from_stage=from_stage,
             settings=settings or (),
             allow=allow or (),
-            workers=Workers(executor, workers, scheduler, dashboard),
+            workers=Workers(executor, scheduler=scheduler),
             observer=shown,
         ) as prepared:
-            _process(prepared, verify, shown)
+            _process(prepared, False, shown)
     _exit(outcome)
 
 

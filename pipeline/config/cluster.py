@@ -45,12 +45,6 @@ class Cluster(Options):
         description="longest time for one tile (s): a worker that takes longer is stopped, the tile is tried "
         "once more alone, and is then a failed row; only on workers: another value starts them for any tile",
     )
-    patience_s: float = Field(
-        60,
-        ge=0,
-        le=86_400,
-        description="local, --scheduler: waiting time for a new worker when all are lost (s)",
-    )
     security: Literal["tls", "none"] = Field(
         "tls",
         description="tls: scheduler and workers answer only processes with certificates made for this "
@@ -70,12 +64,11 @@ class Cluster(Options):
     )
     walltime_h: float = Field(8, gt=0, le=10_000, description="slurm: time limit of each job (hours)")
     queue: str | None = Field(None, min_length=1, description="slurm: partition (-p)")
-    account: str | None = Field(None, min_length=1, description="slurm: account (-A)")
     per_job: int = Field(1, ge=1, le=1024, description="slurm: workers per job, one core each")
     interface: str | None = Field(
         None, min_length=1, description="slurm: network interface between workers and this machine, as ib0"
     )
-    job_extra: tuple[str, ...] = Field((), description="slurm: further #SBATCH lines, as --exclusive")
+    job_extra: tuple[str, ...] = Field((), description="slurm: further #SBATCH lines, as --account=NAME")
     prologue: tuple[str, ...] = Field(
         (), description="slurm: shell lines run before a worker starts, as module load gdal"
     )

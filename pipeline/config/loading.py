@@ -265,8 +265,6 @@ def _error_line(details: Any, model: TypeAdapter[Any], where: str) -> str:
     path = [str(part) for part in details["loc"][bool(method) :]]
     key = ".".join([where, *map(_short, path)])
     if details["type"] == "extra_forbidden":
-        if len(path) > 1:
-            return f"{key}: unknown key{_hint(path[-1], _nested_keys(model))}"
         return f"{key}: unknown key{_remedy(path[-1], method, keys)}"
     if details["type"] == "union_tag_invalid":
         tag = details["ctx"]["tag"]
@@ -291,12 +289,6 @@ def _keys(model: TypeAdapter[Any]) -> dict[str, list[str]]:
     tags = schema.get("discriminator", {}).get("mapping", {"": ""})
     parts = {tag: schema["$defs"][ref.rpartition("/")[2]] if ref else schema for tag, ref in tags.items()}
     return {tag: sorted(part.get("properties", {})) for tag, part in parts.items()}
-
-
-def _nested_keys(model: TypeAdapter[Any]) -> list[str]:
-    """Return the names of all options within options, such as those of the mask cleanup."""
-    parts = model.json_schema().get("$defs", {}).values()
-    return sorted({key for part in parts for key in part.get("properties", {})})
 
 
 def _main_variant(chains: Mapping[str, Any]) -> tuple[str, ...]:

@@ -51,7 +51,6 @@ class Export(Options):
         le=16384,
         description="largest width and height of the texture (pixels); a finer photo is averaged",
     )
-    texture_quality: int = Field(85, ge=1, le=95, description="quality of the texture's JPEG")
 
     @model_validator(mode="after")
     def _texture_has_a_mesh(self) -> Export:

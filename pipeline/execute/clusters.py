@@ -35,6 +35,8 @@ from flexroad.pipeline.execute.start import (
     workers_here,
 )
 
+WORKER_LOST_TIMEOUT_S = 60.0
+"""How long to wait for a new worker when all are lost (s); a local one is replaced in seconds."""
 GRACE_S = 10.0
 """How long a running scheduler may have no workers (s): a nanny may be replacing one."""
 ANSWER_S = 10.0
@@ -51,7 +53,7 @@ class ClusterTarget:
     """The cluster's name in messages."""
     start_s: float = 0
     """How long to wait for the first worker (s)."""
-    patience_s: float = 0
+    worker_lost_timeout_s: float = 0
     """How long to wait for a worker when all are lost (s)."""
     remedy: str = "start some (`dask worker ADDRESS --nthreads 1`)"
     """What to do if no worker comes."""
@@ -78,7 +80,7 @@ def open_cluster(
             notify(
                 "a scheduler without tls:// is open to everyone who reaches it, and runs programs as its user"
             )
-        yield ClusterTarget(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S, cluster.patience_s)
+        yield ClusterTarget(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S, WORKER_LOST_TIMEOUT_S)
         return
     if workers:
         cluster = cluster.model_copy(update={"workers": workers})
@@ -87,7 +89,7 @@ def open_cluster(
         stack.enter_context(dask.config.set(settings(cluster, dashboard)))
         if cluster.kind == "local":
             started = stack.enter_context(local(cluster, dashboard))
-            yield ClusterTarget(started, "the local cluster", 0, cluster.patience_s)
+            yield ClusterTarget(started, "the local cluster", 0, WORKER_LOST_TIMEOUT_S)
         else:
             jobs = stack.enter_context(slurm(cluster, dashboard, logs, notify))
             yield ClusterTarget(

@@ -127,7 +127,8 @@ class _ConnectedExecutor:
             function,
             iter(jobs),
             lost,
-            self.cluster.model_copy(update={"patience_s": self.target.patience_s}),
+            self.target.worker_lost_timeout_s,
+            self.cluster.tile_timeout_s,
             self.notify,
             probe,
         )

@@ -28,7 +28,6 @@ from distributed.protocol.pickle import dumps
 from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerError
 
 from flexroad.catalog.text import Notify
-from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.executor import J, Probe, R
 from flexroad.pipeline.execute.workers import Admission, task_function, work
@@ -77,8 +76,8 @@ class Session(Generic[J, R]):
         The jobs; taken as there is room.
     lost : callable
         Takes a job and the reason, returns the result of a lost job.
-    cluster : Cluster
-        How long to wait for a worker when there is none, and longest time of a job.
+    worker_lost_timeout_s, tile_timeout_s : float
+        How long to wait for a worker when there is none, and longest time of a job (s).
     notify : callable
         Prints one line for the user.
     probe : Probe, optional
@@ -93,7 +92,8 @@ class Session(Generic[J, R]):
         function: Callable[[J], R],
         jobs: Iterator[J],
         lost: Callable[[J, str], R],
-        cluster: Cluster,
+        worker_lost_timeout_s: float,
+        tile_timeout_s: float,
         notify: Notify,
         probe: Probe | None = None,
     ) -> None:
@@ -107,8 +107,8 @@ class Session(Generic[J, R]):
         self.suspects: deque[J] = deque()
         """Quarantined jobs whose worker died again for an unknown reason."""
         self.lost = lost
-        self.patience_s = cluster.patience_s
-        self.limit_s = cluster.tile_timeout_s
+        self.worker_lost_timeout_s = worker_lost_timeout_s
+        self.limit_s = tile_timeout_s
         self.notify = notify
         self.admission = Admission(probe, notify)
         self.returned: deque[J] = deque()
@@ -212,14 +212,14 @@ class Session(Generic[J, R]):
             self.without_worker_s = None
         elif self.without_worker_s is None:
             self.without_worker_s = 0.0
-            self.notify(f"no worker is left; waiting up to {self.patience_s:g} s for one")
+            self.notify(f"no worker is left; waiting up to {self.worker_lost_timeout_s:g} s for one")
         else:
             self.without_worker_s += since_last_check
-            if self.without_worker_s > self.patience_s:
+            if self.without_worker_s > self.worker_lost_timeout_s:
                 raise self._no_worker()
 
     def _no_worker(self) -> ClusterLost | ConfigError:
-        text = f"no worker was left for {self.patience_s:g} s"
+        text = f"no worker was left for {self.worker_lost_timeout_s:g} s"
         for fault in self.admission.left_out.values():
             # Workers are there: without any result, the run could not start.
             return (ClusterLost if self.done else ConfigError)(f"{text}; {fault}")
@@ -230,7 +230,7 @@ class Session(Generic[J, R]):
         if isinstance(error, KilledWorker):
             yield from self._worker_died(flight, error)
         elif isinstance(error, NoWorkerError | NoValidWorkerError):
-            # A scheduler may be configured to fail tasks without workers; here ``patience_s`` decides.
+            # A scheduler may be configured to fail tasks without workers; here the timeout decides.
             self._return(flight)
         elif future.status == "error":
             future.result()

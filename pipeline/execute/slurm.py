@@ -163,7 +163,6 @@ def slurm_options(cluster: Cluster, dashboard: bool, folder: Path) -> dict[str, 
     ]
     return {
         "queue": cluster.queue,
-        "account": cluster.account,
         "cores": cluster.per_job,
         "processes": cluster.per_job,
         "memory": f"{(cluster.memory or DEFAULT_MEMORY_BYTES) * cluster.per_job} B",

@@ -302,7 +302,9 @@ class FinishedTile:
         if not flags:
             return {}
         data = self.data
-        cells = compare(data, self.road, self.clusters, self.surface, self.assessment.agree_m, only_road=True)
+        cells = compare(
+            data, self.road, self.clusters, self.surface, self.assessment.dsm_dtm_tolerance_m, only_road=True
+        )
         found = places(cells, data.core, self.assessment)
         return {flag: found[flag] for flag in flags if flag in found}
 

@@ -71,7 +71,7 @@ COLUMNS: dict[str, str] = {
     "worst_error_estimate_m": "float64",
     "worst_easting": "float64",
     "worst_northing": "float64",
-    "suspect_m2": "float64",
+    "max_unexplained_area_m2": "float64",
     "holdout_squares": "float64",
     "holdout_error_m": "float64",
     "holdout_covered": "float64",

@@ -15,6 +15,9 @@ from flexroad.tasks.types import Orthophoto
 
 NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"
 
+QUALITY = 85
+"""Quality of the texture's JPEG (percent): blocks are hardly visible."""
+
 
 def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
     """Return the texture of a tile's meshes: its orthophoto, at its own resolution up to `export.texture_px`.
@@ -36,7 +39,7 @@ def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
         return None, NO_PHOTO
     unknown = 1 - photo.known.mean()
     note = f"dop: {unknown:.1%} of the texture has no orthophoto and takes its mean colour" if unknown else ""
-    return glb.texture(photo, export.texture_quality), note
+    return glb.texture(photo, QUALITY), note
 
 
 def tile_photo(tile: Tile, layer: Layer, largest_px: int) -> Orthophoto | None:

@@ -41,7 +41,7 @@ REACH_M = 4.0
 GROUND_SHARE = 0.2
 """A cluster is on the ground if this share of its cells is: a deck is one cluster with its approaches."""
 BEYOND_M = 3.0
-"""Distance beyond the verge up to which a smooth surface may not follow the ground yet (m)."""
+"""Distance beyond the shoulder up to which a smooth surface may not follow the ground yet (m)."""
 UNKNOWN_M = 2.0
 """Assumed height of a cluster above the DTM where the DTM is unknown (m)."""
 NO_NEIGHBOURS, INCONSISTENT, CONSISTENT = np.uint8(0), np.uint8(1), np.uint8(2)
@@ -51,6 +51,11 @@ MAX_PLANE_VARIANCE = 0.5
 
 Window = tuple[int, int, int, int]
 """First and last row, first and last column; the last ones are exclusive."""
+BEND = 0.1
+"""Largest difference between the slope of a flat patch and the slope of the street (m per m)."""
+RAISED_M2_PER_M = 150.0
+"""Smallest area of a cluster off the ground, per metre above or below the DTM (m2 per m): an elevated road
+is large for its height, a roof is not. Clusters connected to the ground need none."""
 
 
 class Options(base.Options):
@@ -74,23 +79,11 @@ class Options(base.Options):
         description="largest root mean square of a flat patch's residuals to its plane (m); "
         "set it to 1.5 times the DSM's noise",
     )
-    bend: float = Field(
-        0.1,
-        gt=0,
-        le=2,
-        description="largest difference between a flat patch's slope and the street's (m per m)",
-    )
-    raised_m2_per_m: float = Field(
-        150.0,
-        ge=0,
-        description="smallest area of a cluster off the ground, per metre above or below the DTM (m2 per m); "
-        "clusters connected to the ground need none",
-    )
     min_area_m2: float = Field(50.0, ge=0, description="smaller clusters are dropped (m2)")
     keep_largest: int | None = Field(
         None, ge=1, description="number of the largest remaining clusters to keep; null keeps all"
     )
-    verge_m: float = Field(
+    shoulder_m: float = Field(
         0.0,
         ge=0,
         le=50,
@@ -114,8 +107,8 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     RoadClusters
         Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if
         no cluster is large enough. ``dtm_invalid`` marks the dropped cells where the DTM is not the road's
-        height either (under a car on a bridge it is the valley's), and the verge. ``beside`` are the cells
-        of the verge and those up to `BEYOND_M` from it. With levels, it is once for each of them.
+        height either (under a car on a bridge it is the valley's), and the shoulder. ``beside`` are the cells
+        of the shoulder and those up to `BEYOND_M` from it. With levels, it is once for each of them.
     """
     return ecsrc_near(data, road, options, (slice(0, data.grid.height), slice(0, data.grid.width)))
 
@@ -131,21 +124,21 @@ def ecsrc_near(data: TileData, road: RoadMask, options: Options, near: Slices) -
 
         def of_level(seen: TileData, road: RoadMask, other: bool) -> RoadClusters:
             # A deck that is named needs no area.
-            return _clusters_of(
-                seen, road, options.model_copy(update={"raised_m2_per_m": 0.0} if other else {}), near
-            )
+            return _clusters_of(seen, road, options, near, 0.0 if other else RAISED_M2_PER_M)
 
-        return level_clusters(data, road, of_level, options.verge_m, BEYOND_M)
-    return _clusters_of(data, road, options, near)
+        return level_clusters(data, road, of_level, options.shoulder_m, BEYOND_M)
+    return _clusters_of(data, road, options, near, RAISED_M2_PER_M)
 
 
-def _clusters_of(data: TileData, road: RoadMask, options: Options, near: Slices) -> RoadClusters:
+def _clusters_of(
+    data: TileData, road: RoadMask, options: Options, near: Slices, raised_m2_per_m: float
+) -> RoadClusters:
     """Return the clusters of one level."""
     cell, theta = data.grid.cell, options.theta_z_m
     points = road.mask & np.isfinite(data.dsm)
-    patches = flat_patches(data.dsm, points, cell, options.roughness_m, options.bend, data.dtm, theta)
+    patches = flat_patches(data.dsm, points, cell, options.roughness_m, BEND, data.dtm, theta)
     clusters = _clusters(data.dsm, patches, options.theta_xy_m / cell, theta)
-    ground = _on_ground(data, clusters, options)
+    ground = _on_ground(data, clusters, theta, raised_m2_per_m)
     reach = max(1, math.floor(REACH_M / cell + 1e-9))
     # The plane of a foot goes on up the object's side.
     climbing = patches.climbs & (np.abs(data.dsm - data.dtm) > theta)
@@ -156,14 +149,14 @@ def _clusters_of(data: TileData, road: RoadMask, options: Options, near: Slices)
     kept[alone] = np.abs(data.dsm[alone] - data.dtm[alone]) <= theta
     labels = _labels(data.dsm, kept, patches, cell, options)
     dtm_invalid = invalid_dtm(data, road, labels > 0, near)
-    if options.verge_m == 0:
+    if options.shoulder_m == 0:
         return RoadClusters(data.grid, labels, dtm_invalid)
-    reach = math.ceil((options.verge_m + BEYOND_M) / cell) + 1
+    reach = math.ceil((options.shoulder_m + BEYOND_M) / cell) + 1
     around = tuple(slice(max(part.start - reach, 0), part.stop + reach) for part in near)
     mask, beside = road.mask[around], np.zeros_like(dtm_invalid)
-    verge = ~mask & within(_streets(road.mask, labels > 0)[around], cell, options.verge_m)
-    dtm_invalid[around] |= verge
-    beside[around] = ~mask & within(verge, cell, BEYOND_M)
+    shoulder = ~mask & within(_streets(road.mask, labels > 0)[around], cell, options.shoulder_m)
+    dtm_invalid[around] |= shoulder
+    beside[around] = ~mask & within(shoulder, cell, BEYOND_M)
     return RoadClusters(data.grid, labels, dtm_invalid, beside)
 
 
@@ -189,15 +182,15 @@ def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArra
     return covered
 
 
-def _on_ground(data: TileData, clusters: NDArray[np.int32], options: Options) -> Bools:
+def _on_ground(data: TileData, clusters: NDArray[np.int32], theta: float, raised_m2_per_m: float) -> Bools:
     """Return the cells of clusters that are on the ground or large for their height, ``(H, W)``."""
     clustered = clusters >= 0
     member, size = members_of(clusters[clustered], clusters.size)
     height = np.abs(data.dsm[clustered] - data.dtm[clustered])
-    accepted = np.bincount(member, height <= options.theta_z_m, len(size)) >= GROUND_SHARE * size
+    accepted = np.bincount(member, height <= theta, len(size)) >= GROUND_SHARE * size
     raised = ~accepted
     above = raised[member]
-    needed = options.raised_m2_per_m * _medians(height[above], member[above], len(size))
+    needed = raised_m2_per_m * _medians(height[above], member[above], len(size))
     accepted[raised] = (size * data.grid.cell**2 >= needed)[raised]
     ground = np.zeros_like(clustered)
     ground[clustered] = accepted[member]

@@ -33,6 +33,9 @@ from flexroad.tasks.types import Bools, Floats, RoadClusters, TileData
 
 VERSION = 1
 
+STOP_TOLERANCE, STOP_WINDOW = 1e-4, 20
+"""The fit ends early when the loss changes by at most this share over so many steps."""
+
 
 class Options(BaseOptions):
     """Options of the NURBS fit; the defaults are the paper's."""
@@ -72,10 +75,6 @@ class Options(BaseOptions):
         0.1, gt=0, description="learning rate of Adam (m for heights, no unit for ln w)"
     )
     iterations: int = Field(200, ge=0, description="largest number of Adam steps")
-    stop_tolerance: float = Field(
-        1e-4, ge=0, description="stop when the relative change of the loss is below this"
-    )
-    stop_window: int = Field(20, ge=1, description="number of steps over which that change is taken")
     engine: Literal["numba", "torch"] = Field("numba", description="library that computes the gradient")
     device: str = Field(
         "cpu", pattern=r"^(cpu|cuda(:\d+)?)$", description="cpu; with torch also cuda, cuda:1"
@@ -136,8 +135,7 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
 def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Floats]:
     """Return the optimised control heights above the datum (m) and the weights."""
     schedule = adam.Schedule(
-        options.learning_rate, options.iterations, options.stop_tolerance, options.stop_window,
-        options.result == "last",
+        options.learning_rate, options.iterations, STOP_TOLERANCE, STOP_WINDOW, options.result == "last",
     )  # fmt: skip
     if weights := WEIGHTS.get(options.weights):
         variables = np.stack([start, np.full_like(start, weights.start)])

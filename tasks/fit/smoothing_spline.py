@@ -50,8 +50,13 @@ NEAR_M = 25.0
 """A corner or edge has control points of the levels within this distance (m)."""
 ON_JOINT_M = 0.05
 """Crossings of the outline of a level within this distance of its joints (m) are those of joints."""
-BORDER_TOLERANCE = 1e-6
-"""Tolerance of corners and edges at most: they are small, and in a void the loss changes little."""
+TOLERANCE, BORDER_TOLERANCE = 1e-4, 1e-6
+"""The fit of a tile, and of a corner or edge, ends when the loss falls by less than this share in a step.
+Corners and edges are small, and in a void the loss changes little."""
+ITERATIONS = 200
+"""Largest number of steps; a fit takes 5 to 12."""
+TERRAIN_BENDING = 0.02
+"""Weight of the terrain's squared curvature, as a share of the road's: banks beside roads stay steep."""
 
 
 class Options(BaseOptions):
@@ -67,15 +72,8 @@ class Options(BaseOptions):
         0.1, ge=0, description="differences below this (m) are squared, larger ones count linearly; 0 is L1"
     )
     bending_m3: float = Field(30.0, gt=0, description="weight of the road's squared curvature (m3)")
-    bending_terrain: float = Field(
-        0.02, gt=0, le=1000, description="weight of the terrain's squared curvature, as a share of the road's"
-    )
     steps: bool = Field(
         True, description="give the cells beside roads a step above the spline: kerbs, walls and banks"
-    )
-    iterations: int = Field(200, ge=1, description="largest number of steps of reweighted least squares")
-    stop_tolerance: float = Field(
-        1e-4, ge=0, description="stop when the relative decrease of the loss is below this"
     )
 
 
@@ -145,7 +143,7 @@ def _spline(data: TileData, clusters: RoadClusters, options: Options, frame: Fra
         check_cells(ground_to_fit(fitted, clusters, (rows, cols)), (shape[1], shape[0]))
     held = frame.control(shape) if frame else np.full(shape, np.nan)
     problem = _problem(fitted, clusters, lattice, (rows.stop, cols.start), (0, n), (0, m), held, options)
-    z = _with_held(held, _minimum_of(problem, options) + problem.datum)
+    z = _with_held(held, _minimum_of(problem, options, TOLERANCE) + problem.datum)
     # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
     return surface_on(problem.space, core, core.exact_bounds, z, np.ones_like(z), datum=0.0)
 
@@ -203,7 +201,7 @@ def _corner(
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     k, j = _lines(data, clusters, border, lattice)
     held = np.full((2 * j + p, 2 * k + p), np.nan)
-    z = _control_heights(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, _precise(options))
+    z = _control_heights(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, options)
     row, col = border.cell
     around = road.outside[row - 1 : row + 1, col - 1 : col + 1]
     return Corner(rounded(z[j : j + p, k : k + p]), around)
@@ -293,7 +291,7 @@ def _along(
     acting = slice(j, j + m + p), slice(k, k + n + p)
     held[acting][:p, :p], held[acting][-p:, -p:] = (end.control for end in ends)
     u, v = (-k, n + k), (-j, m + j)
-    around = _control_heights(fitted, clusters, lattice, border.cell, u, v, held, _precise(options))
+    around = _control_heights(fitted, clusters, lattice, border.cell, u, v, held, options)
     z = rounded(around[acting])
     return z[:, p:-p] if eastward else z[p:-p], spline_around(lattice, border, u, v, around)
 
@@ -316,12 +314,6 @@ def _on_joints(level: Level, positions: Floats, border: Border) -> Bools:
 
 def _lattice(cells: tuple[int, int], cell: float, options: Options) -> Lattice:
     return Lattice.of(cells, cell, options.degree, options.spacing_m)
-
-
-def _precise(options: Options) -> Options:
-    """Return the options of the fit of a corner or edge."""
-    tolerance = min(options.stop_tolerance, BORDER_TOLERANCE)
-    return options.model_copy(update={"stop_tolerance": tolerance})
 
 
 def _lines(data: TileData, clusters: RoadClusters, border: Border, lattice: Lattice) -> tuple[int, int]:
@@ -352,7 +344,7 @@ def _control_heights(
     problem = _problem(data, clusters, lattice, start, u, v, held, options)
     if np.isnan(problem.heights).all():
         return held
-    return _with_held(held, _minimum_of(problem, options) + problem.datum)
+    return _with_held(held, _minimum_of(problem, options, BORDER_TOLERANCE) + problem.datum)
 
 
 def _problem(
@@ -373,26 +365,26 @@ def _problem(
         space,
         heights=ground - datum,
         weight=np.where(road, 1.0, options.lambda_terrain),
-        stiffness=options.bending_m3 * np.where(road, 1.0, options.bending_terrain),
+        stiffness=options.bending_m3 * np.where(road, 1.0, TERRAIN_BENDING),
         first=np.where(is_held, held, first) - datum,
         held=is_held,
         datum=datum,
     )
 
 
-def _minimum_of(problem: _Problem, options: Options) -> Floats:
+def _minimum_of(problem: _Problem, options: Options, tolerance: float) -> Floats:
     p = problem
-    return _minimum(p.space, p.heights, p.weight, p.stiffness, p.first, p.held, options)
+    return _minimum(p.space, p.heights, p.weight, p.stiffness, p.first, p.held, options.huber_m, tolerance)
 
 
 def _minimum(
     space: Space, heights: Floats, weight: Floats, stiffness: Floats, first: Floats, held: Bools,
-    options: Options,
+    huber_m: float, tolerance: float,
 ) -> Floats:  # fmt: skip
     """Return the control heights above the datum, ``(m, n)``, that minimise the loss over a raster."""
     # Divided by the number of cells with a height, like the differences, so that voids do not change the
     # balance.
     bending = bending_energy(stiffness / np.count_nonzero(np.isfinite(heights)), space)
     loss = objective(heights, weight, space)
-    convex = HuberObjective(loss, first.shape, options.huber_m, bending, held)
-    return minimise(convex, first, options.iterations, options.stop_tolerance).z
+    convex = HuberObjective(loss, first.shape, huber_m, bending, held)
+    return minimise(convex, first, ITERATIONS, tolerance).z

@@ -18,7 +18,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.meshing.road_outline import encoded
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
-from flexroad.tasks.roads.dtm_validity import AGREE_M
+from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M
 from flexroad.tasks.types import Bools, Floats, Level, RoadClusters, RoadMask, TileData
 
 HIDDEN_M = 1.0
@@ -52,13 +52,13 @@ def level_data(data: TileData, clusters: RoadClusters, number: int = 0) -> TileD
 
 
 def level_clusters(
-    data: TileData, road: RoadMask, ecsrc: Filter, verge_m: float, beyond_m: float
+    data: TileData, road: RoadMask, ecsrc: Filter, shoulder_m: float, beyond_m: float
 ) -> RoadClusters:
     """Return the filtered roads of level 0, with those of the other levels.
 
     - `ecsrc`: the filter of one level.
-    - `verge_m`, `beyond_m`: width of the verge, and distance beyond it, up to which the ground beside roads
-      has steps (m).
+    - `shoulder_m`, `beyond_m`: width of the shoulder, and distance beyond it, up to which the ground beside
+      roads has steps (m).
     """
     grid, levels = data.grid, road.levels
     approach = _any(grid, [_taken(level, grid) for level in levels])
@@ -66,14 +66,14 @@ def level_clusters(
     own = ecsrc(_masked(data, levels, 0), road, False)
     # A road below a deck goes on between its visible parts, as stiff as a road. The DTM is interpolated
     # there, from walls, too; ground so near that it acts on the road has its height by steps alone.
-    verge = within(below, grid.cell, APART_M) & ~road.mask
+    shoulder = within(below, grid.cell, APART_M) & ~road.mask
     labels = np.where(below, max(1, int(own.labels.max())), own.labels)
     own = _without(replace(own, labels=labels.astype(np.int32)), approach)
-    own = replace(own, dtm_invalid=verge | (own.dtm_invalid if own.dtm_invalid is not None else False))
+    own = replace(own, dtm_invalid=shoulder | (own.dtm_invalid if own.dtm_invalid is not None else False))
     if own.beside is not None:
-        reach = verge_m + beyond_m
+        reach = shoulder_m + beyond_m
         near = _any(grid, [_cells(shapely.buffer(deck.areas, reach), grid) for deck in _decks(levels)])
-        near |= within(verge, grid.cell, beyond_m)
+        near |= within(shoulder, grid.cell, beyond_m)
         own = replace(own, beside=own.beside | near & ~road.mask)
     return replace(own, levels=tuple(_of_level(data, road, level, ecsrc) for level in levels))
 
@@ -147,7 +147,7 @@ def _masked(data: TileData, levels: tuple[Level, ...], number: int) -> TileData:
     if number == 0:
         dsm = np.where(below, np.nan, data.dsm)
         # A terrain model that has the deck tells nothing of the ground below it.
-        dtm = np.where(below & (np.abs(data.dtm - data.dsm) <= AGREE_M), np.nan, data.dtm)
+        dtm = np.where(below & (np.abs(data.dtm - data.dsm) <= DSM_DTM_TOLERANCE_M), np.nan, data.dtm)
         return _replaced(data, dsm, dtm)
     level = next(level for level in levels if level.number == number)
     own = _own(level, grid)

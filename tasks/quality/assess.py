@@ -24,7 +24,7 @@ from flexroad.tasks.quality.holdout import Refit, holdout
 from flexroad.tasks.quality.structures import STRUCTURE_FLAGS, structures
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.quality.worst import worst_piece
-from flexroad.tasks.roads.dtm_validity import AGREE_M
+from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
@@ -34,7 +34,7 @@ VERSION = 6
 FLAGS = {
     "error-estimate": "error_estimate_m",
     "worst-error": "worst_error_estimate_m",
-    "patch": "suspect_m2",
+    "patch": "max_unexplained_area_m2",
     "spike": "curvature_per_m",
     "edge-step": "edge_step_m",
     "loose": "residual_p95_m",
@@ -43,52 +43,30 @@ FLAGS = {
     "dropped": "dropped_road",
     "weights": "bounded_weights",
 }
-"""Figure of each flag; the flag is raised if the figure exceeds the option with the figure's name."""
+"""Figure of each flag."""
+LIMITS = {
+    "error-estimate": 0.1,  # m
+    "worst-error": 0.5,  # m; good roads have at most 0.32
+    "patch": 50.0,  # m2
+    "spike": 0.2,  # 1/m; a speed hump has less
+    "edge-step": 0.15,  # m; higher than a kerb
+    "loose": 0.5,  # m
+    "off-dtm": 0.1,  # shares of the road from here on
+    "inferred": 0.05,
+    "dropped": 0.5,
+    "weights": 0.25,  # share of the NURBS weights
+}
+"""Threshold of each flag. The flag is raised if its figure is larger."""
 NO_ROAD = "no-road"
 """The flag of a tile without road: its mask has none, or the filter dropped all of it. With an empty mask it
 is the only flag."""
 
 
 class Options(base.Options):
-    """Tolerance between two heights of the same ground, and the threshold of each flag."""
+    """Tolerance between two heights of the same ground, and the check of the error estimate."""
 
-    agree_m: float = Field(
-        AGREE_M, gt=0, description="largest difference between two heights of the same ground (m)"
-    )
-    error_estimate_m: float = Field(
-        0.1,
-        gt=0,
-        description="flag error-estimate: mean estimated error of the surface on the road (m)",
-    )
-    worst_error_estimate_m: float = Field(
-        0.5,
-        gt=0,
-        description="flag worst-error: largest estimated error of a connected 25 m2 of road (m); sound roads "
-        "have at most 0.32",
-    )
-    suspect_m2: float = Field(
-        50.0, gt=0, description="flag patch: largest patch of road farther than agree_m from DSM and DTM (m2)"
-    )
-    curvature_per_m: float = Field(
-        0.2, gt=0, description="flag spike: largest curvature on the road (1/m); a speed hump has less"
-    )
-    edge_step_m: float = Field(
-        0.15, gt=0, description="flag edge-step: p95 of the step at the road's edge (m); higher than a kerb"
-    )
-    residual_p95_m: float = Field(
-        0.5, gt=0, description="flag loose: p95 distance of the kept points to the surface (m)"
-    )
-    off_dtm_road: float = Field(
-        0.1, ge=0, le=1, description="flag off-dtm: share of the road more than agree_m off the DTM"
-    )
-    inferred_road: float = Field(
-        0.05, ge=0, le=1, description="flag inferred: share of the road without a height in the fit"
-    )
-    dropped_road: float = Field(
-        0.5, ge=0, le=1, description="flag dropped: share of the mask that the filter dropped"
-    )
-    bounded_weights: float = Field(
-        0.25, ge=0, le=1, description="flag weights: share of the NURBS weights at a bound"
+    dsm_dtm_tolerance_m: float = Field(
+        DSM_DTM_TOLERANCE_M, gt=0, description="largest difference between two heights of the same ground (m)"
     )
     holdout: float = Field(
         0.0,
@@ -118,7 +96,7 @@ def assess(
     clusters : RoadClusters
         The road cells that the filter kept.
     options : Options
-        Tolerance, thresholds and the share of the road that is withheld.
+        Tolerance, and the share of the road that is withheld.
     refit : callable, optional
         Fits other data of the tile as the surface was fitted; needed if a share is withheld.
 
@@ -156,7 +134,7 @@ def _assess(
     refit: Refit | None = None,
 ) -> Quality:
     """Return the figures of one level."""
-    cells = compare(data, road, clusters, surface, options.agree_m, only_road=True)
+    cells = compare(data, road, clusters, surface, options.dsm_dtm_tolerance_m, only_road=True)
     on_road, kept, classes, height = cells.on_road, cells.kept, cells.classes, cells.height
     estimate, cell = cells.estimate, data.core.cell
     residuals, to_dtm = _finite(cells.off_dsm[kept]), _finite(cells.off_dtm[on_road])
@@ -172,22 +150,22 @@ def _assess(
         "dropped_road": mean(~kept[on_road]),
         "dsm_excess_m": _quantile(_finite(cells.excess[kept]), 50),
         "off_dtm_m": _quantile(to_dtm, 50),
-        "off_dtm_road": mean(np.abs(to_dtm) > options.agree_m),
+        "off_dtm_road": mean(np.abs(to_dtm) > options.dsm_dtm_tolerance_m),
         "bounded_weights": _share_at_bound(surface),
         "error_estimate_m": mean(_finite(estimate[on_road])),
         **_worst(cells, data.core),
-        **asdict(holdout(data, road, clusters, refit, options.agree_m, options.holdout)),
-        "suspect_m2": _largest_patch(on_road & (cells.deviation > options.agree_m)) * cell**2,
+        **asdict(holdout(data, road, clusters, refit, options.dsm_dtm_tolerance_m, options.holdout)),
+        "max_unexplained_area_m2": _largest_patch(on_road & (cells.deviation > options.dsm_dtm_tolerance_m))
+        * cell**2,
     }
     judged = figures | {"inferred_road": mean(cells.lacking[on_road])}
-    flags = [flag for flag, name in FLAGS.items() if judged[name] > getattr(options, name)]
+    flags = [flag for flag, name in FLAGS.items() if judged[name] > LIMITS[flag]]
     if not on_road.any():
-        figures["suspect_m2"] = float("nan")
+        figures["max_unexplained_area_m2"] = float("nan")
         flags = []
     if not kept.any():
         flags = [NO_ROAD, *flags]
-    limits = {flag: getattr(options, name) for flag, name in FLAGS.items()}
-    flagged = flagged_cells(cells, cell, limits, options.agree_m, flags)
+    flagged = flagged_cells(cells, cell, LIMITS, options.dsm_dtm_tolerance_m, flags)
     return Quality(**figures, flags=tuple(flags), support=classes, flagged=flagged)
 
 
@@ -215,7 +193,7 @@ def cell_errors(
     if own and isinstance(surface, LevelledSurface):
         data, road, surface = level_data(data, clusters, number), level_road(road, number), surface.at(number)
         clusters = own[0]
-    cells = compare(data, road, clusters, surface, options.agree_m)
+    cells = compare(data, road, clusters, surface, options.dsm_dtm_tolerance_m)
     classes = _hidden(cells.classes) if number < 0 else cells.classes
     return np.where(classes == Support.NONE, np.nan, cells.estimate), classes
 

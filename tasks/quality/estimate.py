@@ -18,7 +18,7 @@ from flexroad.tasks.levels.joints import TUBE_M
 from flexroad.tasks.levels.seen import hidden, level_data, off_ground, with_approaches
 from flexroad.tasks.quality.support import Support, support
 from flexroad.tasks.roads.distances import distances, filled
-from flexroad.tasks.roads.dtm_validity import AGREE_M, ground_to_fit, rise
+from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M, ground_to_fit, rise
 from flexroad.tasks.roads.flat_patches import CLIMB
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.stepped import SteppedSurface
@@ -52,7 +52,7 @@ def error_estimate(
     It grows with the residuals of the cells of the same class (road or not) around. Away from any height it
     grows by the height that a road may gain since the nearest one. On kept cells it
     is at least the smaller of the DSM's scatter and the distance to the DTM: a tree crown that the filter
-    kept has both, a bridge deck only the second. Where there is no height at all, it is `AGREE_M`.
+    kept has both, a bridge deck only the second. Without any height it is `DSM_DTM_TOLERANCE_M`.
 
     - `residual`: surface minus the height it was fitted to (m); NaN where none entered the fit.
     - `off_dtm`: surface minus DTM (m).
@@ -98,7 +98,7 @@ def _deviation_around(values: Floats, valid: Bools, share: Floats, size: int) ->
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)))
 
 
-def climbed(smooth: Floats, dtm: Floats, kept: Bools, cell: float, agree_m: float) -> Bools:
+def climbed(smooth: Floats, dtm: Floats, kept: Bools, cell: float, dsm_dtm_tolerance_m: float) -> Bools:
     """Return the kept cells where the surface climbs an object, and those that they enclose, ``(H, W)``.
 
     It is off the DTM there, and steeper than a road, in itself and relative to the DTM: a deck is level above
@@ -107,9 +107,9 @@ def climbed(smooth: Floats, dtm: Floats, kept: Bools, cell: float, agree_m: floa
     - `smooth`, `dtm`: heights of the surface without steps, and of the terrain (m).
     - `kept`: road cells that the filter kept.
     - `cell`: size of a cell (m).
-    - `agree_m`: largest difference between two heights of the same ground (m).
+    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     """
-    steep = kept & (np.abs(smooth - dtm) > agree_m)
+    steep = kept & (np.abs(smooth - dtm) > dsm_dtm_tolerance_m)
     if steep.any():
         for heights in (smooth, smooth - dtm):
             slope = scipy.ndimage.generic_gradient_magnitude(heights, scipy.ndimage.sobel) / (8 * cell)
@@ -123,7 +123,7 @@ def _unexplained(residual: Floats, cells: Bools, cell: float) -> Floats:
     valid = cells & np.isfinite(residual)
     # A cell that is farther off than heights of the same ground is a car or a crown. Larger differences count
     # little in the loss of the fit, too.
-    same_ground = np.clip(residual, -AGREE_M, AGREE_M)
+    same_ground = np.clip(residual, -DSM_DTM_TOLERANCE_M, DSM_DTM_TOLERANCE_M)
     square, around = _width(SQUARE_M, cell), _width(AROUND_M, cell)
     share = _share_around(valid, square)
     misfit = np.abs(_mean_around(same_ground, valid, share, square))
@@ -131,7 +131,7 @@ def _unexplained(residual: Floats, cells: Bools, cell: float) -> Floats:
     share = _share_around(counted, around)
     misfit = _mean_around(misfit, counted, share, around)
     if not (share > 0).any():
-        return np.full(residual.shape, AGREE_M)
+        return np.full(residual.shape, DSM_DTM_TOLERANCE_M)
     estimate = filled(np.where(share > 0, LEAST_M + FACTOR * misfit, np.nan), cells)
     away = cells & ~valid
     estimate[away] += rise(distances(away, valid) * cell)
@@ -181,7 +181,7 @@ class Compared:
     inferred cells."""
     estimate: Floats
     """Estimated error of the surface (m), by `quality.estimate.error_estimate`; at least the distance to the
-    DTM on objects that it climbs, and the deviation where that exceeds ``agree_m``."""
+    DTM on objects that it climbs, and the deviation where that exceeds ``dsm_dtm_tolerance_m``."""
     goes_on: Bools
     """Cells of level 0 below decks or above tubes: a road that ends there at a joint goes on."""
     lacking: Bools
@@ -194,19 +194,19 @@ def compare(
     road: RoadMask,
     clusters: RoadClusters,
     surface: Surface,
-    agree_m: float,
+    dsm_dtm_tolerance_m: float,
     only_road: bool = False,
 ) -> Compared:
     """Compare a surface with DSM and DTM cell by cell; with levels, level 0 with what it sees.
 
     - `data`, `road`, `clusters`, `surface`: as in `tasks.quality.assess.assess`.
-    - `agree_m`: largest difference between two heights of the same ground (m).
+    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     - `only_road`: leave the estimated error NaN beside the road; that takes less time.
     """
     data, clusters = level_data(data, clusters), with_approaches(clusters)
     window = data.grid.window(data.core)
     fitted = with_road_heights(data, clusters)
-    every = support(data, road, _with_ground(clusters, surface, data), agree_m)
+    every = support(data, road, _with_ground(clusters, surface, data), dsm_dtm_tolerance_m)
     classes, below = every[window], hidden(road.levels, clusters.number, data.grid)
     on_road = road.mask[window] & (classes != Support.NONE)
     kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
@@ -219,9 +219,11 @@ def compare(
     estimate = error_estimate(residual, off_dtm, spread, kept, on_road, data.core.cell, only_road)
     inferred = classes == Support.INFERRED
     away = deviation(off_dsm, off_dtm, spread, kept, inferred)
-    on_object = climbed(smooth, data.dtm[window], kept, data.core.cell, agree_m)
-    # Within `agree_m` DSM and DTM show the same ground, and residuals say more.
-    least = np.where(on_object, np.abs(off_dtm), np.where(on_road & (away > agree_m), away, np.nan))
+    on_object = climbed(smooth, data.dtm[window], kept, data.core.cell, dsm_dtm_tolerance_m)
+    # Within `dsm_dtm_tolerance_m` DSM and DTM show the same ground, and residuals say more.
+    least = np.where(
+        on_object, np.abs(off_dtm), np.where(on_road & (away > dsm_dtm_tolerance_m), away, np.nan)
+    )
     estimate = np.fmax(estimate, least)
     distance = np.where(inferred, estimate, away)
     excess = (data.dsm - fitted.dsm)[window]

@@ -24,14 +24,18 @@ UNKNOWN = np.uint16(1 << 15)
 
 
 def flagged_cells(
-    cells: Compared, cell: float, limits: Mapping[str, float], agree_m: float, raised: Collection[str]
+    cells: Compared,
+    cell: float,
+    limits: Mapping[str, float],
+    dsm_dtm_tolerance_m: float,
+    raised: Collection[str],
 ) -> Bits:
     """Return the raised flags of each cell, ``(H, W)``.
 
     - `cells`: the surface beside DSM and DTM.
     - `cell`: size of a cell (m).
     - `limits`: threshold of each flag.
-    - `agree_m`: largest difference between two heights of the same ground (m).
+    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     - `raised`: the flags of the tile.
     """
     road = cells.on_road
@@ -41,11 +45,11 @@ def flagged_cells(
     found = {
         "error-estimate": road & (cells.estimate > limits["error-estimate"]),
         "worst-error": _pieces(road & (cells.estimate > limits["worst-error"]), PIECE_M2, cell),
-        "patch": _pieces(road & (cells.deviation > agree_m), limits["patch"], cell),
+        "patch": _pieces(road & (cells.deviation > dsm_dtm_tolerance_m), limits["patch"], cell),
         "spike": bend(cells.height, road) > limits["spike"] * cell**2,
         "edge-step": edge_step(cells.smooth, road, cells.goes_on) > limits["edge-step"],
         "loose": cells.kept & (np.abs(cells.off_dsm) > limits["loose"]),
-        "off-dtm": road & (np.abs(cells.off_dtm) > agree_m),
+        "off-dtm": road & (np.abs(cells.off_dtm) > dsm_dtm_tolerance_m),
         "inferred": cells.lacking,
         "dropped": road & ~cells.kept,
     }

@@ -44,14 +44,14 @@ def holdout(
     road: RoadMask,
     clusters: RoadClusters,
     refit: Refit | None,
-    agree_m: float,
+    dsm_dtm_tolerance_m: float,
     share: float,
 ) -> Holdout:
     """Fit without a share of the road's squares, and compare the surface and its error estimate with them.
 
     - `data`, `road`, `clusters`: as in `tasks.quality.assess.assess`.
     - `refit`: the fit; not needed if ``share`` is 0.
-    - `agree_m`: largest difference between two heights of the same ground (m).
+    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     - `share`: share of the squares that are withheld, from 0 to 1.
     """
     if not share or refit is None:
@@ -69,7 +69,7 @@ def holdout(
     except TaskError:
         # Too few heights are left for a second fit; the tile has its surface all the same.
         return Holdout(0.0, np.nan, np.nan)
-    cells = compare(rest, road, clusters, surface, agree_m, only_road=True)
+    cells = compare(rest, road, clusters, surface, dsm_dtm_tolerance_m, only_road=True)
     off = cells.height - heights_fitted(seen, clusters)[window]
     counted = (squares >= 0) & kept[window]
     _, number = np.unique(squares[counted], return_inverse=True)

@@ -26,14 +26,16 @@ def places(cells: Compared, grid: Grid, options: Options) -> dict[str, Place]:
     - result: easting and northing (m) by flag, whether it is raised or not. Flags without a place are absent:
       those of the complete tile (``weights``, ``no-road``) and those of which the tile has no cell.
     """
-    road, agree_m = cells.on_road, options.agree_m
+    road, dsm_dtm_tolerance_m = cells.on_road, options.dsm_dtm_tolerance_m
     scores = {
         "error-estimate": _around(np.where(road, cells.estimate, 0.0), grid.cell),
-        "patch": _depth(_largest_patch(road & (cells.deviation > agree_m))),
+        "patch": _depth(_largest_patch(road & (cells.deviation > dsm_dtm_tolerance_m))),
         "spike": bend(cells.height, road),
         "edge-step": edge_step(cells.smooth, road, cells.goes_on),
         "loose": np.where(cells.kept, np.abs(cells.off_dsm), 0.0),
-        "off-dtm": _around(np.where(road & (np.abs(cells.off_dtm) > agree_m), 1.0, 0.0), grid.cell),
+        "off-dtm": _around(
+            np.where(road & (np.abs(cells.off_dtm) > dsm_dtm_tolerance_m), 1.0, 0.0), grid.cell
+        ),
         "inferred": _depth(_largest_patch(cells.lacking)),
         "dropped": _depth(_largest_patch(road & ~cells.kept)),
     }

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.meshing.parts import middles
-from flexroad.tasks.roads.dtm_validity import AGREE_M, valid_dtm
+from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M, valid_dtm
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
 
@@ -32,17 +32,17 @@ class Support(IntEnum):
 
 
 def support(
-    data: TileData, road: RoadMask, clusters: RoadClusters, agree_m: float = AGREE_M
+    data: TileData, road: RoadMask, clusters: RoadClusters, dsm_dtm_tolerance_m: float = DSM_DTM_TOLERANCE_M
 ) -> NDArray[np.uint8]:
     """Return the `Support` of each cell, ``(H, W)``, for a fit to the DSM on roads and the DTM elsewhere.
 
     - `data`: DSM and DTM, m.
     - `road`: gives the cells beyond the survey.
     - `clusters`: the road cells fitted to their DSM, and the cells with an invalid DTM.
-    - `agree_m`: largest difference between DSM and DTM of the same ground (m).
+    - `dsm_dtm_tolerance_m`: largest difference between DSM and DTM of the same ground (m).
     """
     has_dtm = np.isfinite(valid_dtm(data, clusters))
-    agreed = has_dtm & (np.abs(data.dsm - data.dtm) <= agree_m)
+    agreed = has_dtm & (np.abs(data.dsm - data.dtm) <= dsm_dtm_tolerance_m)
     classes = np.where(has_dtm & ~clusters.mask, Support.DTM, Support.INFERRED).astype(np.uint8)
     classes[np.where(clusters.mask, np.isfinite(data.dsm), agreed)] = Support.MEASURED
     classes[road.outside] = Support.NONE

@@ -9,7 +9,7 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.roads.distances import columns_of
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
-AGREE_M = 0.3
+DSM_DTM_TOLERANCE_M = 0.3
 """Largest difference of two heights of the same ground (m)."""
 
 
@@ -37,8 +37,8 @@ def invalid_dtm(data: TileData, road: RoadMask, kept: Bools, near: Slices = EVER
     """Return the road cells dropped by the filter whose DTM does not continue the road, ``(H, W)``.
 
     The expected height is that of the plane through the kept cells around. The DTM may differ from it by
-    `AGREE_M`, plus the scatter of those cells, plus the rise of a crest over the distance to the nearest of
-    them. Farther than `REACH_M` from all kept cells the DTM is taken as valid.
+    `DSM_DTM_TOLERANCE_M`, plus the scatter of those cells, plus the rise of a crest over the distance to the
+    nearest of them. Farther than `REACH_M` from all kept cells the DTM is taken as valid.
 
     - `data`: DSM and DTM, m.
     - `kept`: the filtered mask.
@@ -51,7 +51,7 @@ def invalid_dtm(data: TileData, road: RoadMask, kept: Bools, near: Slices = EVER
     if checked.any() and kept.any():
         expected, scatter, away = extrapolated_plane(data.dsm, kept, checked, data.grid.cell)
         off = np.abs(data.dtm[checked] - expected)
-        invalid[checked] = (away <= REACH_M) & (off > AGREE_M + scatter + rise(away))
+        invalid[checked] = (away <= REACH_M) & (off > DSM_DTM_TOLERANCE_M + scatter + rise(away))
     return invalid
 
 

@@ -23,6 +23,8 @@ LEVEL_COLUMNS = (
 """Columns with a number; of the BGT (Netherlands), BD TOPO (France) and swissTLM3D."""
 STRUCTURE_COLUMNS = ("kunstbaute", "verticalposition", "bauwerksfunktion", "bwf")
 """Columns with a word or code of a structure; of swissTLM3D, INSPIRE, and ATKIS and ALKIS (Germany)."""
+COLUMNS = (*OSM_TAGS, *LEVEL_COLUMNS, *STRUCTURE_COLUMNS)
+"""All columns that are read for levels, in lower case."""
 HIGHEST = 5
 """Levels are numbers from minus to plus this."""
 UNKNOWN = 1000
@@ -55,29 +57,17 @@ UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue"})
 Levels = NDArray[np.int64]
 
 
-def columns(
-    level_columns: tuple[str, ...] = LEVEL_COLUMNS, structure_columns: tuple[str, ...] = STRUCTURE_COLUMNS
-) -> tuple[str, ...]:
-    """Return the columns, or OSM tags, that `level_numbers` looks at, in lower case."""
-    return tuple(dict.fromkeys(map(str.lower, (*OSM_TAGS, *level_columns, *structure_columns))))
-
-
-def level_numbers(
-    table: Any,
-    level_columns: tuple[str, ...] = LEVEL_COLUMNS,
-    structure_columns: tuple[str, ...] = STRUCTURE_COLUMNS,
-) -> tuple[Levels, tuple[str, ...]]:
+def level_numbers(table: Any) -> tuple[Levels, tuple[str, ...]]:
     """Return the level of every row, ``(n,)``, and a note per column with values that cannot be read.
 
     A row takes the first of these that it has: OSM's ``bridge`` or ``tunnel``, with the number in ``layer``;
-    a number in one of ``level_columns``; a word in one of ``structure_columns``. Without any it is on level
-    0.
+    a number in one of `LEVEL_COLUMNS`; a word in one of `STRUCTURE_COLUMNS`. Without any it is on level 0.
 
     - `table`: its columns are named in lower case.
     """
     levels, notes = _osm(table), list[str]()
-    for names, read in ((level_columns, _number), (structure_columns, _structure)):
-        for column in map(str.lower, names):
+    for names, read in ((LEVEL_COLUMNS, _number), (STRUCTURE_COLUMNS, _structure)):
+        for column in names:
             bad = []
             for i, value in enumerate(table.get(column, ())):
                 if levels[i] is None and has_value(value):

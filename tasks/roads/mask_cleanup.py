@@ -1,4 +1,4 @@
-"""Clean a road mask: combine it with a second source, close gaps, fill holes, drop small pieces.
+"""Clean a predicted road mask: close gaps, fill holes, drop small pieces.
 
 Widths and areas are in metres and m2 for any cell size. Pieces and holes that touch the edge of the grid may
 continue beyond it, so they are kept.
@@ -11,10 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from flexroad.catalog.lazy import lazy
-from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
@@ -27,52 +25,28 @@ SLACK = 1e-9
 """Tolerance of sizes as a fraction of a cell, so that 0.6 m is three cells of 0.2 m."""
 
 
-class Cleanup(options.Options):
-    """Steps of the cleanup, in this order; 0 or none skips a step."""
+CLOSE_M = 2.0
+"""Gaps up to this width (m) are closed, such as shadows of poles."""
+FILL_M2, DROP_M2 = 10.0, 25.0
+"""Holes up to a car's area (m2) are filled; pieces smaller than two parking bays (m2) are dropped."""
+CORRIDOR_M = 5.0
+"""Width of the corridor around the roads of the catalog (m): widths and places of centre lines are rough."""
 
-    fuse: Literal["none", "union", "intersection", "corridor"] = Field(
-        "none",
-        description="combine with a second source: union: road in either; intersection: road in both; "
-        "corridor: the mask within corridor_m of the second source",
-    )
-    fuse_with: Literal["roads", "road_mask"] = Field(
-        "roads", description="the second source: the catalog's vectors or its road mask"
-    )
-    roads: rasterise.Options = Field(
-        rasterise.DEFAULTS, description="selection and width of the vectors: as with method: vector"
-    )
-    corridor_m: float = Field(5.0, ge=0, le=100, description="width of the corridor around it (m)")
-    close_m: float = Field(2.0, ge=0, le=50, description="close gaps up to this width (m)")
-    fill_m2: float = Field(10.0, ge=0, description="fill holes up to this area (m2)")
-    drop_m2: float = Field(25.0, ge=0, description="drop pieces smaller than this area (m2)")
+Cleanup = Literal["none", "pieces", "corridor"]
 
 
-NOTHING = Cleanup(close_m=0, fill_m2=0, drop_m2=0)
-"""Options that leave every mask unchanged."""
-
-
-def clean(mask: Bools, data: TileData, options: Cleanup) -> Bools:
+def clean(mask: Bools, data: TileData, cleanup: Cleanup) -> Bools:
     """Return the cleaned mask, ``(H, W)``; cells beyond the survey are never added.
 
     Gaps are closed before areas are measured, so that a road in fragments counts as one piece.
     """
+    if cleanup == "none":
+        return mask
     cell = data.grid.cell
-    fused = mask if options.fuse == "none" else fuse(mask, _second(data, options), cell, options)
-    filled = fill(close(fused, cell, options.close_m), cell, options.fill_m2)
-    return drop(fused | (filled & ~beyond_extent(data)), cell, options.drop_m2)
-
-
-def fuse(mask: Bools, second: Bools, cell: float, options: Cleanup) -> Bools:
-    """Return the mask combined with a second one by ``options.fuse``, ``(H, W)``."""
-    match options.fuse:
-        case "union":
-            return mask | second
-        case "intersection":
-            return mask & second
-        case "corridor":
-            return mask & within(second, cell, options.corridor_m)
-        case _:
-            return mask
+    if cleanup == "corridor":
+        mask = mask & within(_roads(data), cell, CORRIDOR_M)
+    filled = fill(close(mask, cell, CLOSE_M), cell, FILL_M2)
+    return drop(mask | (filled & ~beyond_extent(data)), cell, DROP_M2)
 
 
 def close(mask: Bools, cell: float, width_m: float) -> Bools:
@@ -116,16 +90,15 @@ def _pieces(mask: Bools, cell: float, connectivity: int) -> tuple[NDArray[np.int
     return pieces, stats[:, cv2.CC_STAT_AREA] * cell**2, inner
 
 
-def _second(data: TileData, options: Cleanup) -> Bools:
-    if options.fuse_with == "road_mask" and data.road_mask is not None:
-        return data.road_mask
-    if options.fuse_with == "roads" and data.roads is not None:
-        return rasterise.rasterise_roads(data, options.roads)
-    raise TaskError(
-        f"cleanup.fuse: {options.fuse} needs {options.fuse_with}, which the tile lacks; give "
-        f"--{options.fuse_with.replace('_', '-')} to `flexroad catalog rasters`, or set cleanup.fuse: none",
-        layer=options.fuse_with,
-    )
+def _roads(data: TileData) -> Bools:
+    """Return the cells of the catalog's roads."""
+    if data.roads is None:
+        raise TaskError(
+            "cleanup: corridor needs roads, which the tile lacks; give --roads to `flexroad catalog "
+            "rasters`, or set segment.cleanup: pieces",
+            layer="roads",
+        )
+    return rasterise.rasterise_roads(data)
 
 
 def _bytes(mask: Bools) -> NDArray[np.uint8]:

@@ -6,7 +6,7 @@ Lines have flat ends; where ends of lines meet, a disc closes the wedge between 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -87,13 +87,6 @@ class Roads:
     notes: tuple[str, ...] = ()
 
 
-class LevelColumns(NamedTuple):
-    """Columns that name the level of a road."""
-
-    numbers: tuple[str, ...] = level_numbers.LEVEL_COLUMNS
-    structures: tuple[str, ...] = level_numbers.STRUCTURE_COLUMNS
-
-
 def rasterise_roads(data: TileData, options: Options = DEFAULTS) -> Bools:
     """Return the cells of a tile whose centre is on a road, ``(H, W)``; see `roads` for errors."""
     return cells(roads(data.roads, data.grid, options).areas, data.grid)
@@ -110,13 +103,12 @@ def cells(areas: NDArray[np.object_], grid: Grid) -> Bools:
     return np.asarray(burnt != 0)
 
 
-def roads(source: Source | None, grid: Grid, options: Options, levels: LevelColumns | None = None) -> Roads:
+def roads(source: Source | None, grid: Grid, options: Options, levels: bool = False) -> Roads:
     """Return the roads on and around a grid, as polygons.
 
     - `source`: the tile's layer ``roads``.
     - `grid`: the area to read; roads that touch it are returned whole.
-    - `levels`: columns with the level of a road. Roads below level 0 are then kept, whatever
-      `Options.tunnels` says.
+    - `levels`: whether to read levels. Roads below level 0 are then kept, whatever `Options.tunnels` says.
     """
     if source is None:
         raise LayerMissing(
@@ -124,10 +116,10 @@ def roads(source: Source | None, grid: Grid, options: Options, levels: LevelColu
             "or `flexroad prepare`"
         )
     # Both portals of a tube that reaches the grid are seen.
-    reach = max(options.max_width_m / 2, FARTHEST_M if levels else 0.0)
+    reach = max(widths.MAX_WIDTH_M / 2, FARTHEST_M if levels else 0.0)
     west, south, east, north = grid.bounds
     bounds = (west - reach, south - reach, east + reach, north + reach)
-    names = columns(options) + (level_numbers.columns(*levels) if levels else ())
+    names = columns(options) + (level_numbers.COLUMNS if levels else ())
     layer = options.layer or source.sublayer
     parts, notes = list[Roads](), list[str]()
     for path in source.paths:
@@ -145,14 +137,14 @@ def roads(source: Source | None, grid: Grid, options: Options, levels: LevelColu
 
 def columns(options: Options) -> tuple[str, ...]:
     """Return the columns, or OSM tags, that a selection of roads and their widths need, in lower case."""
-    of_width = (*options.width_columns, *options.lane_columns, *options.width_class_columns)
+    of_width = (*options.width_columns, *options.lane_columns, *widths.WIDTH_CLASS_COLUMNS)
     names = (*of_width, *options.class_columns, *CLASS_TAGS, BRIDGE, AREA, *HIDDEN_TAGS)
     return tuple(dict.fromkeys(name.lower() for name in names))
 
 
-def _from_table(table: Any, options: Options, columns: LevelColumns | None) -> Roads:
+def _from_table(table: Any, options: Options, levels: bool) -> Roads:
     """Return the roads of one table."""
-    table, classes, numbers, unread = selected(table, options, columns)
+    table, classes, numbers, unread = selected(table, options, levels)
     # A collection of multi-part features needs two steps to be split into simple parts.
     members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
     parts, member = shapely.get_parts(members, return_index=True)
@@ -177,7 +169,7 @@ def _from_table(table: Any, options: Options, columns: LevelColumns | None) -> R
 
 
 def selected(
-    table: Any, options: Options, levels: LevelColumns | None
+    table: Any, options: Options, levels: bool
 ) -> tuple[Any, NDArray[np.object_], NDArray[np.int64], tuple[str, ...]]:
     """Return the rows of a table that are roads, the class of each, in lower case or empty, and its level.
 
@@ -185,7 +177,7 @@ def selected(
     """
     numbers, notes = np.zeros(len(table), np.int64), tuple[str, ...]()
     if levels:
-        numbers, notes = level_numbers.level_numbers(table, *levels)
+        numbers, notes = level_numbers.level_numbers(table)
     classes = _classes(table, options.class_columns)
     chosen = _is_road(table, classes, options, numbers < 0)
     return table[chosen], classes[chosen], numbers[chosen], notes

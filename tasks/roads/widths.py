@@ -57,6 +57,12 @@ PRIMES = str.maketrans({"’": "'", "′": "'", "”": '"', "″": '"', ",": "."
 MOST_LANES = 16
 WIDEST_M = 1000.0
 """Numbers from here on are codes for "unknown", as 9998."""
+LANE_WIDTH_M, SHOULDER_M = 3.25, 0.25
+"""Width of a lane, and of the shoulder on either side (m): a road of two lanes is 7 m wide."""
+MIN_WIDTH_M, MAX_WIDTH_M = 2.0, 40.0
+"""Narrower and wider lines get these widths (m): other values are errors of the data."""
+WIDTH_CLASS_COLUMNS = ("brv", "breiteDesVerkehrsweges")
+"""Columns with a width in classes of 3 m, with shoulders; used without width and lanes."""
 CLASS_STEP_M, LOWEST_CLASS_M = 3.0, 6.0
 """ATKIS gives ``breiteDesVerkehrsweges`` as the upper end of a class: 6 is up to 6 m, 9 is 6 to 9 m."""
 
@@ -72,26 +78,11 @@ class Options(base.Options):
         ("lanes", "fsz", "anzahlDerFahrstreifen"),
         description="columns (or OSM tags) with the number of lanes; the first with a value wins",
     )
-    width_class_columns: tuple[str, ...] = Field(
-        ("brv", "breiteDesVerkehrsweges"),
-        description="columns with a width in classes of 3 m, with shoulders; used without width and lanes",
-    )
     width_unit: Literal["m", "ft"] = Field("m", description="unit of widths without one")
-    lane_width_m: float = Field(
-        3.25, gt=0, le=10, description="width of a lane (m), if the number of lanes is given"
-    )
-    shoulder_m: float = Field(
-        0.25,
-        ge=0,
-        le=10,
-        description="shoulder beside the outer lanes on either side (m), if the number of lanes is given",
-    )
     class_width_m: dict[str, float] = Field(
         CLASS_WIDTH_M, description="width by class (m); entries replace those of the built-in table"
     )
     default_width_m: float = Field(6.0, gt=0, le=100, description="width of lines without any of these (m)")
-    min_width_m: float = Field(2.0, gt=0, le=100, description="smallest width; narrower lines get it (m)")
-    max_width_m: float = Field(40.0, gt=0, le=100, description="largest width; wider lines get it (m)")
 
     @field_validator("class_width_m")
     @classmethod
@@ -133,7 +124,7 @@ def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[st
                 # In many tables 0 means unknown.
                 width[i] = value if np.isnan(width[i]) and 0 < value < WIDEST_M else width[i]
     by_class = np.array([options.class_width_m.get(str(name), np.nan) for name in classes], float)
-    for other in (_by_lanes(table, options), _by_width_class(table, options), by_class):
+    for other in (_by_lanes(table, options), _by_width_class(table), by_class):
         width = np.where(np.isnan(width), other, width)
     unknown = int(np.isnan(width).sum())
     notes = []
@@ -148,7 +139,7 @@ def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[st
             f"{options.default_width_m:g} m wide"
         )
     width = np.where(np.isnan(width), options.default_width_m, width)
-    return np.clip(width, options.min_width_m, options.max_width_m), tuple(notes)
+    return np.clip(width, MIN_WIDTH_M, MAX_WIDTH_M), tuple(notes)
 
 
 def lanes(table: Any, options: Options) -> Floats:
@@ -157,12 +148,12 @@ def lanes(table: Any, options: Options) -> Floats:
 
 
 def _by_lanes(table: Any, options: Options) -> Floats:
-    return lanes(table, options) * options.lane_width_m + 2 * options.shoulder_m
+    return lanes(table, options) * LANE_WIDTH_M + 2 * SHOULDER_M
 
 
-def _by_width_class(table: Any, options: Options) -> Floats:
+def _by_width_class(table: Any) -> Floats:
     """Return the middle of each row's class of widths (m), ``(n,)``."""
-    upper = _numbers(table, options.width_class_columns, LOWEST_CLASS_M, WIDEST_M)
+    upper = _numbers(table, WIDTH_CLASS_COLUMNS, LOWEST_CLASS_M, WIDEST_M)
     return np.where(upper == LOWEST_CLASS_M, LOWEST_CLASS_M / 2, upper - CLASS_STEP_M / 2)
 
 

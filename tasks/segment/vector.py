@@ -9,9 +9,8 @@ from pydantic import Field, model_validator
 
 from flexroad.tasks.levels.joints import levels_of
 from flexroad.tasks.meshing.road_outline import encoded
-from flexroad.tasks.roads import level_numbers, rasterise
+from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.extent import beyond_extent
-from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean
 from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 2
@@ -22,40 +21,25 @@ NEEDS = ("roads",)
 
 
 class Options(rasterise.Options):
-    """Selection of the road features, widths of the lines, and cleanup of the mask."""
+    """Selection of the road features, and widths of the lines."""
 
     method: Literal["vector"] = "vector"
-    cleanup: Cleanup = Field(NOTHING, description="cleanup of the mask; none by default")
     outlines: bool = Field(
         True,
         description="meshes have the outlines of the areas as edges, instead of steps from cell to cell; "
-        "without cleanup, and with sample: {method: dynamic, mask: raw}",
+        "with sample: {method: dynamic, mask: raw}",
     )
     levels: bool = Field(
         False,
         description="roads above and below roads have surfaces of their own; with ecsrc: planar, "
         "fit: smoothing_spline and load.halo_m of 40 m or more",
     )
-    level_columns: tuple[str, ...] = Field(
-        level_numbers.LEVEL_COLUMNS,
-        description="columns with the level of a road as a number, besides OSM's tags: 0 on the ground",
-    )
-    structure_columns: tuple[str, ...] = Field(
-        level_numbers.STRUCTURE_COLUMNS,
-        description="columns with a word or code of a bridge or tunnel, for roads without such a number",
-    )
 
     @model_validator(mode="after")
     def _levels_have_outlines(self) -> Options:
-        if self.levels and (self.cleanup != NOTHING or not self.outlines):
-            raise ValueError("levels need the outlines of roads; leave out cleanup, and set outlines to true")
+        if self.levels and not self.outlines:
+            raise ValueError("levels need the outlines of roads; set outlines to true")
         return self
-
-    @property
-    def read_levels(self) -> rasterise.LevelColumns | None:
-        """The columns with the level of a road; None if levels are not read."""
-        columns = rasterise.LevelColumns(self.level_columns, self.structure_columns)
-        return columns if self.levels else None
 
 
 def segment(data: TileData, options: Options) -> RoadMask:
@@ -72,10 +56,10 @@ def segment(data: TileData, options: Options) -> RoadMask:
         note = "segment: no file of the roads layer reaches this tile, so it counts as a tile without roads"
         nowhere = np.zeros(data.grid.shape, np.bool_)
         return RoadMask(data.grid, data.core, nowhere, beyond_extent(data), bridge=nowhere, notes=(note,))
-    roads = rasterise.roads(data.roads, data.grid, options, options.read_levels)
+    roads = rasterise.roads(data.roads, data.grid, options, options.levels)
     levels, left_out = levels_of(roads.areas, roads.shapes, roads.level, data)
     areas, bridge = roads.areas[roads.level == 0], roads.bridge[roads.level == 0]
-    mask = clean(rasterise.cells(areas, data.grid), data, options.cleanup)
+    mask = rasterise.cells(areas, data.grid)
     notes = (*roads.notes, *left_out)
     if data.lacks_road(mask) and not levels:
         files = ", ".join(path.name for path in data.roads.paths)
@@ -83,15 +67,13 @@ def segment(data: TileData, options: Options) -> RoadMask:
             f"segment: no road of {files} lies on this tile; if there are roads, check segment.layer, "
             "segment.where and segment.left_out",
         )
-    # Cleanup changes cells, which have no outline.
-    outlines = options.outlines and options.cleanup == NOTHING
     return RoadMask(
         grid=data.grid,
         core=data.core,
         mask=mask,
         outside=beyond_extent(data),
-        bridge=rasterise.cells(areas[bridge], data.grid) & mask,
-        areas=encoded(areas, data.core) if outlines else None,
+        bridge=rasterise.cells(areas[bridge], data.grid),
+        areas=encoded(areas, data.core) if options.outlines else None,
         notes=notes,
         levels=levels,
     )

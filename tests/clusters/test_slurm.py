@@ -13,7 +13,7 @@ import yaml
 
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import DaskExecutor
+from flexroad.pipeline.execute import DaskExecutor, clusters
 from flexroad.pipeline.execute.clusters import open_cluster
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests.dask_processes import until
@@ -61,10 +61,11 @@ def end_at_walltime(job):
     subprocess.run(["scontrol", "update", f"JobId={job}", "EndTime=now"], check=True)
 
 
-def test_map_job_of_two_workers_ended_by_time_limit_is_submitted_again(slurm, tmp_path):
+def test_map_job_of_two_workers_ended_by_time_limit_is_submitted_again(slurm, tmp_path, monkeypatch):
     said = []
     # The wait for the next job is that for the first one.
-    night = Cluster(**TWO, patience_s=0)
+    monkeypatch.setattr(clusters, "WORKER_LOST_TIMEOUT_S", 0)
+    night = Cluster(**TWO)
     executor = DaskExecutor(cluster=night, say=said.append, logs=tmp_path / "logs")
 
     def jobs():

@@ -21,7 +21,7 @@ def test_fit_of_barbican_equals_literal_fit(real_data, tmp_path, monkeypatch, nu
         archive.extractall(tmp_path)
     layers = {"dsm": "dsm_barb*.tif", "dtm": "dem_barb*.tif", "road_mask": "landcover*.tif"}
     data = load(index(tmp_path / "London_BNG", layers, road_values=(1,)).tiles[number], Options())
-    clusters = planar.ecsrc(data, mask.segment(data, mask.Options()), planar.Options(verge_m=5))
+    clusters = planar.ecsrc(data, mask.segment(data, mask.Options()), planar.Options(shoulder_m=5))
     surfaces = []
     for literal in (False, True):
         if literal:

@@ -44,7 +44,7 @@ CHOICES = {
     "segment": ("mask", "vector"),
     "load.halo_m": ("20", "40"),
     "load.min_valid": ("0.25", "0.9"),
-    "ecsrc.verge_m": ("5", "10"),
+    "ecsrc.shoulder_m": ("5", "10"),
     "fit.bending_m3": ("30", "100"),
     "sample.terrain_m": ("20", "30"),
 }

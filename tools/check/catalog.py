@@ -250,7 +250,7 @@ def _named(data: TileData, options: rasterise.Options) -> NDArray[np.object_]:
     source = data.roads
     if source is None:
         return np.empty(0, object)
-    shapes, layer, names = [], options.layer or source.sublayer, level_numbers.columns()
+    shapes, layer, names = [], options.layer or source.sublayer, level_numbers.COLUMNS
     for path in source.paths:
         table = read_near(
             Query(path, layer, options.where, names, source.crs, data.grid.crs), data.grid.bounds

@@ -14,7 +14,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.tasks.io.vectors import Query, encoding_notes, read_near
 from flexroad.tasks.roads import level_numbers, widths
 from flexroad.tasks.roads.attributes import has_value
-from flexroad.tasks.roads.rasterise import LevelColumns, Options, columns, selected
+from flexroad.tasks.roads.rasterise import Options, columns, selected
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.types import Source
 
@@ -42,18 +42,17 @@ class CentreLines:
 
 
 def read_centre_lines(
-    source: Source, bounds: Bounds, crs: str, options: Options, levels: LevelColumns | None = None
+    source: Source, bounds: Bounds, crs: str, options: Options, levels: bool = False
 ) -> CentreLines:
     """Return the centre lines whose boxes touch an area.
 
     - `source`: vector files; equal lines of several files are one.
     - `bounds`: west, south, east and north (m, in ``crs``).
     - `crs`: CRS of the result.
-    - `levels`: columns with the level of a road. Roads below level 0 are then kept, whatever
-      ``options.tunnels`` says.
+    - `levels`: whether to read levels. Roads below level 0 are then kept, whatever ``options.tunnels`` says.
     """
     names = (*columns(options), *NAMES, *DIRECTIONS, JUNCTION)
-    names += level_numbers.columns(*levels) if levels else ()
+    names += level_numbers.COLUMNS if levels else ()
     found: dict[bytes, CentreLine] = {}
     areas, notes = 0, list[str]()
     for path in source.paths:
@@ -66,7 +65,7 @@ def read_centre_lines(
     return CentreLines(tuple(found.values()), areas, tuple(dict.fromkeys(notes)))
 
 
-def from_table(table: Any, options: Options, levels: LevelColumns | None = None) -> CentreLines:
+def from_table(table: Any, options: Options, levels: bool = False) -> CentreLines:
     """Return the centre lines of a table of features, whose columns are in lower case."""
     table, classes, numbers, unread = selected(table, options, levels)
     members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)

@@ -79,8 +79,7 @@ def export(
     area: options.Area = None,
     area_layer: options.AreaLayer = None,
     allow: options.Allow = None,
-    executor: options.Executor = "serial",
-    workers: options.Workers = None,
+    workers: options.Parallel = 1,
 ) -> None:
     """Write finished tiles in the formats of other programs.
 
@@ -93,7 +92,7 @@ def export(
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)
     track = StepProgress(Console(stderr=True))
-    runner = SerialExecutor() if executor == "serial" else DaskExecutor(workers)
+    runner = SerialExecutor() if workers == 1 else DaskExecutor(workers)
     try:
         source = select(
             parse_location(path),

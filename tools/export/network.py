@@ -88,7 +88,7 @@ def _read(source: Source, options: Options) -> CentreLines:
     else:
         places = _of_catalog(source)
         chosen = stage if isinstance(stage, rasterise.Options) else rasterise.Options()
-    levels = stage.read_levels if isinstance(stage, vector.Options) else None
+    levels = isinstance(stage, vector.Options) and stage.levels
     parts = []
     for (path, crs, sublayer), bounds in places.items():
         layer_source = types.Source("roads", (path,), crs, sublayer=sublayer)

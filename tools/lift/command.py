@@ -64,10 +64,6 @@ def lift(
         bool,
         typer.Option("--allow-steps", help="End with exit code 0 although the tiles below do not meet."),
     ] = False,
-    variant: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Variant of the surface; default: the exported one."),
-    ] = None,
     allow: options.Allow = None,
 ) -> None:
     """Write a road network or features with heights of a run.
@@ -81,7 +77,7 @@ def lift(
     if report is None and (grade, crossfall) != (None, None):
         raise ConfigError("places above limits are written beside the report; give --report FILE.csv")
     wanted = replace(wanted, grade_limit=grade, crossfall_limit=crossfall)
-    ground = Ground.open(path, variant, allow or (), earlier=True)
+    ground = Ground.open(path, allow=allow or (), earlier=True)
     result = lift_file(ground, file, output, wanted, crs, offset, report)
     echo(f"{output}: {result.summary}")
     if result.earlier:

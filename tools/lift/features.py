@@ -50,7 +50,7 @@ class Feature:
 
 def level_columns(names: Iterable[str]) -> list[str]:
     """Return the columns of a layer that say the level of a feature; none if nothing does."""
-    known = level_numbers.columns()
+    known = level_numbers.COLUMNS
     own = [name for name in names if name.lower() in known]
     # OSM's layer orders what crosses; by itself it is no level, and often something else.
     return own if any(name.lower() != "layer" for name in own) else []

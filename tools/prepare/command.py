@@ -18,7 +18,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.signals import INTERRUPTED
 from flexroad.pipeline.cli.stdio import echo
-from flexroad.pipeline.config.options import GROUND, RASTERS, RECONSTRUCTION, option
+from flexroad.pipeline.config.options import GROUND, RECONSTRUCTION, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor
 from flexroad.pipeline.run.lock import run_lock
@@ -28,7 +28,7 @@ from flexroad.tools.prepare.options import PrepareOptions
 from flexroad.tools.prepare.output import check_replaced, disk_errors
 from flexroad.tools.prepare.photos import mvs_cpu, sfm
 from flexroad.tools.prepare.points import ground_filter, morphological
-from flexroad.tools.prepare.points.to_rasters import BRIDGE_CLASSES, Options
+from flexroad.tools.prepare.points.to_rasters import Options
 from flexroad.tools.prepare.raster_writer import PreparedDataset
 
 app = group("prepare", "Make rasters and a catalog of points, meshes or photographs.")
@@ -48,12 +48,6 @@ class _RasterOptions:
     radius_m: float | None = option(
         None, GROUND, "Ground filter: search radius in m, half the widest roof.", "METRES", min=1
     )
-    fill_m: float | None = option(
-        None, RASTERS, "Fill voids of the DSM up to this width in m.", "METRES", min=0
-    )
-    void_m: float | None = option(
-        None, RASTERS, "Fill voids of the DTM up to this width in m.", "METRES", min=0
-    )
 
     def of(self, **more: Any) -> Options:
         """Return the options for making rasters, with more of them; None keeps a default."""
@@ -62,7 +56,7 @@ class _RasterOptions:
             more["morphological"] = morphological.Options(**given)
         else:
             more["filter"] = ground_filter.Options(**given)
-        return Options(**_given(fill_m=self.fill_m, void_m=self.void_m, **more))
+        return Options(**_given(**more))
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -130,32 +124,10 @@ def prepare_points(
         typer.Option(
             metavar="N",
             rich_help_panel=GROUND,
-            help="Classes of bridge decks; default: those of --class-scheme.",
-        ),
-    ] = None,
-    class_scheme: Annotated[
-        Literal["asprs", "ahn"],
-        typer.Option(
-            rich_help_panel=GROUND,
-            help="Meaning of the classes: bridges are 17 in asprs, 26 in the Dutch AHN.",
-        ),
-    ] = "asprs",
-    dtm: Annotated[
-        Literal["tin", "mean"] | None,
-        typer.Option(
-            rich_help_panel=RASTERS, help="DTM: linear between ground points, or their mean per cell."
+            help="Classes of bridge decks; default: 17; 26 in the Dutch AHN.",
         ),
     ] = None,
     rasters: _RasterOptions,
-    despike: Annotated[
-        float | None,
-        typer.Option(
-            min=0.1,
-            metavar="METRES",
-            rich_help_panel=GROUND,
-            help="Drop single points that are this much above all around (m).",
-        ),
-    ] = None,
     workers: options.Workers = None,
     common: PrepareOptions,
 ) -> None:
@@ -164,11 +136,9 @@ def prepare_points(
     They are DSM, DTM, bridge decks and orthophoto.
     """
     options = rasters.of(
-        despike_m=despike,
-        dtm=dtm,
         ground=ground if ground == "morphological" else None,
         ground_classes=ground_class,
-        bridge_classes=bridge_class or BRIDGE_CLASSES[class_scheme],
+        bridge_classes=bridge_class,
     )
     _run(
         output,
@@ -205,7 +175,7 @@ def prepare_mesh(
 def prepare_odm(
     project: Annotated[Path, typer.Argument(metavar="PROJECT", help="Project folder of OpenDroneMap.")],
     output: options.OutputFolder,
-    mesh_options: Annotated[from_mesh.MeshOptions, "density", "seed"],
+    mesh_options: Annotated[from_mesh.MeshOptions, "density"],
     rasters: _RasterOptions,
     *,
     workers: options.Workers = None,
@@ -253,10 +223,6 @@ def prepare_photos(
             help="Longest side of images for dense stereo, in pixels.",
         ),
     ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, metavar="N", rich_help_panel=RECONSTRUCTION, help="Random seed."),
-    ] = None,
     workers: options.Workers = None,
     common: PrepareOptions,
 ) -> None:
@@ -266,7 +232,7 @@ def prepare_photos(
     """
     photos_options = replace(
         photos_options,
-        sfm=sfm.Options(**_given(image_size=image_size, seed=seed)),
+        sfm=sfm.Options(**_given(image_size=image_size)),
         stereo=mvs_cpu.Options(**_given(size=stereo_size)),
         **_given(patchmatch_size=stereo_size),
     )

@@ -76,9 +76,10 @@ class MeshOptions:
     )
     """Easting, northing and height (m)."""
     density: float = option(25.0, RASTERS, "Sampled points per m2 of the mesh's surface.", "NUMBER", min=0.1)
-    seed: int = option(0, RASTERS, "Random seed of the sampling.", "N", min=0)
+    seed: int = 0
+    """Random seed of the sampling."""
     dop: bool = option(True, RASTERS, "Make no orthophoto.")
-    refine: bool = option(True, RASTERS, "Do not refine the DTM by ECSRC.")
+    refine: bool = True
     """Whether the DTM is refined by ECSRC, as in the paper."""
 
 

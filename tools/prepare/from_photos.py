@@ -16,7 +16,7 @@ import numpy as np
 
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import some
-from flexroad.pipeline.config.options import INPUTS, RASTERS, option
+from flexroad.pipeline.config.options import INPUTS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.tasks import TaskError
@@ -52,13 +52,14 @@ class PhotosOptions:
         None, INPUTS, "Ground control, CSV: image,x_px,y_px,easting,northing,height.", "FILE"
     )
     """A column ``name`` is optional."""
-    control_crs: str | None = option(None, INPUTS, "CRS of the control; default: the rasters'.", "CRS")
+    control_crs: str | None = None
+    """CRS of the control; None: the CRS of the rasters."""
     sfm: sfm.Options = field(default_factory=sfm.Options)
     stereo: mvs_cpu.Options = field(default_factory=mvs_cpu.Options)
     """Dense stereo on the CPU."""
     patchmatch_size: int = 2000
     """Dense stereo on a GPU: photographs are reduced to this width or height (pixels)."""
-    refine: bool = option(True, RASTERS, "Do not refine the DTM by ECSRC.")
+    refine: bool = True
     """Whether the DTM is refined by ECSRC, as in the paper."""
 
 

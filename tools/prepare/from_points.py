@@ -176,8 +176,7 @@ def _other_bridges(bucketed: BucketedPoints, options: Options) -> tuple[str, ...
     """Return notes on points of classes that are bridges in another scheme."""
     meanings = {
         "asprs": "bridge decks by the standard of LAS, are not used; --bridge-class",
-        "ahn": "bridges and other structures in the Dutch AHN, are not used as bridges; "
-        "--class-scheme ahn does so, or --bridge-class",
+        "ahn": "bridges and other structures in the Dutch AHN, are not used as bridges; --bridge-class",
     }
     notes = []
     for scheme, meaning in meanings.items():

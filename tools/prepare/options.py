@@ -18,7 +18,7 @@ import numpy as np
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.limits import MIN_COVER
-from flexroad.pipeline.config.options import INPUTS, MIN_COVER_HELP, OUTPUTS, RASTERS, option
+from flexroad.pipeline.config.options import INPUTS, RASTERS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import memory
 from flexroad.tasks.types import Floats
@@ -61,15 +61,15 @@ class PrepareOptions:
     roads_layer: str | None = option(None, INPUTS, "Layer of --roads, if the file has several.", "NAME")
     roads_where: str | None = option(None, INPUTS, "SQL condition on --roads: \"class = 'road'\".", "SQL")
     tile_size_m: float = option(250, RASTERS, "Side of a tile in m; a smaller area is one tile.", "METRES")
-    min_cover: float = option(MIN_COVER, RASTERS, MIN_COVER_HELP, "SHARE", min=0, max=1)
+    min_cover: float = MIN_COVER
+    """Tiles with a DSM height in less than this share of their cells are left out."""
     date: datetime | None = option(
         None, INPUTS, "Date of the survey; default: that of the files.", "YYYY-MM-DD"
     )
     assumed_date: datetime | None = None
     """Date, marked as assumed, if neither the option nor the files give one; not on the command line."""
-    dataset: str | None = option(
-        None, OUTPUTS, "Name of the data in reports; default: the input's name.", "NAME", name="name"
-    )
+    dataset: str | None = None
+    """Name of the data in reports; None: the name of the input."""
 
     @property
     def step_m(self) -> float:

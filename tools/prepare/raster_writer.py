@@ -218,7 +218,7 @@ class RasterWriter:
         if not kept:
             raise ConfigError(
                 f"no tile of {self.out} would have heights in {min_cover:.0%} of its cells; "
-                "use larger cells (--cell), smaller tiles (--tile-size) or a lower --min-cover"
+                "use larger cells (--cell) or smaller tiles (--tile-size)"
             )
         left_out = f"left out {some(sparse)}: heights in less than {min_cover:.0%} of the cells"
         return kept, (*notes, left_out) if sparse else notes

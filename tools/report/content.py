@@ -55,7 +55,7 @@ FAULT = f"evaluate: {MeshFault.__name__}: "
 ESTIMATES = {
     "error_estimate_m": "error estimate (m)",
     "worst_error_estimate_m": "of its worst 25 m² (m)",
-    "suspect_m2": "largest suspect patch (m²)",
+    "max_unexplained_area_m2": "largest unexplained patch (m²)",
     "residual_p95_m": "p95 to its road points (m)",
     "curvature_per_m": "curvature (1/m)",
     "edge_step_m": "edge step (m)",

@@ -97,7 +97,7 @@ def _maps(tile: FinishedTile) -> TilePictures:
     dsm, raw, kept = data.dsm[window], road.mask[window], clusters.mask[window]
     truth = (data.dtm if data.reference is None else data.reference)[window]
     against = "DTM" if data.reference is None else "reference"
-    cells = compare(data, road, clusters, tile.surface, tile.assessment.agree_m)
+    cells = compare(data, road, clusters, tile.surface, tile.assessment.dsm_dtm_tolerance_m)
     at = tile.flag_places
     return TilePictures(
         tile.id,

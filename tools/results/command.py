@@ -24,7 +24,7 @@ from flexroad.tools.results.query import (
     on_flagged,
     outside,
 )
-from flexroad.tools.results.query_files import LONLAT, parse_csv, read_lines, read_points
+from flexroad.tools.results.query_files import parse_csv, read_lines, read_points
 
 app = group()
 
@@ -59,18 +59,11 @@ def query(
         str | None,
         typer.Option(
             metavar="CRS",
-            help="CRS of the points or the line, if it is another one; first east, then north.",
+            help="CRS of the points or the line, if it is another one: EPSG:4326 for degrees. First east, "
+            "then north.",
             rich_help_panel=INPUTS,
         ),
     ] = None,
-    lonlat: Annotated[
-        bool,
-        typer.Option(
-            "--lonlat",
-            help="Coordinates are longitude, latitude in degrees: --crs EPSG:4326.",
-            rich_help_panel=INPUTS,
-        ),
-    ] = False,
     layer: Annotated[
         str | None,
         typer.Option(
@@ -109,20 +102,17 @@ def query(
     """
     if (points is None) == (line is None):
         raise ConfigError("give the points with --points FILE, or a line with --line")
-    if lonlat and crs:
-        raise ConfigError(f"--lonlat means --crs {LONLAT}; give one of --lonlat and --crs {crs}")
     if output is not None and output.suffix.lower() not in (".csv", ".gpkg"):
         raise ConfigError(f"-o {output}: give a name that ends in .csv or .gpkg")
-    given = LONLAT if lonlat else crs
     wanted = _level(level)
     ground = Ground.open(path, variant, allow or (), earlier=True)
     if line is not None:
-        result = along_lines(ground, read_lines(line, given, layer, required_crs(ground)), step, wanted)
+        result = along_lines(ground, read_lines(line, crs, layer, required_crs(ground)), step, wanted)
     elif points == STDIN:
-        result = at_points(ground, parse_csv(sys.stdin.buffer.read(), "standard input", given), wanted)
+        result = at_points(ground, parse_csv(sys.stdin.buffer.read(), "standard input", crs), wanted)
     else:
         assert points is not None
-        result = at_points(ground, read_points(points, given, layer), wanted)
+        result = at_points(ground, read_points(points, crs, layer), wanted)
     if output is not None and output.suffix.lower() == ".gpkg":
         result.write_geopackage(output)
     else:

@@ -248,4 +248,4 @@ def outside(result: AnswerTable, ground: Ground) -> str:
     line += f"; the tiles lie in W {west:.0f} S {south:.0f} E {east:.0f} N {north:.0f}"
     line += f" ({short(result.crs)})" if result.crs else ""
     degrees = (np.abs(result.easting) <= 180) & (np.abs(result.northing) <= 90)
-    return line + ("; longitude and latitude need --lonlat" if degrees.all() else "")
+    return line + ("; longitude and latitude need --crs EPSG:4326" if degrees.all() else "")

@@ -28,7 +28,6 @@ from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
 from flexroad.tasks.roads.extent import beyond_extent
-from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.segment.dinov2 import segment as segmenter
 from flexroad.tasks.types import Bools, RoadMask, TileData
 from flexroad.tools.train import fit_head
@@ -46,9 +45,8 @@ class TrainOptions:
     labels: Labels = option(
         MISSING, INPUTS, "mask: the catalog's reference road or road mask; vector: its vector roads."
     )
-    validation: float = option(
-        0.3, VALIDATION, "Share of the tiles for validation.", "SHARE", min=0.05, max=0.9
-    )
+    validation: float = 0.3
+    """Share of the tiles for validation."""
     gap_m: float = option(
         50.0,
         VALIDATION,
@@ -57,15 +55,8 @@ class TrainOptions:
         min=0,
         name="gap-m",
     )
-    ignore_m: float = option(
-        1.0,
-        VALIDATION,
-        "Distance of training cells from edges of labels (m).",
-        "METRES",
-        min=0,
-        name="ignore-m",
-    )
-    """Edges of labels are never exact."""
+    ignore_m: float = 1.0
+    """Distance of training cells from edges of labels (m): edges are never exact."""
     seed: int = option(0, METHOD, "Seed of the split and of the training.", "N", min=0)
     settings: Mapping[str, Any] | None = None
     """Options of the head's training, by name; None for the defaults."""
@@ -209,7 +200,7 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notif
         model.write_bytes(trained.model)
         given = configured.model_dump() if isinstance(configured, segmenter.Options) else {}
         # Without cleanup: the figures are those of the model alone.
-        applied = segmenter.Options(**given | {"model": model, "cleanup": NOTHING})
+        applied = segmenter.Options(**given | {"model": model, "cleanup": "none"})
         judged = tuple(
             _evaluate(block, tiles, lambda data: segmenter.segment(data, applied)) for block in sides.validate
         )

@@ -41,16 +41,6 @@ def view(
             rich_help_panel=OUTPUTS,
         ),
     ] = None,
-    photo_px: Annotated[
-        int,
-        typer.Option(
-            min=64,
-            max=8192,
-            metavar="N",
-            help="Largest width and height of a tile's photo.",
-            rich_help_panel=OUTPUTS,
-        ),
-    ] = 1024,
     serve: Annotated[
         bool,
         typer.Option(
@@ -66,8 +56,7 @@ def view(
     tile: options.TileIds = None,
     bbox: options.Box = None,
     allow: options.Allow = None,
-    executor: options.Executor = "serial",
-    workers: options.Workers = None,
+    workers: options.Parallel = 1,
 ) -> None:
     """Write a run as a page for browsers: map and surface in 3D.
 
@@ -80,9 +69,9 @@ def view(
     folder = parse_location(output) if output else run.path / FOLDER
     if serve and is_remote(folder):
         raise ConfigError(f"--serve needs a folder on disk, not {folder}; give one with -o")
-    runner = SerialExecutor() if executor == "serial" else DaskExecutor(workers)
+    runner = SerialExecutor() if workers == 1 else DaskExecutor(workers)
     track = StepProgress(Console(stderr=True))
-    written = write_viewer(run, folder, runner, tile or (), bbox, photo_px, track)
+    written = write_viewer(run, folder, runner, tile or (), bbox, track)
     for note in written.notes[:MOST_NOTES]:
         echo(f"note: {note}", err=True)
     if len(written.notes) > MOST_NOTES:

@@ -58,7 +58,7 @@ PENDING, DONE, FAILED = range(3)
 MEASURES = {
     "error_estimate_m": ("Error estimate", "m"),
     "worst_error_estimate_m": ("Error estimate of the worst 25 m²", "m"),
-    "suspect_m2": ("Largest suspect patch", "m²"),
+    "max_unexplained_area_m2": ("Largest unexplained patch", "m²"),
     "measured_road": ("Road measured by the scan", "%"),
     "dtm_road": ("Road from the terrain model", "%"),
     "inferred_road": ("Road inferred", "%"),
@@ -77,6 +77,8 @@ NAMES = (LOOPBACK, "localhost")
 WGS84 = "EPSG:4326"
 QUALITY = 82
 """Quality of the photos' JPEG."""
+PHOTO_PX = 1024
+"""Largest width and height of a tile's photo (pixels): a tile of 250 m takes 0.3 to 0.8 MB."""
 SIMPLIFIED_M = 0.05
 """Largest distance of a simplified road line from the given one (m)."""
 
@@ -100,7 +102,6 @@ def write_viewer(
     executor: Executor,
     ids: Sequence[str] = (),
     bbox: Bounds | None = None,
-    photo_px: int = 1024,
     track: Track = untracked,
 ) -> _Written:
     """Write the viewer of a run, or of the selected tiles, into a folder."""
@@ -110,7 +111,7 @@ def write_viewer(
     index, done = _index(run, tiles, variant)
     options = run.config.chains[variant]["segment"]
     roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
-    look = Look(run.origin, photo_px, roads)
+    look = Look(run.origin, roads)
     finished = track(_finished(run, done, variant), "writing tiles", len(done))
     with ended(finished):
         rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
@@ -285,8 +286,6 @@ class Look:
 
     origin: tuple[float, float]
     """Whole-metre (easting, northing) that meshes of the run are relative to."""
-    photo_px: int
-    """Largest width and height of a photo (pixels)."""
     roads: RoadOptions = DEFAULTS
     """Selection of the road lines."""
 
@@ -295,7 +294,7 @@ def piece(item: TileItem, look: Look) -> Piece:
     """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks."""
     tile = item.tile
     source, notes = tile.tile, list[str]()
-    photo = _photo(source, look.photo_px, notes)
+    photo = _photo(source, PHOTO_PX, notes)
     quality, surface, core = tile.quality, tile.surface, source.grid
     top, support = None, quality.support
     if isinstance(surface, LevelledSurface):

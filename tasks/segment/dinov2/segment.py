@@ -22,7 +22,7 @@ from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
-from flexroad.tasks.segment.dinov2.backbone import PATCH, Backbone, Device, load_backbone, normalised
+from flexroad.tasks.segment.dinov2.backbone import Backbone, Device, load_backbone, normalised
 from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
 from flexroad.tasks.segment.dinov2.windows import blend, cover
 from flexroad.tasks.types import Bools, Orthophoto, RoadMask, TileData
@@ -33,34 +33,29 @@ VERSION = 1
 READS = ("dop", "roads")
 """``roads`` is read only if the cleanup uses it."""
 NEEDS = ("dop",)
+OVERLAP = 0.25
+"""Overlap of neighbouring windows, as a fraction of their side: at their edges predictions are worse."""
+BATCH = 4
+"""Windows per batch; more are not faster on a CPU and need more memory."""
 TIE_M = 1e-6
 """Shift of the cell centres to the south-east: of pixels equally near, every tile takes the same one."""
 
 
 class Options(options.Options):
-    """Model, windows and cleanup. A value of null means the value that the head was trained with."""
+    """Model and cleanup. The size of the windows and the threshold are those of the head."""
 
     method: Literal["dinov2"] = "dinov2"
     model: Path = Field(description="file of the head, made by `flexroad train CATALOG`")
     backbone: str | None = Field(
         None, description="hub name or folder of the backbone's weights; null: the head's"
     )
-    gsd_m: float | None = Field(
-        None, ge=0.02, le=5, description="ground sampling distance of the windows (m); null: the head's"
-    )
-    window_px: int | None = Field(
-        None, ge=28, le=2044, multiple_of=PATCH, description="side of a window (pixels); null: the head's"
-    )
-    overlap: float = Field(
-        0.25, ge=0, le=0.5, description="overlap of neighbouring windows, as a fraction of their side"
-    )
-    batch: int = Field(4, ge=1, le=1024, description="windows per batch; more need more memory")
     device: Device = Field("auto", description="cpu, cuda, or auto: a GPU if there is one")
     half: bool = Field(False, description="half precision: float16 on a GPU, bfloat16 on the CPU")
-    threshold: float | None = Field(
-        None, gt=0, lt=1, description="probability from which a pixel is road; null: the head's"
+    cleanup: Cleanup = Field(
+        "pieces",
+        description="pieces: close gaps up to 2 m wide, fill holes up to 10 m2, drop pieces below 25 m2; "
+        "corridor: first drop what is over 5 m from the catalog's roads; none: the mask as predicted",
     )
-    cleanup: Cleanup = Field(Cleanup(), description="cleanup of the mask")
 
 
 def files(options: Options) -> tuple[Path, ...]:
@@ -92,16 +87,15 @@ def segment(data: TileData, options: Options) -> RoadMask:
     head = read_head(options.model)
     backbone = load_backbone(options.backbone or head.about.backbone, options.device, options.half)
     check(head, backbone)
-    photo, probability = _predict(data, head, backbone, options)
+    photo, probability = _predict(data, head, backbone)
     row, col = photo.grid.cells(*_centres(data.grid))
-    threshold = options.threshold or head.about.threshold
+    threshold = head.about.threshold
     mask = clean(probability[row, col] >= threshold, data, options.cleanup)
     notes = _notes(photo.known[row, col], coregistration.note(data, photo))
     if data.lacks_road(mask):
         notes += (
             f"segment: no road on this tile: probabilities reach {probability[row, col].max():.2f}, the "
-            f"threshold is {threshold:g}; if there are roads, lower segment.threshold, or train on similar "
-            "tiles",
+            f"threshold is {threshold:g}; if there are roads, train on similar tiles",
         )
     return RoadMask(
         grid=data.grid,
@@ -113,16 +107,14 @@ def segment(data: TileData, options: Options) -> RoadMask:
     )
 
 
-def _predict(
-    data: TileData, head: Head, backbone: Backbone, options: Options
-) -> tuple[Orthophoto, NDArray[np.float32]]:
+def _predict(data: TileData, head: Head, backbone: Backbone) -> tuple[Orthophoto, NDArray[np.float32]]:
     """Return the photo around the tile and the road probability of its pixels, 0 where it has no data."""
-    gsd_m, size = options.gsd_m or head.about.gsd_m, options.window_px or head.about.window_px
-    overlap = round(size * options.overlap)
+    gsd_m, size = head.about.gsd_m, head.about.window_px
+    overlap = round(size * OVERLAP)
     assert data.dop is not None
     photo = read_photo(data.dop, cover(data.grid, gsd_m, size, overlap), gsd_m)
     image = normalised(photo, head.about.mean, head.about.std)
-    blended = blend(predictor(head, backbone), image, photo.known, size, overlap, options.batch)
+    blended = blend(predictor(head, backbone), image, photo.known, size, overlap, BATCH)
     return photo, np.where(photo.known, blended, np.float32(0))
 
 

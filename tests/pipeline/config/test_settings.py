@@ -7,12 +7,12 @@ from flexroad.pipeline.errors import ConfigError
 def test_setting_replaces_an_option_and_names_the_configuration():
     base, config = (
         load_config("production"),
-        load_config("production", ["fit.spacing_m=5", "ecsrc.verge_m=2"]),
+        load_config("production", ["fit.spacing_m=5", "ecsrc.shoulder_m=2"]),
     )
     assert config.chains["flexroad"]["fit"].spacing_m == 5
     assert config.chains["flexroad"]["fit"].huber_m == base.chains["flexroad"]["fit"].huber_m
     assert config.raw["fit"]["spacing_m"] == 5
-    assert config.name == "production --set fit.spacing_m=5 --set ecsrc.verge_m=2"
+    assert config.name == "production --set fit.spacing_m=5 --set ecsrc.shoulder_m=2"
     # A variant with a method of its own keeps it.
     assert load_config("paper", ["fit.degree=2"]).chains["plane"]["fit"].method == "plane"
 
@@ -33,11 +33,12 @@ def test_setting_of_a_method_starts_from_its_defaults(settings):
 
 def test_setting_below_a_single_word_keeps_the_method():
     chains = load_config(
-        "paper", ["variants.rgt.sample.method=corners", "segment.method=vector", "segment.cleanup.drop_m2=9"]
+        "paper",
+        ["variants.rgt.sample.method=corners", "segment.method=vector", "segment.class_width_m.track=9"],
     ).chains
     assert chains["rgt"]["sample"].method == "corners"
     assert chains["flexroad"]["segment"].method == "vector"
-    assert chains["flexroad"]["segment"].cleanup.drop_m2 == 9
+    assert chains["flexroad"]["segment"].class_width_m["track"] == 9
 
 
 @pytest.mark.parametrize(
@@ -45,12 +46,12 @@ def test_setting_below_a_single_word_keeps_the_method():
     [
         [
             "fit.spacing_m=5",
-            "segment={method: vector, cleanup: {drop_m2: 9, fill_m2: 8}}",
+            "segment={method: vector, class_width_m: {track: 9, service: 8}}",
             "export.formats=[npz]",
         ],
         {
             "fit": {"spacing_m": 5},
-            "segment": {"method": "vector", "cleanup": {"drop_m2": 9, "fill_m2": 8}},
+            "segment": {"method": "vector", "class_width_m": {"track": 9, "service": 8}},
             "export.formats": ("npz",),
         },
     ],
@@ -60,14 +61,15 @@ def test_settings_as_texts_and_as_dict_are_equal(settings):
     config = load_config("production", settings)
     chain = config.chains["flexroad"]
     assert (chain["fit"].spacing_m, chain["fit"].huber_m, chain["fit"].bending_m3) == (5, 0.1, 30)
-    assert (chain["segment"].cleanup.drop_m2, chain["segment"].cleanup.fill_m2) == (9, 8)
+    widths = chain["segment"].class_width_m
+    assert (widths["track"], widths["service"]) == (9, 8)
     assert config.export.formats == ("npz",)
 
 
 def test_settings_as_a_dict_are_part_of_the_name_and_keep_small_numbers():
-    config = load_config("production", {"ecsrc.verge_m": 1e-5, "fit": {"spacing_m": 5}})
-    assert config.name == "production --set ecsrc.verge_m=1.0e-05 --set fit={spacing_m: 5}"
-    assert config.chains["flexroad"]["ecsrc"].verge_m == 1e-5
+    config = load_config("production", {"ecsrc.shoulder_m": 1e-5, "fit": {"spacing_m": 5}})
+    assert config.name == "production --set ecsrc.shoulder_m=1.0e-05 --set fit={spacing_m: 5}"
+    assert config.chains["flexroad"]["ecsrc"].shoulder_m == 1e-5
 
 
 def test_settings_with_a_value_that_is_not_yaml_raise():
@@ -80,9 +82,9 @@ def test_settings_with_a_value_that_is_not_yaml_raise():
 def test_setting_of_a_mapping_keeps_the_options_that_it_leaves_out():
     load = load_config("production", ["load={halo_m: 20}"]).chains["flexroad"]["load"]
     assert (load.halo_m, load.road_height) == (20, "auto")
-    vector = ["segment={method: vector, cleanup: {drop_m2: 9}}", "segment.cleanup={fill_m2: 8}"]
-    cleanup = load_config("production", vector).chains["flexroad"]["segment"].cleanup
-    assert (cleanup.drop_m2, cleanup.fill_m2) == (9, 8)
+    vector = ["segment={method: vector, class_width_m: {track: 9}}", "segment.class_width_m={service: 8}"]
+    widths = load_config("production", vector).chains["flexroad"]["segment"].class_width_m
+    assert (widths["track"], widths["service"]) == (9, 8)
     assert list(load_config("paper", ["variants={mine: {}}"]).chains) == ["mine"]
 
 

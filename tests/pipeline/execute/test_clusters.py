@@ -27,7 +27,11 @@ pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 # Workers cannot import this test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
 
-IMPATIENT = Cluster(patience_s=1)
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """A short wait for new workers."""
+    monkeypatch.setattr(clusters, "WORKER_LOST_TIMEOUT_S", 1)
 
 
 @pytest.fixture(scope="module")
@@ -151,11 +155,12 @@ def other_numpy(tmp_path) -> dict[str, str]:
 def map_error(processes, jobs=(1, 2, 3), **options) -> str:
     """Return the one-line message of the ConfigError that `DaskExecutor.map` raises."""
     with pytest.raises(ConfigError) as caught:
-        list(DaskExecutor(scheduler=processes.address, cluster=IMPATIENT).map(double, jobs, lost, **options))
+        list(DaskExecutor(scheduler=processes.address).map(double, jobs, lost, **options))
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
+@pytest.mark.usefixtures("impatient")
 def test_map_without_workers_or_with_other_versions_raises(processes, other_numpy, monkeypatch):
     monkeypatch.setattr("flexroad.pipeline.execute.clusters.GRACE_S", 0)
     processes.scheduler()
@@ -193,6 +198,7 @@ def test_map_worker_with_other_versions_that_joins_later_is_left_out(processes, 
     assert "is left out: numpy is 1.0 there and" in line
 
 
+@pytest.mark.usefixtures("impatient")
 def test_map_worker_with_other_code_of_the_same_version_is_left_out(processes, tmp_path):
     source = tmp_path / "other" / "flexroad"
     shutil.copytree(Path(flexroad.__file__).parent, source, ignore=shutil.ignore_patterns("__pycache__"))
@@ -227,6 +233,7 @@ class Unwritable:
         raise OSError(30, "Read-only file system", "/store")
 
 
+@pytest.mark.usefixtures("impatient")
 def test_map_workers_that_fail_the_probe_raise(running):
     message = map_error(running, probe=Unwritable())
     assert "worker tcp://127.0.0.1" in message
@@ -325,6 +332,7 @@ def slow(job):
     return job
 
 
+@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("killed", ["scheduler", "workers"])
 def test_map_scheduler_or_all_workers_killed_raises(processes, killed):
     scheduler = processes.scheduler()
@@ -333,7 +341,7 @@ def test_map_scheduler_or_all_workers_killed_raises(processes, killed):
     results = []
 
     def map_and_kill():
-        for result in DaskExecutor(scheduler=processes.address, cluster=IMPATIENT).map(slow, range(20), lost):
+        for result in DaskExecutor(scheduler=processes.address).map(slow, range(20), lost):
             results.append(result)
             if len(results) == 5:
                 (scheduler if killed == "scheduler" else worker).kill()
@@ -366,14 +374,14 @@ def test_map_ended_leaves_nothing_on_the_cluster(running, wanted):
 def test_slurm_options_write_job_script(tmp_path):
     jobqueue = pytest.importorskip("dask_jobqueue")
     cluster = Cluster(
-        kind="slurm", workers=6, per_job=3, memory="2 GiB", walltime_h=2.5, queue="night", account="roads",
+        kind="slurm", workers=6, per_job=3, memory="2 GiB", walltime_h=2.5, queue="night",
         job_extra=["--exclusive"], prologue=["module load gdal"],
     )  # fmt: skip
     with jobqueue.SLURMCluster(**slurm_options(cluster, False, tmp_path)) as made:
         script = made.job_script()
     lines = script.splitlines()
     assert {
-        "#SBATCH -p night", "#SBATCH -A roads", "#SBATCH -n 1", "#SBATCH --cpus-per-task=3",
+        "#SBATCH -p night", "#SBATCH -n 1", "#SBATCH --cpus-per-task=3",
         "#SBATCH --mem=6G", "#SBATCH -t 02:30:00", "#SBATCH --exclusive", "module load gdal",
         "export OMP_NUM_THREADS=1", "export PYTHONSAFEPATH=1",
         "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False",

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 from distributed.scheduler import KilledWorker
 
-from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import session as module
 from flexroad.pipeline.execute import workers
@@ -32,7 +31,7 @@ class Client:
 @pytest.fixture
 def session(monkeypatch):
     monkeypatch.setattr(module.time, "monotonic", lambda: session.now)
-    session = Session(Client(), "", "", repr, iter([]), repr, Cluster(patience_s=20), lambda line: None)
+    session = Session(Client(), "", "", repr, iter([]), repr, 20, 3600, lambda line: None)
     session.now = 1000.0
     return session
 
@@ -177,7 +176,7 @@ def working(monkeypatch):
     def make(*there, jobs=range(20), refused=()):
         client, lines = WorkingClient(*there, monkeypatch=monkeypatch), []
         session = Session(
-            client, "", CHECK, str, iter(jobs), lambda job, why: why, Cluster(patience_s=20),
+            client, "", CHECK, str, iter(jobs), lambda job, why: why, 20, 3600,
             lines.append, MadeProbe(None, refused),
         )  # fmt: skip
         return session, lines

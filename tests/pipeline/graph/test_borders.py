@@ -155,7 +155,7 @@ def test_options_of_fit_and_filter_change_borders_and_others_do_not(survey):
     _, parts = names(catalog)
     for stage, option, changes in (
         ("fit", {"huber_m": 0.2}, True),
-        ("ecsrc", {"verge_m": 3}, True),
+        ("ecsrc", {"shoulder_m": 3}, True),
         ("load", {"halo_m": 20}, False),
         ("load", {"road_height": "dsm"}, True),
         ("sample", {"road_m": 2}, False),

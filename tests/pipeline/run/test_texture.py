@@ -21,7 +21,7 @@ from flexroad.pipeline.worker.texture import NO_PHOTO
 from tests.whole_run import LIGHT
 
 CELL = 0.5
-TEXTURED = compose({**LIGHT, "export": {"texture": True, "texture_quality": 95}}, "light")
+TEXTURED = compose({**LIGHT, "export": {"texture": True}}, "light")
 PLAIN = compose(LIGHT, "light")
 WITHOUT = 3
 """Number of the tile without a photo."""

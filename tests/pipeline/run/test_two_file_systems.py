@@ -52,10 +52,11 @@ def require(mount: str, scratch: Path) -> None:
 
 
 @pytest.fixture
-def run(flexroad, processes, made_survey, tmp_path):
+def run(flexroad, processes, made_survey, tmp_path, monkeypatch):
     """The command that runs the survey on the workers."""
+    monkeypatch.setattr("flexroad.pipeline.execute.clusters.WORKER_LOST_TIMEOUT_S", 1)
     config = tmp_path / "light.yaml"
-    config.write_text(yaml.safe_dump(LIGHT | {"cluster": {"patience_s": 1}}, sort_keys=False))
+    config.write_text(yaml.safe_dump(LIGHT, sort_keys=False))
     (tmp_path / "run").mkdir()
     words = ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "run"]
     processes.scheduler()

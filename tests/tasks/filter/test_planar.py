@@ -9,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.filter import planar
 from flexroad.tasks.filter.planar import (
     BEYOND_M,
     CONSISTENT,
@@ -33,7 +34,7 @@ def kept(mask, dsm, dtm, options=Options(), cell=1.0):  # noqa: B008 (frozen)
 
 def classified(mask, dsm, dtm):
     """Return 1 for kept cells plus 2 for cells with an invalid DTM."""
-    result = clusters(mask, dsm, dtm, Options(verge_m=4))
+    result = clusters(mask, dsm, dtm, Options(shoulder_m=4))
     return result.mask + 2 * result.dtm_invalid
 
 
@@ -123,14 +124,14 @@ def test_planar_car_on_deck_invalidates_dtm():
 
 
 def test_verge_invalidates_dtm_beside_streets():
-    """The DTM is invalid up to `verge_m`, also beside objects at the edge; not beside dropped mask parts."""
+    """The DTM is invalid up to `shoulder_m`, also beside objects at the edge; not beside dropped parts."""
     mask, dsm, dtm = street()
     crown = np.zeros_like(mask)
     crown[16:19, 50:56] = True
     mask[33:35, 90:93] = True
     rough = np.where(crown, 5 + np.random.default_rng(2).normal(0, 1, mask.shape), 0.0)
     result = clusters(
-        mask, dsm + rough + 4 * (np.indices(mask.shape)[0] >= 33) * mask, dtm, Options(verge_m=3)
+        mask, dsm + rough + 4 * (np.indices(mask.shape)[0] >= 33) * mask, dtm, Options(shoulder_m=3)
     )
     row = np.indices(mask.shape)[0]
     assert not result.mask[crown].any()
@@ -247,7 +248,7 @@ def test_labels_on_level_ground_equal_components_of_near_cells(seed, gap, cell):
 def test_verge_on_level_ground_equals_cells_near_kept_parts(seed, verge, cell):
     mask = scattered_blocks(seed)
     level = np.zeros(mask.shape)
-    options = Options(verge_m=verge, theta_xy_m=0, min_area_m2=6 * cell**2)
+    options = Options(shoulder_m=verge, theta_xy_m=0, min_area_m2=6 * cell**2)
     result = clusters(mask, level, level, options, cell)
     away = scipy.ndimage.distance_transform_edt(~result.mask) * cell
     near = (away <= verge) & result.mask.any()
@@ -265,7 +266,7 @@ def test_part_of_result_equals_complete_result(seed, cut, verge):
     part = slice(cut[0], 90 - cut[1] + 1), slice(cut[2], 90 - cut[3] + 1)
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 90, 90)
     data, road = TileData("t", grid, grid, dsm, dtm), RoadMask(grid, grid, mask, np.zeros_like(mask))
-    options = Options(verge_m=verge)
+    options = Options(shoulder_m=verge)
     complete, near = ecsrc(data, road, options), ecsrc_near(data, road, options, part)
     np.testing.assert_array_equal(near.labels, complete.labels)
     np.testing.assert_array_equal(near.dtm_invalid[part], complete.dtm_invalid[part])
@@ -370,13 +371,13 @@ def test_planar_output_is_pinned_to_version():
 
 
 def test_options_out_of_bounds_are_refused():
-    for wrong in ({"theta_z_m": 0}, {"roughness_m": 0}, {"bend": 0}, {"raised_m2_per_m": -1}, {"theta_z": 1}):
+    for wrong in ({"theta_z_m": 0}, {"roughness_m": 0}, {"theta_z": 1}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Options(**wrong)
 
 
-def test_raised_cluster_needs_area_for_its_height():
+def test_raised_cluster_needs_area_for_its_height(monkeypatch):
     mask, dsm, dtm = street(shape=(40, 80))
-    raised = Options(raised_m2_per_m=0)
     assert not kept(mask, dsm, dtm - 30).any()
-    assert kept(mask, dsm, dtm - 30, raised)[mask].all()
+    monkeypatch.setattr(planar, "RAISED_M2_PER_M", 0.0)
+    assert kept(mask, dsm, dtm - 30)[mask].all()

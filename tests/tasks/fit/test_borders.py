@@ -24,7 +24,7 @@ from flexroad.tools.synthetic import make_scene
 from tests import exact_fit
 
 AROUND_M = 100
-FILTER = planar.Options(verge_m=5)
+FILTER = planar.Options(shoulder_m=5)
 OPTIONS = smoothing_spline.Options()
 ALL = Grid("EPSG:25832", 500000, 5600500, 1.0, 500, 500)
 """Two by two tiles of 250 m."""
@@ -83,16 +83,16 @@ def joined(surfaces):
     return control
 
 
-def fit_together(world):
+def fit_together(world, monkeypatch):
     """Return the control heights of one precise fit of the complete world, on the same lattice."""
     data = world
-    options = OPTIONS.model_copy(update={"stop_tolerance": 1e-8})
-    lattice = smoothing_spline._lattice((250, 250), 1.0, options)
+    monkeypatch.setattr(smoothing_spline, "BORDER_TOLERANCE", 1e-8)
+    lattice = smoothing_spline._lattice((250, 250), 1.0, OPTIONS)
     (n, m), (k, j) = lattice.intervals, lattice.lines_within(AROUND_M)
     u, v = (-k, 2 * n + k), (-j, 2 * m + j)
     free = np.full((2 * m + 2 * j + 3, 2 * n + 2 * k + 3), np.nan)
     start = AROUND_M + 500, AROUND_M
-    control = smoothing_spline._control_heights(data, filtered(data)[1], lattice, start, u, v, free, options)
+    control = smoothing_spline._control_heights(data, filtered(data)[1], lattice, start, u, v, free, OPTIONS)
     return control[j : j + 2 * m + 3, k : k + 2 * n + 3]
 
 
@@ -113,9 +113,10 @@ def with_void(world, radius):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stratum", ["urban", "rural"])
-def test_tiles_equal_one_fit_of_all(stratum):
+def test_tiles_equal_one_fit_of_all(monkeypatch, stratum):
     world = made_world(stratum)
-    off = np.abs(at_cells(joined(fit_tiles(world))) - at_cells(fit_together(world)))
+    tiles = joined(fit_tiles(world))
+    off = np.abs(at_cells(tiles) - at_cells(fit_together(world, monkeypatch)))
     on_road = off[world.reference_road[world.grid.window(ALL)]]
     assert on_road.mean() < 0.5e-3
     assert np.percentile(on_road, 99) < 5e-3
@@ -124,9 +125,10 @@ def test_tiles_equal_one_fit_of_all(stratum):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stratum", ["urban", "rural"])
-def test_void_on_corner_is_bridged_as_by_one_fit_of_all(stratum):
+def test_void_on_corner_is_bridged_as_by_one_fit_of_all(monkeypatch, stratum):
     world, void = with_void(made_world(stratum), radius=70)
-    off = np.abs(at_cells(joined(fit_tiles(world))) - at_cells(fit_together(world)))
+    tiles = joined(fit_tiles(world))
+    off = np.abs(at_cells(tiles) - at_cells(fit_together(world, monkeypatch)))
     assert off[void].max() < 0.010
     assert off[~void].mean() < 0.5e-3
 

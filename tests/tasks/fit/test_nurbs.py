@@ -163,9 +163,10 @@ def test_minimise_with_last_returns_variables_of_last_step():
     assert loss_function(result)[0] == losses[-1] > min(losses)
 
 
-def test_fit_unbounded_weights_exceed_the_bounds():
+def test_fit_unbounded_weights_exceed_the_bounds(monkeypatch):
+    monkeypatch.setattr(nurbs, "STOP_TOLERANCE", 0)
     data, clusters, _ = tile(noise=1.0)
-    changes = {"learning_rate": 1.0, "iterations": 60, "stop_tolerance": 0}
+    changes = {"learning_rate": 1.0, "iterations": 60}
     softplus = fitted(data, clusters, weights="softplus", **changes)
     assert (softplus.W.min() > 0, softplus.W.max() > 10) == (True, True)
     unbounded = fitted(data, clusters, weights="unbounded", plan="moving", **changes)
@@ -198,9 +199,10 @@ def test_options_that_no_engine_has_raise(changes):
 
 
 @pytest.mark.parametrize("engine", ["numba", "torch"])
-def test_fit_free_weights_stay_within_bounds(engine):
+def test_fit_free_weights_stay_within_bounds(engine, monkeypatch):
+    monkeypatch.setattr(nurbs, "STOP_TOLERANCE", 0)
     data, clusters, _ = tile(noise=1.0)
-    surface = fitted(data, clusters, engine=engine, learning_rate=1.0, iterations=60, stop_tolerance=0)
+    surface = fitted(data, clusters, engine=engine, learning_rate=1.0, iterations=60)
     assert surface.W.max() == pytest.approx(10)
     assert surface.W.min() == pytest.approx(0.1)
 

@@ -7,7 +7,7 @@ import shapely.affinity
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.levels.overlaps import crossing_notes
-from flexroad.tasks.roads.rasterise import LevelColumns, Options, roads
+from flexroad.tasks.roads.rasterise import Options, roads
 from flexroad.tasks.types import Source
 from tests.make_roads import GRID as FILE_GRID
 from tests.make_roads import on_grid, write
@@ -72,7 +72,7 @@ def test_lines_that_share_a_vertex_are_a_junction(tmp_path, junction, number):
         for start, end in (((20, 50), (80, 50)), ((50, 20), (50, 80)))
     ]
     path = write(tmp_path / "r.gpkg", lines, width=[6, 6], level=[1, 1])
-    found = roads(Source("roads", (path,)), FILE_GRID, Options(), LevelColumns())
+    found = roads(Source("roads", (path,)), FILE_GRID, Options(), levels=True)
     assert len(crossing_notes(found.areas, found.shapes, found.level, FILE_GRID)) == number
 
 

@@ -161,7 +161,7 @@ def test_raster_of_a_level_is_made_once_and_kept_without_empty_cells(tmp_path, m
     )
     level = replace(level)
     road, data = replace(result.road, levels=(level,)), result.data
-    clusters = planar.ecsrc(data, road, planar.Options(verge_m=5))
+    clusters = planar.ecsrc(data, road, planar.Options(shoulder_m=5))
     surface = smoothing_spline.fit(data, clusters, smoothing_spline.Options())
     assess(data, road, clusters, surface, AssessOptions())
     assert len(made) > 3

@@ -84,7 +84,7 @@ def test_assess_local_hump_raises_patch():
     hump = STREET & (np.hypot(ROW - 55, COL - 60) < 6)
     quality = assessed(tile(), GivenHeights(TRUTH + 0.8 * hump))
     assert "patch" in quality.flags
-    assert quality.suspect_m2 == hump.sum()
+    assert quality.max_unexplained_area_m2 == hump.sum()
 
 
 def test_assess_curvature_is_independent_of_cell_size():
@@ -102,7 +102,7 @@ def test_assess_kept_crown_raises_flags():
     data = tile(dsm=TRUTH + NOISE + np.where(CROWN, DOME, 0))
     climbed, clean = assessed(data, None), assessed(data, None, kept=STREET & ~CROWN)
     assert {"error-estimate", "patch", "loose", "off-dtm"} <= set(climbed.flags)
-    assert climbed.suspect_m2 == pytest.approx(CROWN.sum(), rel=0.5)
+    assert climbed.max_unexplained_area_m2 == pytest.approx(CROWN.sum(), rel=0.5)
     assert clean.flags == ()
     assert clean.dtm_road == pytest.approx(CROWN.sum() / STREET.sum())
 
@@ -166,7 +166,7 @@ def test_assess_without_road_or_data():
 def test_assess_road_dropped_by_filter_has_figures_and_both_flags():
     dropped = assessed(tile(), None, kept=NOWHERE)
     assert dropped.flags == (NO_ROAD, "dropped")
-    assert (dropped.dropped_road, dropped.suspect_m2) == (1, 0)
+    assert (dropped.dropped_road, dropped.max_unexplained_area_m2) == (1, 0)
 
 
 def test_assess_steps_beside_road_are_supported_and_no_steps_of_surface():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexroad.tasks.quality.estimate import AGREE_M, FACTOR, LEAST_M, error_estimate
+from flexroad.tasks.quality.estimate import DSM_DTM_TOLERANCE_M, FACTOR, LEAST_M, error_estimate
 
 SHAPE = (60, 60)
 ROAD = np.ones(SHAPE, bool)
@@ -27,14 +27,14 @@ def test_noise_of_cells_averages_out():
 def test_single_cells_far_off_count_as_heights_of_the_same_ground_at_most():
     far = np.random.default_rng(1).random(SHAPE) < 0.1
     found = estimate(np.where(far, 4.0, 0.0)).mean()
-    assert found == pytest.approx(LEAST_M + 0.1 * FACTOR * AGREE_M, rel=0.1)
+    assert found == pytest.approx(LEAST_M + 0.1 * FACTOR * DSM_DTM_TOLERANCE_M, rel=0.1)
     assert found == pytest.approx(estimate(np.where(far, 40.0, 0.0)).mean())
 
 
 def test_patch_far_off_is_estimated_larger_than_single_cells():
     patch = np.zeros(SHAPE)
     patch[20:40, 20:40] = 4.0
-    assert estimate(patch)[28:32, 28:32].min() == pytest.approx(LEAST_M + FACTOR * AGREE_M)
+    assert estimate(patch)[28:32, 28:32].min() == pytest.approx(LEAST_M + FACTOR * DSM_DTM_TOLERANCE_M)
 
 
 def test_cells_without_height_rise_with_distance_to_the_nearest():
@@ -46,4 +46,4 @@ def test_cells_without_height_rise_with_distance_to_the_nearest():
 
 
 def test_tile_without_heights_has_the_difference_of_heights_of_the_same_ground():
-    assert (estimate(np.full(SHAPE, np.nan)) == AGREE_M).all()
+    assert (estimate(np.full(SHAPE, np.nan)) == DSM_DTM_TOLERANCE_M).all()

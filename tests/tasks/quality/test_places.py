@@ -31,7 +31,7 @@ def found(surface=LEVEL, dsm=LEVEL, dtm=LEVEL, kept=STREET):
     data = TileData("made", GRID, GRID, dsm, dtm)
     given = data, RoadMask(GRID, GRID, STREET, NOWHERE), RoadClusters(GRID, kept.astype(np.int32), None)
     options = Options()
-    cells = compare(*given, GivenHeights(surface), options.agree_m)
+    cells = compare(*given, GivenHeights(surface), options.dsm_dtm_tolerance_m)
     return assess(*given, GivenHeights(surface), options).flags, places(cells, GRID, options)
 
 

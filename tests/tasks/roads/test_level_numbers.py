@@ -4,7 +4,7 @@ import pytest
 import shapely
 
 from flexroad.tasks.io.vectors import Query, read_near
-from flexroad.tasks.roads.level_numbers import columns, level_numbers
+from flexroad.tasks.roads.level_numbers import COLUMNS, level_numbers
 from flexroad.tools.synthetic.crossings import Crossings
 from tests.make_town import CRS, OPTIONS, write_streets
 
@@ -124,13 +124,6 @@ def test_level_numbers_order_of_columns():
     assert one(level=0, kunstbaute="Bruecke") == 0
 
 
-def test_level_numbers_own_columns():
-    table = pandas.DataFrame({"niveau": [1, None], "level": [3, 3], "ouvrage": [None, "Tunnel"]})
-    levels, _ = level_numbers(table, ("Niveau",), ("Ouvrage",))
-    assert levels.tolist() == [1, -1]
-    assert columns(("Niveau",), ("Ouvrage",)) == ("bridge", "tunnel", "covered", "layer", "niveau", "ouvrage")
-
-
 def test_level_numbers_mixed_rows_and_empty_table():
     rows = [{"bridge": "yes", "layer": "2"}, {"level": 1.0}, {}, {"kunstbaute": "Tunnel"}]
     assert numbers(rows) == [2, 1, 0, -1]
@@ -143,7 +136,7 @@ def test_level_numbers_mixed_rows_and_empty_table():
 def test_level_numbers_of_an_osm_file_are_those_of_its_decks_and_tunnels(tmp_path):
     """GDAL packs most of the tags into one column."""
     around = (500_000, 5_600_000, 500_500, 5_600_500)
-    query = Query(write_streets(tmp_path / "town.osm", around), None, None, columns(), None, CRS)
+    query = Query(write_streets(tmp_path / "town.osm", around), None, None, COLUMNS, None, CRS)
     town = read_near(query, around)
     levels, notes = level_numbers(town)
     assert notes == ()

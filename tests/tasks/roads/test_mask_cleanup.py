@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean, close, drop, fill
+from flexroad.tasks.roads.mask_cleanup import clean, close, drop, fill
 from flexroad.tasks.types import Source, TileData
 
 masks = arrays.arrays(bool, st.tuples(st.integers(1, 24), st.integers(1, 24)))
@@ -103,8 +103,8 @@ def test_clean_closes_gaps_before_dropping_pieces():
     mask[18:22, 5:55] = True
     mask[:, 10::6] = False  # joints of one metre
     data = tile(mask.shape)
-    assert not clean(mask, data, Cleanup(close_m=0, drop_m2=25)).any()
-    whole = clean(mask, data, Cleanup(close_m=2, drop_m2=25))
+    assert not drop(mask, 1.0, 25).any()
+    whole = clean(mask, data, "pieces")
     assert whole[18:22, 6:54].all()
 
 
@@ -113,46 +113,30 @@ def test_clean_adds_no_cells_beyond_survey():
     mask[:, 9:11] = False
     void = np.zeros_like(mask)
     void[:, 9] = True
-    result = clean(mask, tile(mask.shape, void=void), Cleanup(close_m=3))
+    result = clean(mask, tile(mask.shape, void=void), "pieces")
     np.testing.assert_array_equal(result[5:-5], ~void[5:-5])
 
 
 @given(masks)
 def test_clean_without_steps_changes_nothing(mask):
-    np.testing.assert_array_equal(clean(mask, tile(mask.shape), NOTHING), mask)
+    np.testing.assert_array_equal(clean(mask, tile(mask.shape), "none"), mask)
 
 
-def test_clean_fuse_combines_with_second_source():
-    mask, second = np.zeros((30, 30), bool), np.zeros((30, 30), bool)
-    mask[10:20], second[:, 14] = True, True
-    data = tile(mask.shape, cell=0.5, road_mask=second)
-
-    def fused(fuse, **more):
-        options = NOTHING.model_copy(update={"fuse": fuse, "fuse_with": "road_mask", **more})
-        return clean(mask, data, options)
-
-    np.testing.assert_array_equal(fused("union"), mask | second)
-    np.testing.assert_array_equal(fused("intersection"), mask & second)
-    corridor = mask.copy()
-    corridor[:, :11] = corridor[:, 18:] = False
-    np.testing.assert_array_equal(fused("corridor", corridor_m=1.5), corridor)
-
-
-def test_clean_missing_second_source_fails():
+def test_clean_corridor_without_roads_fails():
     mask = np.ones((4, 4), bool)
-    with pytest.raises(TaskError, match=r"union needs roads.*--roads"):
-        clean(mask, tile(mask.shape), Cleanup(fuse="union"))
+    with pytest.raises(TaskError, match=r"corridor needs roads.*--roads"):
+        clean(mask, tile(mask.shape), "corridor")
 
 
-def test_clean_fuse_accepts_roads_of_catalog(tmp_path):
+def test_clean_corridor_is_5_m_around_roads_of_catalog(tmp_path):
     import geopandas
     from shapely.geometry import box
 
-    mask = np.zeros((20, 30), bool)
+    mask = np.ones((20, 30), bool)
     data = tile(mask.shape)
     west, south, east, _ = data.grid.bounds
     path = tmp_path / "roads.gpkg"
-    geopandas.GeoDataFrame(geometry=[box(west, south + 5, east, south + 9)], crs=data.grid.crs).to_file(path)
-    result = clean(mask, replace(data, roads=Source("roads", (path,))), Cleanup(fuse="union"))
-    np.testing.assert_array_equal(result[:, 0], [*[False] * 11, *[True] * 4, *[False] * 5])
+    geopandas.GeoDataFrame(geometry=[box(west, south, east, south + 4)], crs=data.grid.crs).to_file(path)
+    result = clean(mask, replace(data, roads=Source("roads", (path,))), "corridor")
+    np.testing.assert_array_equal(result[:, 0], [*[False] * 11, *[True] * 9])
     assert (result == result[:, :1]).all()

@@ -15,7 +15,7 @@ from flexroad.catalog import Grid
 from flexroad.catalog.crs import transformer
 from flexroad.tasks import TaskError
 from flexroad.tasks.io import vectors
-from flexroad.tasks.roads.rasterise import LevelColumns, Options, cells, rasterise_roads, roads
+from flexroad.tasks.roads.rasterise import Options, cells, rasterise_roads, roads
 from tests.make_roads import GRID, on_grid, tile, write, write_osm
 
 WEST_EAST = LineString(on_grid((10, 50), (90, 50)))
@@ -251,13 +251,13 @@ def test_levels_of_roads_are_read_if_they_are_wanted(tmp_path):
     path = write(tmp_path / "r.gpkg", lines, width=[6] * 3, **values)
     assert roads(tile(path).roads, GRID, Options()).level.tolist() == [0, 0]
     # A tube is a road then, whatever the option for tunnels says.
-    assert roads(tile(path).roads, GRID, Options(), LevelColumns()).level.tolist() == [1, -1, 0]
+    assert roads(tile(path).roads, GRID, Options(), levels=True).level.tolist() == [1, -1, 0]
 
 
 def test_lines_of_several_levels_meet_without_a_disc(tmp_path):
     lines = [LineString(on_grid((10 + 20 * i, 50), (30 + 20 * i, 50))) for i in range(4)]
     path = write(tmp_path / "r.gpkg", lines, width=[6] * 4, bridge=["no", "no", "yes", "yes"])
-    result = roads(tile(path).roads, GRID, Options(), LevelColumns())
+    result = roads(tile(path).roads, GRID, Options(), levels=True)
     assert result.level.tolist() == [0, 0, 1, 1, 0, 1]
     ground = shapely.union_all(result.areas[result.level == 0])
     assert ground.bounds[2] - GRID.west == pytest.approx(50)

@@ -90,7 +90,7 @@ def scanned(seed, stratum):
 
 def filtered(data):
     road = RoadMask(data.grid, data.core, data.road_mask, beyond_extent(data))
-    return road, planar.ecsrc(data, road, planar.Options(verge_m=5))
+    return road, planar.ecsrc(data, road, planar.Options(shoulder_m=5))
 
 
 def part_of(data, grid):

@@ -72,9 +72,9 @@ def test_widths_from_width_lanes_class_or_default():
         }
     )
     classes = ["primary"] * 3 + ["service", "service", "service", "service"]
-    options = Options(lane_width_m=3.0, shoulder_m=0.5, class_width_m={"service": 3.5})
+    options = Options(class_width_m={"service": 3.5})
     result, notes = widths(table, classes, options)
-    assert result.tolist() == [7.5, 10.0, 7.0, 3.5, 4.5, 40.0, 2.0]
+    assert result.tolist() == [7.5, 10.25, 7.0, 3.5, 4.5, 40.0, 2.0]
     assert notes == ("1 widths of lines cannot be read ('wide'): lanes or class are used instead",)
 
 

@@ -5,7 +5,6 @@ import pytest
 from shapely import LineString, box
 
 from flexroad.tasks import TaskError
-from flexroad.tasks.roads.mask_cleanup import Cleanup
 from flexroad.tasks.segment.vector import VERSION, Options, segment
 from tests.make_roads import GRID, on_grid, tile, write
 
@@ -47,13 +46,6 @@ def test_segment_file_without_crs_uses_that_of_catalog(tmp_path):
         segment(tile(path), Options())
     assert caught.value.file == str(path)
     assert segment(tile(path, crs=GRID.crs), Options()).mask.sum() == 600
-
-
-def test_segment_cleanup_drops_small_areas(tmp_path):
-    lines = [LINE, LineString(on_grid((20, 80), (24, 80)))]
-    path = write(tmp_path / "r.gpkg", lines, width=[6, 4])
-    assert segment(tile(path), Options()).mask[:40].any()
-    assert not segment(tile(path), Options(cleanup=Cleanup(drop_m2=20))).mask[:40].any()
 
 
 def test_segment_line_beside_tile_covers_cells_within_half_width(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
-from flexroad.tasks.roads.rasterise import LevelColumns, Options
+from flexroad.tasks.roads.rasterise import Options
 from flexroad.tasks.types import Source
 from flexroad.tools.export.centre_lines import from_table, read_centre_lines
 from tests.make_roads import GRID, in_cp1252, on_grid, write
@@ -135,7 +135,7 @@ def test_levels_are_read_and_tubes_kept_if_they_are_asked_for():
     streets = table([ALONG] * 4, **columns)
     plain = from_table(streets, Options())
     assert [line.level for line in plain.lines] == [0, 0, 0]
-    found = from_table(streets, Options(), LevelColumns())
+    found = from_table(streets, Options(), levels=True)
     assert [line.level for line in found.lines] == [2, -1, 0, 0]
     assert any("cannot be read as levels" in note for note in found.notes)
     assert found.lines[0].reverse.level == 2

@@ -17,7 +17,7 @@ from tests.make_clouds import write_cloud
 from tests.permissions import permissions_enforced
 
 WEST, SOUTH = 356_000.0, 5_699_000.0
-AHN = ("--class-scheme", "ahn")
+AHN = ("--bridge-class", "26")
 
 
 def flexroad(*words, expect=0) -> str:
@@ -69,13 +69,11 @@ def test_prepare_points_options_are_applied(cloud, tmp_path):
 
     flexroad(
         "prepare", "points", cloud, "-o", tmp_path, "--cell", 2, "--dop-cell", 1, "--ground-class", 2, 6,
-        "--name", "made", "--dtm", "mean", "--workers", 1,
+        "--workers", 1,
     )  # fmt: skip
     with rasterio.open(tmp_path / "dtm.tif") as raster:
         assert raster.res == (2, 2)
         assert "2, 6" in raster.tags()["DTM"]
-        assert "mean" in raster.tags()["DTM"]
-    assert Catalog.read(tmp_path / "catalog.parquet").tiles[0].dataset == "made"
 
 
 @pytest.mark.parametrize(
@@ -177,11 +175,11 @@ def test_prepare_interrupted_leaves_no_folder(cloud, tmp_path, number):
     ("words", "is_bridge"),
     [
         ((), False),
-        (("--class-scheme", "ahn"), True),
-        (("--class-scheme", "ahn", "--bridge-class", "17"), False),
+        (("--bridge-class", "26"), True),
+        (("--bridge-class", "17"), False),
     ],
 )
-def test_prepare_points_class_scheme_selects_bridges(tmp_path, words, is_bridge):
+def test_prepare_points_bridge_class_selects_bridges(tmp_path, words, is_bridge):
     east, north = np.meshgrid(np.arange(0, 40, 0.5), np.arange(0, 40, 0.5))
     kind = np.where(abs(north - 20) < 4, 26, 2)
     # A place in the Netherlands: elsewhere a metre of their CRS is none.
@@ -189,4 +187,4 @@ def test_prepare_points_class_scheme_selects_bridges(tmp_path, words, is_bridge)
     path = write_cloud(tmp_path / "ahn.las", xyz, kind.ravel(), "EPSG:28992")
     said = flexroad("prepare", "points", path, "-o", tmp_path / "out", "--workers", 1, *words)
     assert (tmp_path / "out" / "bridges.tif").is_file() == is_bridge
-    assert ("--class-scheme ahn does so" in said) == (not is_bridge)
+    assert ("--bridge-class 26 takes them" in said) == (not is_bridge)

@@ -484,7 +484,7 @@ def test_structures_of_ahn_are_bridges_only_if_told(tmp_path, classes, is_bridge
     options = Options() if classes is None else Options(bridge_classes=classes)
     result, _ = prepare([path], tmp_path / "out", options=options)
     assert (tmp_path / "out" / "bridges.tif").is_file() == is_bridge
-    noted = [note for note in result.notes if "--class-scheme ahn" in note]
+    noted = [note for note in result.notes if "--bridge-class 26" in note]
     assert len(noted) == (not is_bridge)
     assert all(f"{(kind == 17).sum():,} points of class 26" in note for note in noted)
 

@@ -79,8 +79,6 @@ def csv(path: Path, header: str, rows, form: str = "{:.9f},{:.9f}") -> Path:
     [
         ("longitude,latitude", []),
         ("LON,Lat", []),
-        ("lon,lat", ["--lonlat"]),
-        ("x,y", ["--lonlat"]),
         ("x,y", ["--crs", "EPSG:4326"]),
         # ETRS89, which the projected CRS is based on.
         ("lon,lat", ["--crs", "EPSG:4258"]),
@@ -181,7 +179,7 @@ def test_profile_along_points_has_distances_heights_and_grades(run, flexroad):
 
 def test_profile_of_line_in_degrees_equals_that_of_the_run(run, flexroad):
     line = ", ".join(f"{x:.10f} {y:.10f}" for x, y in degrees())
-    table = answer(flexroad("query", run, "--line", line, "--lonlat"))
+    table = answer(flexroad("query", run, "--line", line, "--crs", "EPSG:4326"))
     length = np.hypot(*(POINTS[1] - POINTS[0]))
     assert len(table) == int(length) + 2
     assert table.distance_m.iloc[-1] == pytest.approx(length, abs=2e-3)
@@ -239,7 +237,7 @@ def test_query_of_points_beside_all_tiles_says_where_the_tiles_are(run, flexroad
     assert answer(said).height_m.isna().all()
     assert said.err == (
         "note: 2 points lie on no finished tile; their columns are empty; the tiles lie in "
-        "W 500000 S 5600000 E 500040 N 5600040 (EPSG:25832); longitude and latitude need --lonlat\n"
+        "W 500000 S 5600000 E 500040 N 5600040 (EPSG:25832); longitude and latitude need --crs EPSG:4326\n"
     )
 
 
@@ -247,13 +245,12 @@ def test_query_of_points_beside_all_tiles_says_where_the_tiles_are(run, flexroad
     ("text", "words", "message"),
     [
         ("a,b\n1,2\n", "", "it needs easting and northing, or x and y, or longitude and latitude"),
-        ("easting,northing\n1,2\n", "--lonlat", "it needs longitude and latitude"),
+        ("easting,northing\n1,2\n", "--crs EPSG:4326", "it needs longitude and latitude"),
         ("", "", "no columns of coordinates"),
         ("x,y\n1,2\n\n3,4 m\n", "", "points.csv, line 4: y is '4 m', not a number"),
         ("x;y\n1,5;2\n3.000,5;4\n", "", "points.csv, line 3: x is '3.000,5', not a number"),
         ("x,y\n1,5,2,5\n", "", "points.csv, line 2: 4 values, but the header has 2"),
         ("x,y\n1,2\n", "--crs EPSG:1", "unknown CRS 'EPSG:1'"),
-        ("x,y\n1,2\n", "--crs EPSG:25832 --lonlat", "give one of --lonlat and --crs"),
         ("x,y\n1,2\n", "-o a.shp", "ends in .csv or .gpkg"),
         ("x,y\n1,2\n", "--line 1", "give the points with --points FILE, or a line with --line"),
     ],
@@ -285,7 +282,7 @@ def test_query_of_csv_in_another_encoding_gives_one_error(run, flexroad, tmp_pat
         ),
         ("--line", [Point(0, 0)], UTM, "", "type Point, not lines; points go to --points"),
         ("--points", [Point(0, 0)], None, "", "carries no CRS; give it with --crs"),
-        ("--points", [Point(0, 0)], UTM, "--lonlat", "is in EPSG:25832, not EPSG:4326"),
+        ("--points", [Point(0, 0)], UTM, "--crs EPSG:4326", "is in EPSG:25832, not EPSG:4326"),
         ("--points", [Point(0, 0)], UTM, "--layer b", "no layer 'b'; it has points"),
         ("--line", [LineString([(0, 0), (0, 0)])], UTM, "", "has no length"),
         ("--line", [LineString([(200, 95), (201, 96)])], "EPSG:4326", "", "cannot be transformed"),

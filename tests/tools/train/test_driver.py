@@ -16,7 +16,6 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run, check_models
 from flexroad.tasks import load
 from flexroad.tasks.roads import rasterise
-from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.segment.dinov2 import segment
 from flexroad.tools.synthetic.scenes import write_scenes
 from flexroad.tools.train.driver import LabelledTiles, Samples, TrainOptions, train
@@ -69,7 +68,7 @@ def with_layers(catalog, **layers):
 def test_train_report_equals_segmenter_on_validation_tiles(land, trained):
     model, report = trained
     right = wrong = missed = 0
-    options = segment.Options(model=model, cleanup=NOTHING)
+    options = segment.Options(model=model, cleanup="none")
     for tile in Catalog.read(land).select(report["asked"]["judged by"]).tiles:
         data = load.load(tile, load.Options())
         mask = segment.segment(data, options).mask
@@ -222,5 +221,5 @@ def test_run_missing_model_raises_before_start(land, tmp_path, quick_config):
 
 def test_train_help_lists_options():
     text = flexroad("train", "--help")
-    for word in ("--labels", "--validation", "--gap-m", "--ignore-m", "--set", "--seed"):
+    for word in ("--labels", "--gap-m", "--set", "--seed"):
         assert word in text

@@ -24,6 +24,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.quality.assess import LIMITS
 from flexroad.tools.export.source import select
 from flexroad.tools.synthetic.scenes import write_scenes
 from flexroad.tools.view import driver as viewer
@@ -37,9 +38,10 @@ def city(tmp_path_factory):
     catalog = Catalog.read(write_scenes(folder / "survey", 4, seed=3, size_m=60, dop=True))
     broken = catalog.tiles[2].layer("dsm")
     catalog.tiles[2].paths(broken)[0].write_bytes(b"<script>")
-    config = load_config("production", ["assess.error_estimate_m=1e-6"])
-    run = Run.create(folder / "city", config, catalog)
-    run_tiles(run, SerialExecutor(), only=lambda tile: tile != catalog.tiles[3])
+    run = Run.create(folder / "city", load_config("production"), catalog)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(LIMITS, "error-estimate", 1e-6)
+        run_tiles(run, SerialExecutor(), only=lambda tile: tile != catalog.tiles[3])
     return run.path
 
 

@@ -13,6 +13,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.quality.assess import LIMITS
 from flexroad.tasks.spline.stepped import without_steps
 from flexroad.tools.export.source import select
 from flexroad.tools.synthetic.scenes import write_scenes
@@ -327,11 +328,11 @@ def test_back_and_forward_lead_from_the_tile_to_the_map_and_again_to_the_tile(ru
 def flagged(run, tmp_path_factory):
     """The page of a run with one flagged tile, this tile, and the place of its flag."""
     folder = tmp_path_factory.mktemp("flagged")
-    flagging = Run.create(
-        folder / "run", load_config("production", ["assess.error_estimate_m=1e-6"]), run.catalog
-    )
+    flagging = Run.create(folder / "run", load_config("production"), run.catalog)
     tile = run.catalog.tiles[0]
-    run_tiles(flagging, SerialExecutor(), only=lambda one: one == tile)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(LIMITS, "error-estimate", 1e-6)
+        run_tiles(flagging, SerialExecutor(), only=lambda one: one == tile)
     (finished,) = select(flagging.path).finished()
     return (
         write_viewer(Run.open(flagging.path), folder / "page", SerialExecutor()).page,

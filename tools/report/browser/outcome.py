@@ -14,7 +14,7 @@ import pandas as pd
 
 from flexroad.catalog.text import count, printable
 from flexroad.tasks.io.height_offset import is_offset
-from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, Options
+from flexroad.tasks.quality.assess import FLAGS, LIMITS, NO_ROAD
 from flexroad.tasks.quality.places import Place
 from flexroad.tasks.quality.structures import BELOW, LEAST_RISE_M, NO_JOINT, NO_RISE
 from flexroad.tools.report.browser.tiles import STATES, TileTable, short
@@ -122,9 +122,7 @@ class Reason:
         return f"{self.flag}: {self.words}{at}; {self.remedy}"
 
 
-def reasons(
-    row: Mapping[str, Any], options: Options, places: Mapping[str, Place], notes: Sequence[str] = ()
-) -> list[Reason]:
+def reasons(row: Mapping[str, Any], places: Mapping[str, Place], notes: Sequence[str] = ()) -> list[Reason]:
     """Return a tile's flags in words.
 
     - `row`: the tile's row of metrics.parquet.
@@ -134,7 +132,7 @@ def reasons(
     """
     given = row.get("flags")
     names = given.split(", ") if isinstance(given, str) and given else []
-    found = [_reason(name, row, options, places) for name in names]
+    found = [_reason(name, row, places) for name in names]
     offset = next(filter(is_offset, notes), None)
     if offset is None:
         return found
@@ -142,27 +140,27 @@ def reasons(
     return [replace(one, remedy=f"{what} ({cause})") if one.flag in OF_HEIGHTS else one for one in found]
 
 
-def _reason(name: str, row: Mapping[str, Any], options: Options, places: Mapping[str, Place]) -> Reason:
+def _reason(name: str, row: Mapping[str, Any], places: Mapping[str, Place]) -> Reason:
     meaning = MEANINGS.get(name)
     if meaning is None:
         # A run of another version may have flags of its own.
         return Reason(name, "docs/quality.md explains this flag", None, "look at the tile")
     column = FLAGS.get(name)
     value = row.get(column) if column else None
-    limit = getattr(options, column) if column else None
-    words = meaning.words.format(value=_number(value, meaning.percent), limit=_number(limit, meaning.percent))
+    limit = _number(LIMITS.get(name), meaning.percent)
+    words = meaning.words.format(value=_number(value, meaning.percent), limit=limit)
     place = places.get(name)
     return Reason(name, words, place, meaning.remedy.format(there=" there" if place else ""))
 
 
-def described(options: Options) -> dict[str, dict[str, Any]]:
+def described() -> dict[str, dict[str, Any]]:
     """Return the flags for the page: words, remedy, column, limit and whether it is a share, by flag."""
     return {
         name: {
             "words": meaning.words,
             "remedy": meaning.remedy.format(there=""),
             "column": FLAGS.get(name),
-            "limit": _number(getattr(options, FLAGS[name]), meaning.percent) if name in FLAGS else None,
+            "limit": _number(LIMITS[name], meaning.percent) if name in LIMITS else None,
             "percent": meaning.percent,
         }
         for name, meaning in MEANINGS.items()

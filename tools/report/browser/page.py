@@ -19,7 +19,7 @@ from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import count, printable
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
-from flexroad.tasks.quality.assess import FLAGS, Options
+from flexroad.tasks.quality.assess import FLAGS, LIMITS
 from flexroad.tools.report.browser.figures import Comparison, compare, histograms
 from flexroad.tools.report.browser.outcome import Reason, cards, described, headline, reasons, statements
 from flexroad.tools.report.browser.relief import relief
@@ -85,13 +85,12 @@ def html_page(
     - `before`: name and rows of another run over the same tiles, for a comparison.
     """
     table, failed = tile_table(run.catalog.tiles, content), errors(content)
-    options: Options = run.config.chains[content.variant]["assess"]
     ranked_by, first = ranking(table)
     pictures = {tile.tile_id: tile for tile in tile_pictures(run, content, first, track)}
     comparison = compare(table, before[1], content.variant, before[0]) if before else None
     numbers = {tile.id: i for i, tile in enumerate(table.tiles)}
     background = relief(run, table.finished, content.results, track)
-    data = _data(table, failed, options, pictures, viewer, comparison)
+    data = _data(table, failed, pictures, viewer, comparison)
     if background:
         places = [background.places.get(tile.id) for tile in table.tiles]
         data["relief"] = {"side": background.side_px, "columns": background.columns, "places": places}
@@ -108,9 +107,9 @@ def html_page(
         crs=_crs_name(table.crs),
         unplaced=_unplaced(table),
         relief=background.webp if background else None,
-        charts=list(histograms(numeric_columns(table), _limits(options))),
+        charts=list(histograms(numeric_columns(table), _limits())),
         comparison=comparison,
-        looks=[_look(name, table, numbers, options, pictures, viewer) for name in first],
+        looks=[_look(name, table, numbers, pictures, viewer) for name in first],
         ranked_by=ranked_by,
         meaning=ESTIMATE_MEANING.replace("`", ""),
         viewer=viewer,
@@ -138,16 +137,15 @@ def ranking(table: TileTable) -> tuple[str, list[str]]:
 def _data(
     table: TileTable,
     failed: dict[str, str],
-    options: Options,
     pictures: Mapping[str, TilePictures],
     viewer: str,
     comparison: Comparison | None,
 ) -> dict[str, Any]:
     data = map_data(table, failed, {} if comparison is None else comparison.columns)
-    limits = _limits(options)
+    limits = _limits()
     for column in data["columns"]:
         column["limit"] = limits.get(column["key"])
-    data["meanings"] = {flag: one for flag, one in described(options).items() if flag in data["flagNames"]}
+    data["meanings"] = {flag: one for flag, one in described().items() if flag in data["flagNames"]}
     data["viewer"] = viewer
     data["places"] = {
         i: {flag: [round(float(value), 2) for value in place] for flag, place in found.places.items()}
@@ -157,17 +155,16 @@ def _data(
     return data
 
 
-def _limits(options: Options) -> dict[str, float]:
+def _limits() -> dict[str, float]:
     """Return the thresholds of the flags by column, in the unit of the page."""
     shares = {"off_dtm_road", "inferred_road", "dropped_road", "bounded_weights"}
-    return {name: getattr(options, name) * (100 if name in shares else 1) for name in FLAGS.values()}
+    return {name: LIMITS[flag] * (100 if name in shares else 1) for flag, name in FLAGS.items()}
 
 
 def _look(
     name: str,
     table: TileTable,
     numbers: Mapping[str, int],
-    options: Options,
     pictures: Mapping[str, TilePictures],
     viewer: str,
 ) -> _Look:
@@ -180,7 +177,7 @@ def _look(
         name,
         numbers[name],
         f"{'; '.join(parts)}.",
-        reasons(row, options, found.places if found else {}, found.notes if found else ()),
+        reasons(row, found.places if found else {}, found.notes if found else ()),
         found,
         f"{viewer}#tile={quote(name, safe='')}" if viewer else "",
     )

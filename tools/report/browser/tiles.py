@@ -55,7 +55,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "mesh_max_road_m": ("mesh distance road, largest", "m"),
     "mesh_p95_terrain_m": ("mesh distance terrain p95", "m"),
     "mesh_max_terrain_m": ("mesh distance terrain, largest", "m"),
-    "suspect_m2": ("largest suspect patch", "m²"),
+    "max_unexplained_area_m2": ("largest unexplained patch", "m²"),
     "curvature_per_m": ("largest curvature", "1/m"),
     "edge_step_m": ("step at the road's edge", "m"),
     "residual_median_m": ("surface minus the road's heights, median", "m"),

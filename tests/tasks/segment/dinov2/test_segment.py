@@ -13,8 +13,8 @@ from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks import TaskError, load
 from flexroad.tasks.roads import coregistration
-from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.segment.dinov2 import backbone, head
+from flexroad.tasks.segment.dinov2 import segment as method
 from flexroad.tasks.segment.dinov2.backbone import MEAN, STD, load_backbone, normalised
 from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
 from flexroad.tasks.segment.dinov2.segment import Options, files, segment
@@ -60,7 +60,16 @@ def heads(backbones, sample, tmp_path_factory) -> dict[int, Path]:
 
 
 def segmented(data: TileData, model: Path, **options):
-    return segment(data, Options(model=model, **({"cleanup": NOTHING} | options)))
+    return segment(data, Options(model=model, **({"cleanup": "none"} | options)))
+
+
+def with_threshold(path: Path, threshold: float) -> Path:
+    """Write the same head with another threshold."""
+    head = read_head(path)
+    other = path.with_name(f"{threshold}.safetensors")
+    about = head.about.model_copy(update={"threshold": threshold})
+    other.write_bytes(Head(head.weight, head.bias, about).encode())
+    return other
 
 
 def iou(a, b) -> float:
@@ -232,21 +241,24 @@ def test_segment_does_not_depend_on_tiling(heads, sample):
     assert np.mean(piece.mask == whole.mask[rows, cols]) > 0.999
 
 
-def test_segment_other_overlap_changes_result_slightly(heads, sample):
+def test_segment_other_overlap_changes_result_slightly(heads, sample, monkeypatch):
     """Other window positions have other surroundings and other position codes, which are random here.
 
     Tolerance: probabilities differ by 0.05 on average, and 19 of 20 cells have the same class.
     """
-    narrow, wide = (segmented(sample.data, heads[0], overlap=overlap) for overlap in (0.25, 0.5))
+    narrow = segmented(sample.data, heads[0])
+    monkeypatch.setattr(method, "BATCH", 7)
+    batched = segmented(sample.data, heads[0])
+    np.testing.assert_allclose(batched.probability, narrow.probability, atol=1e-5)
+    monkeypatch.setattr(method, "OVERLAP", 0.5)
+    wide = segmented(sample.data, heads[0])
     difference = np.abs(narrow.probability - wide.probability)
     assert 0 < difference.mean() < 0.05
     assert np.mean(narrow.mask == wide.mask) > 0.95
-    batched = segmented(sample.data, heads[0], batch=7)
-    np.testing.assert_allclose(batched.probability, narrow.probability, atol=1e-5)
 
 
 def test_segment_threshold_changes_mask_only(heads, sample):
-    strict, lax = (segmented(sample.data, heads[0], threshold=t) for t in (0.9, 0.1))
+    strict, lax = (segmented(sample.data, with_threshold(heads[0], t)) for t in (0.9, 0.1))
     np.testing.assert_array_equal(strict.probability, lax.probability)
     assert not np.any(strict.mask & ~lax.mask)
     assert strict.mask.sum() < lax.mask.sum()
@@ -260,7 +272,7 @@ def test_segment_cells_without_photo_are_no_road(heads, sample):
     rows, cols = wide.window(grid)
     around = {name: np.pad(getattr(data, name), 30, mode="edge") for name in ("dsm", "dtm")}
     own = replace(data.dop, paths=data.dop.paths[:1])
-    road = segmented(replace(data, grid=wide, core=grid, dop=own, **around), heads[0], threshold=0.01)
+    road = segmented(replace(data, grid=wide, core=grid, dop=own, **around), with_threshold(heads[0], 0.01))
     beyond = np.ones(wide.shape, bool)
     beyond[rows, cols] = False
     assert not road.mask[beyond].any()
@@ -328,7 +340,7 @@ def test_segment_moved_backbone_gives_same_result(backbones, heads, sample, tmp_
     moved.mkdir()
     for file in backbones[0].iterdir():
         (moved / file.name).write_bytes(file.read_bytes())
-    options = Options(model=heads[0], backbone=str(moved), cleanup=NOTHING)
+    options = Options(model=heads[0], backbone=str(moved), cleanup="none")
     np.testing.assert_array_equal(
         segment(sample.data, options).probability, segmented(sample.data, heads[0]).probability
     )
