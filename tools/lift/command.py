@@ -14,7 +14,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.points import Ground
+from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.pipeline.run.tile_steps import LARGEST_M, REMEDY, length_text
 from flexroad.tools.lift.driver import lift as lift_file
 from flexroad.tools.lift.types import Options
@@ -126,7 +126,7 @@ def lift(
         grade_limit=None if grade_limit is None else grade_limit / 100,
         crossfall_limit=None if crossfall_limit is None else crossfall_limit / 100,
     )
-    ground = Ground.open(path, variant, allow or (), earlier=True)
+    ground = RunSampler.open(path, variant, allow or (), earlier=True)
     result = lift_file(ground, file, output, wanted, crs, offset, report)
     echo(f"{output}: {result.summary}")
     if result.earlier:
