@@ -255,7 +255,7 @@ class Surface(ABC):
         return tuple(sorted((0, *(own.level.number for own in self.levels))))
 
     def at(self, number: int) -> Surface:
-        """Return the surface of a level; that of level 0 if it does not have the level."""
+        """Return the surface of one of its levels."""
         return self
 
     @property

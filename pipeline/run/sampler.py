@@ -62,8 +62,7 @@ class SurfaceSampler(ABC):
         A point on the edge of two finished tiles belongs to the one first in the catalog. A surface goes on
         beyond the survey, but its heights there are no heights of the ground.
 
-        - `level`: the level of roads above roads: 0 is the ground, others are where they have decks or tubes.
-          None: the highest at each point.
+        - `level`: 0 is the ground, others are where they have decks or tubes; None: the highest there is.
         """
         easting = np.atleast_1d(np.asarray(easting, dtype=np.float64))
         northing = np.atleast_1d(np.asarray(northing, dtype=np.float64))
@@ -104,21 +103,17 @@ class SurfaceSampler(ABC):
         The rows of a point are ordered by level, and its first one is that of the ground.
         """
         ground = self.at(easting, northing, 0)
-        answers = [ground, *(self.at(easting, northing, k) for k in ground.numbers if k != 0)]
-        kept = [
-            np.arange(len(answer.height)) if answer is ground else np.flatnonzero(np.isfinite(answer.height))
-            for answer in answers
-        ]
-        points = np.concatenate(kept)
-        columns: dict[str, Any] = {
-            name: np.concatenate(
-                [getattr(answer, name)[rows] for answer, rows in zip(answers, kept, strict=True)]
-            )
-            for name in ("height", "normal", "tile", "kind", "flags", "level")
-        }
-        order = np.lexsort((columns["level"], columns["level"] != 0, points))
-        columns = {name: values[order] for name, values in columns.items()}
-        return points[order], replace(ground, **columns)
+        others = [self.at(easting, northing, number) for number in ground.numbers if number != 0]
+        rows = [np.arange(len(ground.height)), *(np.flatnonzero(np.isfinite(o.height)) for o in others)]
+        point = np.concatenate(rows)
+        order = np.argsort(point, kind="stable")
+
+        def joined(name: str) -> Any:
+            parts = zip((ground, *others), rows, strict=True)
+            return np.concatenate([getattr(answer, name)[own] for answer, own in parts])[order]
+
+        names = ("height", "normal", "tile", "kind", "flags", "level")
+        return point[order], replace(ground, **{name: joined(name) for name in names})
 
     def heights(
         self, easting: Floats, northing: Floats, steps: bool = True

@@ -38,7 +38,7 @@ class LevelledSurface(SteppedSurface):
         """Return the surface of level 0 with the other levels, without steps on the cells of a grid."""
         rows, cols = cells.shape
         return cls(
-            **{field.name: getattr(spline, field.name) for field in fields(NurbsSurface)},
+            **vars(spline),
             steps=np.zeros((rows, cols), np.float32),
             cells=cells,
             south_north=np.zeros((2, cols), np.float32),
