@@ -380,7 +380,8 @@ class GroundTile:
     @property
     def unread(self) -> FinishedTile:
         """The tile without the results that were read, which would stay in memory with it."""
-        return replace(self.tile)
+        own = self.tile.evaluator
+        return replace(self.tile, evaluator=own and Evaluator(own.graph, own.store))
 
 
 @lru_cache(maxsize=SURFACES)
