@@ -47,7 +47,6 @@ from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
 from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
 from flexroad.tasks.spline.frame import Frame
-from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.mesh_border import (
     NUDGE,
     SAME_M,
@@ -58,7 +57,7 @@ from flexroad.tasks.spline.mesh_border import (
 )
 from flexroad.tasks.spline.moving import MovingNurbs
 from flexroad.tasks.spline.stepped import SteppedSurface
-from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
+from flexroad.tasks.types import Bools, Floats, HeightAt, Mesh, RoadClusters, RoadMask, Surface
 
 VERSION = 5
 
@@ -134,10 +133,8 @@ def sample(
     if isinstance(surface, SteppedSurface) and not options.breaklines:
         on_road = road.mask[road.grid.window(road.core)]
         surface = surface.without_steps_near(on_road, SMOOTH_M, frame)
-    if isinstance(surface, LevelledSurface) and options.method == "dynamic":
-        return _levels(surface, road, mask, local, options, frame)
     if options.method == "dynamic":
-        return _dynamic(surface, road, mask, local, options, frame)
+        return _levels(surface, road, mask, local, options, frame)
     step = options.road_m if options.method == "uniform" else np.inf
     points, faces = _regular(surface, origin, local, step, frame)
     if isinstance(surface, MovingNurbs):
@@ -176,14 +173,14 @@ def _regular(
     if frame:
         border = on_border(points, local)
         easting, northing = (points[border, :2] + origin).T
-        points[border, 2] = border_heights(surface, easting, northing)
+        points[border, 2] = border_heights(surface.height, easting, northing)
     index = np.arange(len(points), dtype=np.int32).reshape(len(y), len(x))
     sw, se, nw, ne = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     return points, np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
 
 
 def _levels(
-    surface: LevelledSurface,
+    surface: Surface,
     road: RoadMask,
     mask: Bools,
     local: Bounds,
@@ -223,7 +220,7 @@ def _other_level(
     if limit:
         area = shapely.intersection(area, limit.covered)
         lines.append(parts_of(limit.lines))
-    border = _dynamic_border(surface, road, local, options, frame, lines)
+    border = _dynamic_border(surface.height, road, local, options, frame, lines)
     border = outline.with_shared(border, ground, local)
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
     covered = SurveyLimit(
@@ -264,10 +261,11 @@ def _dynamic(
         lines.append(without_joints(outline.lines, others))
         fine = fine[outline.contains(fine)]
     lines += [part for other in others for part in (other.joints, other.feet)]
-    free, joined = np.concatenate([fine, coarse]), _joined_ground(surface, road, others)
+    free = np.concatenate([fine, coarse])
+    joined = JoinedGround(surface, road.core.origin, others) if others else None
     if frame:
         free = free[~on_border(free, local)]
-    border = _dynamic_border(joined or surface, road, local, options, frame, lines)
+    border = _dynamic_border((joined or surface).height, road, local, options, frame, lines)
     free = free[apart_from(free, lines, options.road_m / 2)]
     if limit:
         free = free[limit.covers(free)]
@@ -287,13 +285,6 @@ def _dynamic(
     if limit:
         faces = faces[limit.covers(middles(points, faces))]
     return _mesh(points, faces, road, mask, outline)
-
-
-def _joined_ground(surface: Surface, road: RoadMask, others: Sequence[LevelOutline]) -> JoinedGround | None:
-    """Return the surface with the heights of other levels on joints, None if no other level is near."""
-    if not others or not isinstance(surface, LevelledSurface):
-        return None
-    return JoinedGround(surface, road.core.origin, others)
 
 
 def _in_space(points: Floats, surface: MovingNurbs, origin: tuple[float, float]) -> Floats:
@@ -340,7 +331,7 @@ def _lattice(surface: Surface, road: RoadMask, where: Bools, local: Bounds, step
 
 
 def _dynamic_border(
-    surface: Surface,
+    height: HeightAt,
     road: RoadMask,
     local: Bounds,
     options: Options,
@@ -349,12 +340,12 @@ def _dynamic_border(
 ) -> Floats:
     """Return the border points of a dynamic mesh, ``(n, 3)``."""
     if frame:
-        return _shared_border(surface, road.core, local, options, frame)
-    return _border(surface, road.core.origin, local, options, lines)
+        return _shared_border(height, road.core, local, options, frame)
+    return _border(height, road.core.origin, local, options, lines)
 
 
 def _border(
-    surface: Surface, origin: tuple[float, float], local: Bounds, options: Options,
+    height: HeightAt, origin: tuple[float, float], local: Bounds, options: Options,
     lines: Sequence[NDArray[np.object_]],
 ) -> Floats:  # fmt: skip
     """Return points along the four edges of the domain, with corners and ends of lines, ``(n, 3)``."""
@@ -368,11 +359,11 @@ def _border(
         corners = np.isin(plan[:, 0], [west, east]) & np.isin(plan[:, 1], [south, north])
         away = np.linalg.norm(plan[:, None] - ends, axis=2).min(axis=1, initial=np.inf)
         plan = np.concatenate([plan[corners | (away >= options.road_m / 4)], ends])
-    z = surface.height(plan[:, 0] + origin[0], plan[:, 1] + origin[1])
+    z = height(plan[:, 0] + origin[0], plan[:, 1] + origin[1])
     return np.column_stack([plan, z])
 
 
-def _shared_border(surface: Surface, core: Grid, local: Bounds, options: Options, frame: Frame) -> Floats:
+def _shared_border(height: HeightAt, core: Grid, local: Bounds, options: Options, frame: Frame) -> Floats:
     """Return the border points of a tile that joins its neighbours, ``(n, 3)``."""
     lengths = local[2] - local[0], local[3] - local[1]
     fine, coarse = (
@@ -380,7 +371,7 @@ def _shared_border(surface: Surface, core: Grid, local: Bounds, options: Options
         for step in (options.road_m, options.terrain_m)
     )
     plan = border_points(frame, local, core.cell, fine, coarse, options.mask == "raw", options.road_m / 4)
-    z = border_heights(surface, *(plan + core.origin).T)
+    z = border_heights(height, *(plan + core.origin).T)
     return np.column_stack([plan, z])
 
 

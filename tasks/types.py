@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import shapely
@@ -198,25 +199,81 @@ class RoadClusters:
         return self.level.number if self.level else 0
 
 
-@runtime_checkable
-class Surface(Protocol):
-    """Height and normal of the fitted ground at any easting and northing of the tile."""
+@dataclass(frozen=True, eq=False)
+class LevelSpline:
+    """The spline of a level other than 0."""
 
-    @property
-    def bounds(self) -> Bounds:
-        """The domain: west, south, east, north (m).
+    level: Level
+    A: Floats
+    """Control heights, ``(m, n)``, m; row 0 in the south."""
 
-        Beyond it, up to the tile's edge, the surface is extrapolated linearly.
-        """
 
+HeightAt = Callable[[Floats, Floats], Floats]
+"""Heights (m) at eastings and northings (m)."""
+
+
+class Surface(ABC):
+    """Height and normal of the fitted ground at any easting and northing of the tile.
+
+    Most surfaces have level 0 alone, without steps.
+    """
+
+    bounds: Bounds
+    """The domain: west, south, east, north (m).
+
+    Beyond it, up to the tile's edge, the surface is extrapolated linearly.
+    """
+    levels: tuple[LevelSpline, ...] = ()
+    """The other levels, by ascending number."""
+
+    @abstractmethod
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in the points' broadcast shape; NaN where unknown."""
 
+    @abstractmethod
     def lattice(self, eastings: Floats, northings: Floats) -> Floats:
         """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
 
+    @abstractmethod
     def normal(self, easting: Floats, northing: Floats) -> Floats:
         """Return upward unit normals at scattered points, ``(..., 3)``."""
+
+    def smooth(self, easting: Floats, northing: Floats) -> Floats:
+        """Return heights without the steps beside roads (m), in the points' broadcast shape."""
+        return self.height(easting, northing)
+
+    def step(self, easting: Floats, northing: Floats) -> Floats:
+        """Return the steps beside roads (m), in the points' broadcast shape."""
+        return np.zeros(np.broadcast_shapes(np.shape(easting), np.shape(northing)))
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers of the levels, ascending; 0 is one of them."""
+        return tuple(sorted((0, *(own.level.number for own in self.levels))))
+
+    def at(self, number: int) -> Surface:
+        """Return the surface of one of its levels."""
+        return self
+
+    @property
+    def highest(self) -> Surface:
+        """The surface of the highest level at each place."""
+        return self
+
+    def covers(self, number: int, easting: Floats, northing: Floats) -> Bools:
+        """Return which points a level has, in their broadcast shape: level 0 is everywhere."""
+        for own in self.levels:
+            if own.level.number == number:
+                return own.level.covers(easting, northing)
+        return np.full(np.broadcast_shapes(np.shape(easting), np.shape(northing)), number == 0)
+
+    def top(self, easting: Floats, northing: Floats) -> NDArray[np.int8]:
+        """Return the number of the highest level at points, in their broadcast shape."""
+        result = np.zeros(np.broadcast_shapes(np.shape(easting), np.shape(northing)), np.int8)
+        for own in self.levels:
+            if own.level.number > 0:
+                result[own.level.covers(easting, northing)] = own.level.number
+        return result
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,9 @@ from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.sample import Options, sample
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
 from flexroad.tasks.spline.lattice import Lattice
-from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.space import surface_on
-from flexroad.tasks.types import Level, Mesh, RoadClusters, RoadMask
+from flexroad.tasks.types import Level, LevelSpline, Mesh, RoadClusters, RoadMask
 
 WEST, SOUTH = 500000.0, 5600000.0
 GROUND_M, DECK_M, RISE = 100.0, 107.0, 0.03

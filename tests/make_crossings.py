@@ -137,7 +137,7 @@ class Survey:
             height = own.height(x, y)
             if name == "approach" and result.road.levels:
                 # Of a deck that is drawn too long, the end is an approach.
-                height = result.surface.top_lattice(core.eastings, core.northings)
+                height = result.surface.highest.lattice(core.eastings, core.northings)
             off = height - self.world.height(number, x, y)
             errors[name] = float(np.abs(off[cells]).mean())
         return errors

@@ -11,7 +11,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from flexroad.pipeline.run.points import Ground
+from flexroad.pipeline.run.sampler import RunSampler
 from tests import make_osm, validators
 from tests.command_line import call
 from tests.read_opendrive import quality_issues
@@ -59,7 +59,9 @@ def offset(file: Path) -> np.ndarray:
 def surface(folder: Path, places: np.ndarray) -> np.ndarray:
     """Return the heights of the run at places in UTM, without kerbs."""
     to_run = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:25832", always_xy=True)
-    found, _ = Ground.open(folder / "runs" / "town").heights(*to_run.transform(*places[:, :2].T), steps=False)
+    found, _ = RunSampler.open(folder / "runs" / "town").heights(
+        *to_run.transform(*places[:, :2].T), steps=False
+    )
     return found.ground
 
 

@@ -51,6 +51,8 @@ from flexroad.tasks.types import (
 
 ESTIMATES = 32
 """Number of tiles of which a process keeps the error estimates (0.6 MB each)."""
+SURFACES = 128
+"""Number of tiles of which a process keeps surface and road mask (some 0.7 MB each)."""
 NO_DISTANCES = (math.nan,) * len(FIGURES)
 """Distances of a mesh that has none (m)."""
 SEE_REPORT = "`flexroad report` says what is wrong there"
@@ -211,6 +213,16 @@ class FinishedTile:
         evaluator = Evaluator(status.graph, place.artefacts)
         return cls(status.graph.around, variant, Snapshot.of(status, variant), place, evaluator)
 
+    @classmethod
+    def last(cls, run: Run, status: TileStatus, variant: str) -> FinishedTile:
+        """Return a tile as it was last finished; a result that the store no longer has is an error."""
+        nodes = run.folder(status.graph.tile.id).nodes(variant)
+        try:
+            digests = bytes.fromhex("".join(nodes[stage] for stage in STAGE_NAMES))
+        except (KeyError, TypeError, ValueError):
+            digests = b""  # The marker is damaged.
+        return cls(status.graph.around, variant, Snapshot("", digests, None), RunPlace.of(run))
+
     def in_variant(self, variant: str) -> FinishedTile:
         """Return the tile in another variant; what both have in common is read or computed once."""
         snapshot = replace(self.snapshot, digests=_digests(self.graph, variant))
@@ -349,11 +361,13 @@ class GroundTile:
     id: str
     name: str
     tile: FinishedTile = field(compare=False, repr=False)
+    earlier: bool = field(default=False, repr=False)
+    """Whether it is of earlier sources or options (`FinishedTile.last`)."""
 
     @classmethod
-    def of(cls, tile: FinishedTile) -> GroundTile:
+    def of(cls, tile: FinishedTile, earlier: bool = False) -> GroundTile:
         """Return that of a tile."""
-        return cls(tile.id, tile.snapshot.nodes["assess"], tile)
+        return cls(tile.id, tile.snapshot.nodes["assess"], tile, earlier)
 
     @property
     def grid(self) -> Grid:
@@ -363,7 +377,15 @@ class GroundTile:
     @property
     def unread(self) -> FinishedTile:
         """The tile without the results that were read, which would stay in memory with it."""
-        return replace(self.tile)
+        own = self.tile.evaluator
+        return replace(self.tile, evaluator=own and Evaluator(own.graph, own.store))
+
+
+@lru_cache(maxsize=SURFACES)
+def surface_and_road(tile: GroundTile) -> tuple[Surface, RoadMask]:
+    """Return the surface and the road mask of a tile."""
+    finished = tile.unread
+    return finished.surface, finished.road
 
 
 @lru_cache(maxsize=ESTIMATES)

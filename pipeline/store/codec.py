@@ -20,11 +20,20 @@ from flexroad.catalog import Grid
 from flexroad.pipeline.config.methods import methods
 from flexroad.tasks.io.archive import npz
 from flexroad.tasks.spline.frame import Corner, Edge
-from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.moving import MovingNurbs
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Level, Mesh, Metrics, Quality, RoadClusters, RoadMask, Structures
+from flexroad.tasks.types import (
+    Level,
+    LevelSpline,
+    Mesh,
+    Metrics,
+    Quality,
+    RoadClusters,
+    RoadMask,
+    Structures,
+)
 
 HEADER = "header.json"
 SEPARATOR = "."

@@ -26,9 +26,8 @@ from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import cog, glb, npz, ply
 from flexroad.tasks.quality.support import of_faces, top_support
 from flexroad.tasks.roads.level_numbers import HIGHEST
-from flexroad.tasks.spline.levelled import LevelledSurface, top_of
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Bools, Floats, Quality
+from flexroad.tasks.types import Bools, Floats, Quality, Surface
 
 CLASSIFICATION = "https://stac-extensions.github.io/classification/v2.0.0/schema.json"
 FILE = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
@@ -153,15 +152,12 @@ def _cog(
     road, surface = evaluate(nodes["segment"]), evaluate(nodes["fit"])
     window = road.grid.window(core)
     # Rasters have the highest level, as the DSM.
-    heights = top_of(surface).lattice(core.eastings, core.northings)
+    heights = surface.highest.lattice(core.eastings, core.northings)
     heights[road.outside[window]] = float("nan")
     kept, quality = top_mask(evaluate(nodes["ecsrc"]))[window], evaluate(nodes["assess"])
-    support = quality.support
-    others: dict[Kind, bytes] = {}
     # Without a common one, GDAL's environment is set up and cleared for each call.
     with quiet():
-        if isinstance(surface, LevelledSurface):
-            support, others = _of_levels(core, road.outside[window], surface, quality, vertical)
+        support, others = _of_levels(core, road.outside[window], surface, quality, vertical)
         return {
             HEIGHT: cog.encode_height(heights, core, vertical),
             ROAD: cog.encode_mask(kept, core),
@@ -171,7 +167,7 @@ def _cog(
 
 
 def _of_levels(
-    core: Grid, outside: Bools, surface: LevelledSurface, quality: Quality, vertical: str | None
+    core: Grid, outside: Bools, surface: Surface, quality: Quality, vertical: str | None
 ) -> tuple[NDArray[np.uint8], dict[Kind, bytes]]:
     """Return the support of the highest level, and rasters of level 0 below decks and of tubes."""
     at = np.meshgrid(core.eastings, core.northings)

@@ -12,7 +12,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.space import least_squares_plane
-from flexroad.tasks.types import Floats, RoadClusters, TileData
+from flexroad.tasks.types import Floats, RoadClusters, Surface, TileData
 
 VERSION = 1
 
@@ -24,8 +24,8 @@ class Options(BaseOptions):
 
 
 @dataclass(frozen=True, eq=False)
-class PlaneSurface:
-    """A plane; satisfies `tasks.types.Surface`."""
+class PlaneSurface(Surface):
+    """A plane."""
 
     crs: str
     bounds: Bounds

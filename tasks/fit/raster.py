@@ -14,7 +14,7 @@ from pydantic import Field
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.options import Options as BaseOptions
-from flexroad.tasks.types import Floats, RoadClusters, TileData
+from flexroad.tasks.types import Floats, RoadClusters, Surface, TileData
 
 VERSION = 1
 STORED = False
@@ -33,8 +33,8 @@ class Options(BaseOptions):
 
 
 @dataclass(frozen=True, eq=False)
-class RasterSurface:
-    """Cell centres joined by triangles; satisfies `tasks.types.Surface`.
+class RasterSurface(Surface):
+    """Cell centres joined by triangles.
 
     Each quad of four centres is cut along its diagonal from south-west to north-east, as in `tasks.sample`:
     triangles (sw, se, ne) and (sw, ne, nw). Heights are linear on a triangle; they are NaN if a corner is

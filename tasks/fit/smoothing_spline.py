@@ -31,13 +31,13 @@ from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.frame import Corner, Edge, Frame, rounded
 from flexroad.tasks.spline.irls import HuberObjective, minimise
 from flexroad.tasks.spline.lattice import Lattice, Range
-from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import Space, check_cells, start_heights, surface_on
 from flexroad.tasks.spline.stepped import border_steps, ground_beside, spline_around, with_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.spline.thin_plate import bending_energy
-from flexroad.tasks.types import Bools, Floats, Level, RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import Bools, Floats, Level, LevelSpline, RoadClusters, RoadMask, TileData
 
 VERSION = 8
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.meshing.lines import AT_BORDER_M, GRID_M, parts_of
 from flexroad.tasks.meshing.road_outline import encoded, lines_of
-from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.mesh_border import SAME_M, on_border
-from flexroad.tasks.types import Bools, Floats, Level
+from flexroad.tasks.types import Bools, Floats, Level, Surface
 
 WALL_M = 0.25
 """Distance of the foot of an abutment from the joint (m)."""
@@ -164,15 +163,10 @@ def without_joints(lines: NDArray[np.object_], outlines: Sequence[LevelOutline])
 class JoinedGround:
     """The surface of level 0, of which points on joints have the heights of the level that begins there."""
 
-    surface: LevelledSurface
+    surface: Surface
     origin: tuple[float, float]
     """Easting and northing that the outlines are relative to (m)."""
     outlines: Sequence[LevelOutline]
-
-    @property
-    def bounds(self) -> Bounds:
-        """The domain: west, south, east, north (m)."""
-        return self.surface.bounds
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, ``(n,)``."""
@@ -185,11 +179,3 @@ class JoinedGround:
             at = outline.has_joint_at(points - self.origin)
             result[at] = self.surface.at(outline.number).height(*points[at].T)
         return result
-
-    def lattice(self, eastings: Floats, northings: Floats) -> Floats:
-        """Return heights (m) of level 0 at every pair, ``(len(northings), len(eastings))``."""
-        return self.surface.lattice(eastings, northings)
-
-    def normal(self, easting: Floats, northing: Floats) -> Floats:
-        """Return upward unit normals of level 0 at scattered points, ``(..., 3)``."""
-        return self.surface.normal(easting, northing)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats, Mesh, Surface
 
@@ -30,7 +29,7 @@ def mesh_normals(mesh: Mesh, surface: Surface | None = None) -> Floats:
     if mesh.level is not None:
         every = np.empty_like(mesh.vertices)
         for number in mesh.numbers:
-            of_level = surface.at(number) if isinstance(surface, LevelledSurface) else surface
+            of_level = surface and surface.at(number)
             every[np.unique(mesh.faces[mesh.level == number])] = mesh_normals(mesh.at(number), of_level)
         return every
     normals = vertex_normals(mesh.vertices, mesh.faces)

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.archive import npz
-from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Level
+from flexroad.tasks.types import Level, LevelSpline
 
 VERSION = 2
 WITH_LEVELS = 3
@@ -58,7 +58,7 @@ def encode(surface: NurbsSurface) -> bytes:
         stepped = {name: getattr(surface, name) for name in STEPS}
         stepped["cells"] = np.asarray(numbers, np.float64)
     version = VERSION
-    if isinstance(surface, LevelledSurface):
+    if surface.levels:
         version = WITH_LEVELS
         stepped["levels"] = np.array([own.level.number for own in surface.levels], np.int64)
         for own in surface.levels:

@@ -25,7 +25,6 @@ from flexroad.tasks.quality.structures import STRUCTURE_FLAGS, structures
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.quality.worst import worst_piece
 from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M
-from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
 
@@ -108,11 +107,11 @@ def assess(
         of decks and tubes are those of level 0, too.
     """
     own = _assess(data, road, clusters, surface, options, refit)
-    if not isinstance(surface, LevelledSurface):
-        return own
     others = []
     for of_level in clusters.levels:
         number = of_level.number
+        if number not in surface.numbers:
+            continue
         seen, there = level_data(data, clusters, number), level_road(road, number)
         quality = _assess(seen, there, of_level, surface.at(number), options)
         found, flags = structures(road, surface, number)
@@ -189,8 +188,8 @@ def cell_errors(
     They are those of a level, or of level 0 if the tile does not have it. The estimate is NaN beyond the
     survey, and beyond decks and tubes.
     """
-    own = [own for own in clusters.levels if own.number == number]
-    if own and isinstance(surface, LevelledSurface):
+    own = [own for own in clusters.levels if own.number == number and number in surface.numbers]
+    if own:
         data, road, surface = level_data(data, clusters, number), level_road(road, number), surface.at(number)
         clusters = own[0]
     cells = compare(data, road, clusters, surface, options.dsm_dtm_tolerance_m)
@@ -208,8 +207,6 @@ def top_errors(
 ) -> tuple[Floats, NDArray[np.uint8]]:
     """Return `cell_errors` of the highest level in each cell."""
     estimate, classes = cell_errors(data, road, clusters, surface, options)
-    if not isinstance(surface, LevelledSurface):
-        return estimate, classes
     top = surface.top(*np.meshgrid(data.core.eastings, data.core.northings))
     for number in (of_level.number for of_level in clusters.levels):
         here = (top == number) & (number > 0)

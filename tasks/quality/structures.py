@@ -7,8 +7,7 @@ import shapely
 
 from flexroad.tasks.levels.joints import lack_joint
 from flexroad.tasks.levels.seen import level_road
-from flexroad.tasks.spline.levelled import LevelledSurface
-from flexroad.tasks.types import RoadMask, Structures
+from flexroad.tasks.types import RoadMask, Structures, Surface
 
 BELOW, NO_RISE, NO_JOINT = "below", "no-rise", "no-joint"
 STRUCTURE_FLAGS = (BELOW, NO_RISE, NO_JOINT)
@@ -21,9 +20,7 @@ FROM_JOINTS_M = 2.0
 """Nearer to a joint both levels have nearly the same height (m)."""
 
 
-def structures(
-    road: RoadMask, surface: LevelledSurface, number: int
-) -> tuple[Structures | None, tuple[str, ...]]:
+def structures(road: RoadMask, surface: Surface, number: int) -> tuple[Structures | None, tuple[str, ...]]:
     """Return the figures and flags of the decks or tubes of a level; None if none lies on the tile's core."""
     level = next(level for level in road.levels if level.number == number)
     west, south, east, north = road.core.bounds

@@ -11,26 +11,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import BLEND_M, Bools, Floats, Level, Surface
+from flexroad.tasks.types import BLEND_M, Floats, Level, LevelSpline, Surface
 
 GRADIENT_M = 0.01
 """Distance over which the slope of the weight of a level is taken (m)."""
 STEEPEST = 1.6 / BLEND_M
 """More than the largest slope of the weight where it is smooth (1/m)."""
-
-
-@dataclass(frozen=True, eq=False)
-class LevelSpline:
-    """The spline of a level other than 0."""
-
-    level: Level
-    A: Floats
-    """Control heights, ``(m, n)``, m; row 0 in the south."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +38,7 @@ class LevelledSurface(SteppedSurface):
         """Return the surface of level 0 with the other levels, without steps on the cells of a grid."""
         rows, cols = cells.shape
         return cls(
-            **{field.name: getattr(spline, field.name) for field in fields(NurbsSurface)},
+            **vars(spline),
             steps=np.zeros((rows, cols), np.float32),
             cells=cells,
             south_north=np.zeros((2, cols), np.float32),
@@ -56,40 +46,18 @@ class LevelledSurface(SteppedSurface):
             levels=levels,
         )
 
-    @property
-    def numbers(self) -> tuple[int, ...]:
-        """The numbers of the levels, ascending; 0 is one of them."""
-        return tuple(sorted((0, *(own.level.number for own in self.levels))))
-
     def at(self, number: int) -> NurbsSurface:
-        """Return the surface of a level. Of others than 0 it counts only on the level's areas."""
+        """Return the surface of a level. Those of others than 0 are roads only where the level `covers`."""
         if number == 0:
             return self
         control = next(own.A for own in self.levels if own.level.number == number)
         own = {field.name: getattr(self, field.name) for field in fields(NurbsSurface)}
         return NurbsSurface(**own | {"A": control})
 
-    def covers(self, number: int, easting: Floats, northing: Floats) -> Bools:
-        """Return which points lie on the decks or tubes of a level, in their broadcast shape."""
-        (own,) = (own for own in self.levels if own.level.number == number)
-        return own.level.covers(easting, northing)
-
-    def top(self, easting: Floats, northing: Floats) -> NDArray[np.int8]:
-        """Return the number of the highest level at points, in their broadcast shape."""
-        result = np.zeros(np.broadcast_shapes(np.shape(easting), np.shape(northing)), np.int8)
-        for own in self.levels:
-            if own.level.number > 0:
-                result[own.level.covers(easting, northing)] = own.level.number
-        return result
-
-    def top_lattice(self, eastings: Floats, northings: Floats) -> Floats:
-        """Return heights of the highest level (m) at every pair, ``(len(northings), len(eastings))``."""
-        heights, (east, north) = self.lattice(eastings, northings), np.meshgrid(eastings, northings)
-        numbers = self.top(east, north)
-        for number in np.unique(numbers[numbers > 0]).tolist():
-            here = numbers == number
-            heights[here] = self.at(number).height(east[here], north[here])
-        return heights
+    @property
+    def highest(self) -> Surface:
+        """The surface of the highest level at each place."""
+        return HighestSurface(self.bounds, self)
 
     def smooth(self, easting: Floats, northing: Floats) -> Floats:
         """Return the heights of level 0 without its steps (m) at points, in their broadcast shape."""
@@ -135,27 +103,25 @@ class LevelledSurface(SteppedSurface):
 
 
 @dataclass(frozen=True, eq=False)
-class TopSurface:
+class HighestSurface(Surface):
     """The highest level at each place: decks, and elsewhere the ground."""
 
-    levels: LevelledSurface
-
-    @property
-    def bounds(self) -> Bounds:
-        """The domain: west, south, east, north (m)."""
-        return self.levels.bounds
+    bounds: Bounds
+    """The domain: west, south, east, north (m)."""
+    every: LevelledSurface
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in their broadcast shape."""
-        return self._with_decks(self.levels.height(easting, northing), easting, northing, NurbsSurface.height)
+        return self._with_decks(self.every.height(easting, northing), easting, northing, NurbsSurface.height)
 
     def lattice(self, eastings: Floats, northings: Floats) -> Floats:
         """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
-        return self.levels.top_lattice(eastings, northings)
+        places = np.meshgrid(eastings, northings)
+        return self._with_decks(self.every.lattice(eastings, northings), *places, NurbsSurface.height)
 
     def normal(self, easting: Floats, northing: Floats) -> Floats:
         """Return upward unit normals at scattered points, ``(..., 3)``."""
-        return self._with_decks(self.levels.normal(easting, northing), easting, northing, NurbsSurface.normal)
+        return self._with_decks(self.every.normal(easting, northing), easting, northing, NurbsSurface.normal)
 
     def _with_decks(
         self,
@@ -166,16 +132,11 @@ class TopSurface:
     ) -> Floats:
         """Return values of level 0 at points, with those of higher levels on these."""
         east, north = np.broadcast_arrays(easting, northing)
-        numbers, result = self.levels.top(east, north), np.array(values)
+        numbers, result = self.every.top(east, north), np.array(values)
         for number in np.unique(numbers[numbers > 0]).tolist():
             here = numbers == number
-            result[here] = of(self.levels.at(number), east[here], north[here])
+            result[here] = of(self.every.at(number), east[here], north[here])
         return result
-
-
-def top_of(surface: Surface) -> Surface:
-    """Return the surface of the highest levels; one without levels is returned as it is."""
-    return TopSurface(surface) if isinstance(surface, LevelledSurface) else surface
 
 
 def _rise(level: Level, easting: Floats, northing: Floats, aside: tuple[float, float]) -> Floats:

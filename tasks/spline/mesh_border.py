@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.borders import DECIMALS
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.spline.frame import Edge, Frame
-from flexroad.tasks.types import Bools, Floats, Surface
+from flexroad.tasks.types import Bools, Floats, HeightAt
 
 GRAIN_M = 2.0**-12
 """Heights on the border are multiples of this (m): relative to a whole-metre datum they are exact in the
@@ -26,12 +26,12 @@ NUDGE = 1e-6
 """Share of a cell, larger than the rounding error of its edge's coordinates."""
 
 
-def border_heights(surface: Surface, easting: Floats, northing: Floats) -> Floats:
+def border_heights(height: HeightAt, easting: Floats, northing: Floats) -> Floats:
     """Return the heights of vertices on the border (m).
 
     They are evaluated point by point: the last digits of a matrix product depend on the other points.
     """
-    return np.asarray(np.round(surface.height(easting, northing) / GRAIN_M) * GRAIN_M)
+    return np.asarray(np.round(height(easting, northing) / GRAIN_M) * GRAIN_M)
 
 
 def border_points(

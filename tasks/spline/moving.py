@@ -16,15 +16,15 @@ import numpy as np
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.spline.objective import Objective
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Floats, Surface
 
 DECIMALS = 6
 """Decimals of a metre that places are rounded to: what lies on the tile's edge stays exactly on it."""
 
 
 @dataclass(frozen=True, eq=False)
-class MovingNurbs:
-    """A NURBS in space; satisfies `tasks.types.Surface`, where places stand for their parameters (u, v).
+class MovingNurbs(Surface):
+    """A NURBS in space, where places stand for their parameters (u, v).
 
     `height` at a place is that of S(u, v), where u and v are affine in the place: a value of the paper's R^S,
     not the height of the surface above the place. `moved` says where S(u, v) is in plan.

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Floats, Surface
 
 Starts = NDArray[np.intp]
 
@@ -114,8 +114,8 @@ def dense(start: Starts, values: Floats, points: int) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class NurbsSurface:
-    """A NURBS height field over a rectangle (Eq. nurbs); satisfies `tasks.types.Surface`.
+class NurbsSurface(Surface):
+    """A NURBS height field over a rectangle (Eq. nurbs).
 
     Beyond its domain it is extrapolated linearly: first-order Taylor expansion about the nearest domain
     point.

@@ -16,7 +16,7 @@ import pytest
 import rasterio
 from scipy.ndimage import map_coordinates
 
-from flexroad.pipeline.run.points import Ground
+from flexroad.pipeline.run.sampler import RunSampler
 from tests.read_opendrive import quality_issues
 from tests.real.opendrive import reference_lines
 from tests.real.shown import flexroad, measured, table_after
@@ -119,7 +119,7 @@ def test_deepscenario_roads_agree_with_map_and_vehicles(folder, source):
     )
     assert covered.sum() == count
     for variant, expected in zip(("plane", "rgt", "flexroad"), shown, strict=True):
-        surface = Ground.open(folder / "runs/deepscenario", variant).at(x[covered], y[covered])
+        surface = RunSampler.open(folder / "runs/deepscenario", variant).at(x[covered], y[covered])
         assert abs(surface.height - z[covered]).mean() == pytest.approx(expected, abs=0.001)
 
 

@@ -14,11 +14,11 @@ from flexroad.tasks.metrics.mesh_check import faults
 from flexroad.tasks.sample import Options, sample
 from flexroad.tasks.spline.moving import moving
 from flexroad.tasks.spline.space import clamped_space, surface_on
-from flexroad.tasks.types import Mesh, RoadClusters, RoadMask
+from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, Surface
 
 
 @dataclass(frozen=True)
-class Hills:
+class Hills(Surface):
     """A surface with heights everywhere except in a hole."""
 
     hole: tuple[float, float, float] | None = None

@@ -17,12 +17,12 @@ from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.meshing.road_outline import encoded
 from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.roads.rasterise import cells
-from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import RoadClusters, RoadMask, Surface, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 90, 80)
 
 
-class Hills:
+class Hills(Surface):
     bounds = GRID.hull
 
     def height(self, easting, northing):

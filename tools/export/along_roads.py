@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
@@ -20,8 +20,10 @@ from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile, GroundTile, passing
+from flexroad.pipeline.run.sampler import TileSampler
 from flexroad.pipeline.run.tile_steps import LARGEST_M, length_text
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats
@@ -39,11 +41,18 @@ from flexroad.tools.export.along_line import (
     profile_error,
     profiles,
 )
-from flexroad.tools.export.along_route import PlaceLevels, RouteLevels, structures
-from flexroad.tools.export.ground import SMOOTH, Ground, steps_left_out
 from flexroad.tools.export.local_frame import LocalFrame
 from flexroad.tools.export.network import Network, network
-from flexroad.tools.export.pieces import MARKERS, Encode, Piece, Row, write_pieces, write_whole
+from flexroad.tools.export.pieces import (
+    MARKERS,
+    SMOOTH,
+    Encode,
+    Piece,
+    Row,
+    steps_left_out,
+    write_pieces,
+    write_whole,
+)
 from flexroad.tools.export.profiles import Profiles
 from flexroad.tools.export.reference_line import ReferenceLine
 from flexroad.tools.export.source import Options, Source
@@ -108,13 +117,18 @@ class RouteUnit:
                 text.update(repr(part.level).encode())
         return text.hexdigest()
 
+    @property
+    def sampler(self) -> TileSampler:
+        """The surfaces of its tiles."""
+        return TileSampler(self.tiles)
+
     def height(self, work: Work) -> HeightAt:
         """Return the surface without steps in the local frame."""
-        return self._local(Ground(self.tiles).height, work)
+        return self._local(work, steps=False)
 
     def step(self, work: Work) -> HeightAt:
         """Return the height of the surface with steps above it, in the local frame."""
-        return self._local(Ground(self.tiles).step, work)
+        return self._local(work, steps=True)
 
     def tile_step(self, line: ReferenceLine, v: Floats, inside: Bools, work: Work) -> float:
         """Return the largest step between the tiles below a road (m); 0 on one tile.
@@ -123,7 +137,12 @@ class RouteUnit:
         - `inside` ``(n, m)``: the places beside the line's points that count.
         """
         x, y = line.beside(v)
-        return Ground(self.tiles).largest_tile_step(*work.frame.to_run(x, y), inside, self.levels(x, y))
+        index: NDArray[np.intp] = np.where(inside, np.arange(x.size).reshape(x.shape), -1)
+        starts = np.concatenate([index[:-1].ravel(), index[:, :-1].ravel()])
+        ends = np.concatenate([index[1:].ravel(), index[:, 1:].ravel()])
+        joined = (starts >= 0) & (ends >= 0)
+        easting, northing = (values.ravel() for values in work.frame.to_run(x, y))
+        return self.sampler.tile_step(easting, northing, starts[joined], ends[joined], self.levels(x, y))
 
     def levels(self, x: Floats, y: Floats) -> PlaceLevels | None:
         """Return the levels of places in the local frame; None if the route is on level 0 alone."""
@@ -138,8 +157,8 @@ class RouteUnit:
     def _levels(self) -> RouteLevels | None:
         return RouteLevels.of(self.route)
 
-    def _local(self, of: Callable[[Floats, Floats, PlaceLevels | None], Floats], work: Work) -> HeightAt:
-        return lambda x, y: of(*work.frame.to_run(x, y), self.levels(x, y))
+    def _local(self, work: Work, steps: bool) -> HeightAt:
+        return lambda x, y: self.sampler.on_road(*work.frame.to_run(x, y), self.levels(x, y), steps)
 
     def flags(self, line: ReferenceLine, work: Work) -> str:
         """Return the flags that the carriageway of one of its roads passes, by name."""
@@ -147,7 +166,7 @@ class RouteUnit:
         x, y = line.beside(v)
         on = np.abs(v) <= line.width[:, None] / 2
         x, y = x[on], y[on]
-        bits = Ground(self.tiles).flags(*work.frame.to_run(x, y), self.levels(x, y))
+        bits = self.sampler.flags(*work.frame.to_run(x, y), self.levels_on(x, y))
         return ", ".join(flag_names(bits))
 
     def road_id(self, part: int) -> int:

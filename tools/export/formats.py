@@ -19,7 +19,6 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.roads.extent import covered
-from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tools.export import (
@@ -125,7 +124,7 @@ def _smooth_row(tile: FinishedTile, bounds: Bounds, beyond_m2: float) -> Row:
     """Return the largest step that a surface leaves out, and a note if it ends with the survey or goes on."""
     parts = [CUT] if bounds != tile.tile.grid.bounds else []
     parts += [BEYOND] if beyond_m2 else []
-    parts += [OF_LEVEL_0] if isinstance(tile.surface, LevelledSurface) else []
+    parts += [OF_LEVEL_0] if tile.surface.levels else []
     return {"steps_max_m": _steps_m(tile)} | ({"note": "; ".join(parts)} if parts else {})
 
 

@@ -31,9 +31,15 @@ from flexroad.tools.export.along_roads import (
     with_line,
     write_units,
 )
-from flexroad.tools.export.ground import SMOOTH, Ground, steps_left_out
 from flexroad.tools.export.network import network
-from flexroad.tools.export.pieces import MARKERS, Piece, Row, write_whole
+from flexroad.tools.export.pieces import (
+    MARKERS,
+    SMOOTH,
+    Piece,
+    Row,
+    steps_left_out,
+    write_whole,
+)
 from flexroad.tools.export.reference_line import ReferenceLine
 from flexroad.tools.export.road_lines import RoadLine
 from flexroad.tools.export.source import Options, Source
@@ -138,8 +144,8 @@ def _mean(values: Any) -> float | None:
 
 def _arrays(along: Stations, unit: RouteUnit, work: Work) -> dict[str, Any]:
     easting, northing = work.frame.to_run(along.x, along.y)
-    levels = unit.levels(along.middle_x, along.middle_y)
-    error, support = Ground(unit.tiles).error(*work.frame.to_run(along.middle_x, along.middle_y), levels)
+    middle = along.middle_x, along.middle_y
+    error, support = unit.sampler.errors(*work.frame.to_run(*middle), unit.levels_on(*middle))
     return {
         "points": np.column_stack([easting, northing, along.z]),
         "support": support,

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,6 @@ from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.levels.seen import top_mask, with_approaches
 from flexroad.tasks.products import cog
 from flexroad.tasks.quality.support import Support, top_support
-from flexroad.tasks.spline.levelled import LevelledSurface, top_of
 from flexroad.tasks.types import Bools, Floats, Surface
 from flexroad.tools.export.source import Options, Source
 
@@ -178,26 +176,24 @@ class _Shown:
     kept: Bools
     """Filtered road cells, on the grid of the tile's road mask."""
     support: NDArray[np.uint8]
-    covers: Callable[[Floats, Floats], Bools] | None = None
-    """Returns which points lie on the decks or tubes of the level; None if it is everywhere."""
+    level: int = 0
+    """A deck or tube; 0 if it is shown everywhere."""
 
 
 def _shown(tile: FinishedTile, level: int | None) -> _Shown | None:
     """Return what is shown of a level, or of the highest one if it is None; None if the tile lacks it."""
     surface, clusters, quality = tile.surface, tile.clusters, tile.quality
-    if not isinstance(surface, LevelledSurface):
-        return None if level else _Shown(surface, clusters.mask, quality.support)
     if level is None:
         core = tile.tile.grid
         top = surface.top(*np.meshgrid(core.eastings, core.northings))
-        return _Shown(top_of(surface), top_mask(clusters), top_support(quality, top))
+        return _Shown(surface.highest, top_mask(clusters), top_support(quality, top))
     if level == 0:
         return _Shown(surface, with_approaches(clusters).mask, quality.support)
     if level not in surface.numbers:
         return None
     (own,) = (own for own in clusters.levels if own.number == level)
     support = dict(quality.levels)[level].support
-    return _Shown(surface.at(level), own.mask, support, partial(surface.covers, level))
+    return _Shown(surface.at(level), own.mask, support, level)
 
 
 def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile, shown: _Shown) -> None:
@@ -208,8 +204,8 @@ def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile, shown: _Shown) 
         outside = road.outside[_cells(road.grid, eastings, northings)]
         is_road = shown.kept[_cells(road.grid, eastings, northings)].astype(np.uint8)
         support = shown.support[_cells(core, eastings, northings)]
-        if shown.covers:
-            beyond = ~shown.covers(*np.meshgrid(eastings, northings))
+        if shown.level:
+            beyond = ~tile.surface.covers(shown.level, *np.meshgrid(eastings, northings))
             outside, is_road = outside | beyond, np.where(beyond, NO_ROAD, is_road)
             support = np.where(beyond, Support.NONE, support)
         heights = surface.lattice(eastings, northings)

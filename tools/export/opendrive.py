@@ -18,8 +18,8 @@ import numpy as np
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.text import printable
+from flexroad.tasks.levels.along_route import Structure
 from flexroad.tasks.types import Floats
-from flexroad.tools.export.along_route import Structure
 from flexroad.tools.export.profiles import Profiles
 from flexroad.tools.export.reference_line import ReferenceLine
 

@@ -30,7 +30,6 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
-from flexroad.tools.export.ground import SMOOTH, steps_left_out
 from flexroad.tools.export.source import Source
 
 MARKERS = ".pieces"
@@ -39,8 +38,18 @@ PARTS = ".parts"
 """Folder of the parts of a joined file."""
 LARGEST = ("height_error_m", "steps_max_m")
 """Entries of the rows of tiles of which the manifest has the largest."""
+SMOOTH = "the surface without kerbs and walls"
+STEPS_SHOWN_M = 0.01
+"""Height of steps that are left out from which the user is told (m)."""
 Row = dict[str, Any]
 """What the files of the complete run need of a tile, as JSON values."""
+
+
+def steps_left_out(steps_m: float | None) -> str:
+    """Return the end of a line for the user about the largest step (m); empty if it is too small."""
+    if steps_m is None or steps_m < STEPS_SHOWN_M:
+        return ""
+    return f"; with kerbs and walls it differs by up to {steps_m:.2f} m, where the run has no road"
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.points import Ground
+from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.pipeline.run.tile_steps import LARGEST_M, REMEDY, length_text
 from flexroad.tools.lift.driver import lift as lift_file
 from flexroad.tools.lift.types import Options
@@ -77,7 +77,7 @@ def lift(
     if report is None and (grade, crossfall) != (None, None):
         raise ConfigError("places above limits are written beside the report; give --report FILE.csv")
     wanted = replace(wanted, grade_limit=grade, crossfall_limit=crossfall)
-    ground = Ground.open(path, allow=allow or (), earlier=True)
+    ground = RunSampler.open(path, allow=allow or (), earlier=True)
     result = lift_file(ground, file, output, wanted, crs, offset, report)
     echo(f"{output}: {result.summary}")
     if result.earlier:

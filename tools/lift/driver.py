@@ -31,7 +31,8 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import passing
-from flexroad.pipeline.run.points import Ground, Heights, required_crs, to_crs
+from flexroad.pipeline.run.points import Heights, to_crs
+from flexroad.pipeline.run.sampler import RunSampler, required_crs
 from flexroad.pipeline.run.tile_steps import length_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import flag_names
@@ -147,7 +148,7 @@ def _length(rows: Sequence[Lifted], name: str) -> str:
 
 
 def lift(
-    ground: Ground,
+    ground: RunSampler,
     source: Path,
     out: Path,
     options: Options,
@@ -205,7 +206,7 @@ class _Seen:
 class _InRun:
     """The surface of a run at coordinates of a file (`RunSurface`)."""
 
-    ground: Ground
+    ground: RunSampler
     crs: str
     place: Frame
     run_crs: str
@@ -262,7 +263,7 @@ class _InRun:
 
     def errors(self, easting: Floats, northing: Floats, numbers: NDArray[np.int8]) -> Floats:
         """Return the estimated errors (m) at points on levels, in the CRS of the run."""
-        return self.ground.errors(easting, northing, numbers)
+        return self.ground.errors(easting, northing, numbers)[0]
 
     def require_heights(self) -> None:
         """Raise an error if no point has had a height."""

@@ -15,7 +15,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.points import Ground, required_crs
+from flexroad.pipeline.run.sampler import RunSampler, required_crs
 from flexroad.tools.results.query import (
     LevelWanted,
     along_lines,
@@ -76,7 +76,7 @@ def query(
         str | None,
         typer.Option(
             metavar="N|all",
-            help="Level of roads above roads: 0 is the ground, all: a row per level; default: the highest.",
+            help="Level of roads above roads: 0 is the sampler, all: a row per level; default: the highest.",
         ),
     ] = None,
     variant: Annotated[
@@ -105,14 +105,14 @@ def query(
     if output is not None and output.suffix.lower() not in (".csv", ".gpkg"):
         raise ConfigError(f"-o {output}: give a name that ends in .csv or .gpkg")
     wanted = _level(level)
-    ground = Ground.open(path, variant, allow or (), earlier=True)
+    sampler = RunSampler.open(path, variant, allow or (), earlier=True)
     if line is not None:
-        result = along_lines(ground, read_lines(line, crs, layer, required_crs(ground)), step, wanted)
+        result = along_lines(sampler, read_lines(line, crs, layer, required_crs(sampler)), step, wanted)
     elif points == STDIN:
-        result = at_points(ground, parse_csv(sys.stdin.buffer.read(), "standard input", crs), wanted)
+        result = at_points(sampler, parse_csv(sys.stdin.buffer.read(), "standard input", crs), wanted)
     else:
         assert points is not None
-        result = at_points(ground, read_points(points, crs, layer), wanted)
+        result = at_points(sampler, read_points(points, crs, layer), wanted)
     if output is not None and output.suffix.lower() == ".gpkg":
         result.write_geopackage(output)
     else:
@@ -124,7 +124,7 @@ def query(
             err=True,
         )
     for note in filter(
-        None, (*result.notes, outside(result, ground), beyond_survey(result), on_flagged(result))
+        None, (*result.notes, outside(result, sampler), beyond_survey(result), on_flagged(result))
     ):
         echo(f"note: {note}", err=True)
 

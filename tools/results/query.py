@@ -19,7 +19,8 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, reason
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import SEE_REPORT
-from flexroad.pipeline.run.points import Answer, Ground, crs_of, required_crs, to_crs
+from flexroad.pipeline.run.points import Answer, to_crs
+from flexroad.pipeline.run.sampler import RunSampler, crs_of, required_crs
 from flexroad.pipeline.run.tile_steps import LARGEST_M, REMEDY, length_text
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.quality.flagged import Bits, flag_names
@@ -93,7 +94,7 @@ class AnswerTable:
             write(parse_location(path), file.read_bytes())
 
 
-def at_points(ground: Ground, points: Points, level: LevelWanted = None) -> AnswerTable:
+def at_points(sampler: RunSampler, points: Points, level: LevelWanted = None) -> AnswerTable:
     """Return what a run has at points: the columns height_m, nx, ny, nz, tile, class, flags.
 
     Points of a vector file also get the columns easting and northing (m), in the CRS of the run. With a level
@@ -101,16 +102,16 @@ def at_points(ground: Ground, points: Points, level: LevelWanted = None) -> Answ
     """
     easting, northing, table = points.x, points.y, points.table
     if points.crs is not None:
-        easting, northing = to_crs(points.x, points.y, points.crs, required_crs(ground))
+        easting, northing = to_crs(points.x, points.y, points.crs, required_crs(sampler))
     if points.vector:
         table = table.assign(easting=easting, northing=northing)
-    rows, answer = _on_level(ground, easting, northing, level)
+    rows, answer = _on_level(sampler, easting, northing, level)
     whole = table.iloc[rows].assign(**_columns(answer, level))
     return AnswerTable(
         whole,
         easting[rows],
         northing[rows],
-        crs_of(ground),
+        crs_of(sampler),
         answer,
         points.notes,
         points.separator,
@@ -120,15 +121,17 @@ def at_points(ground: Ground, points: Points, level: LevelWanted = None) -> Answ
 
 
 def _on_level(
-    ground: Ground, easting: Floats, northing: Floats, level: LevelWanted
+    sampler: RunSampler, easting: Floats, northing: Floats, level: LevelWanted
 ) -> tuple[NDArray[np.intp], Answer]:
     """Return the number of the point of each row, and what a run has there."""
     if level == "all":
-        return ground.on_every_level(easting, northing)
-    return np.arange(len(easting)), ground.at(easting, northing, level)
+        return sampler.on_every_level(easting, northing)
+    return np.arange(len(easting)), sampler.at(easting, northing, level)
 
 
-def along_lines(ground: Ground, lines: list[Floats], step_m: float, level: LevelWanted = None) -> AnswerTable:
+def along_lines(
+    sampler: RunSampler, lines: list[Floats], step_m: float, level: LevelWanted = None
+) -> AnswerTable:
     """Return profiles: what a run has every ``step_m`` along lines, and at their ends.
 
     The columns are line (only if there are several), distance_m, easting, northing, height_m, grade_percent,
@@ -137,26 +140,26 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float, level: Level
     """
     points = stations(lines, step_m)
     easting, northing = points.easting.to_numpy(), points.northing.to_numpy()
-    rows, answer = _on_level(ground, easting, northing, level)
+    rows, answer = _on_level(sampler, easting, northing, level)
     if step_m > PASSED_M and level != "all":
-        answer = replace(answer, flags=_up_to_next(ground, lines, points, level))
+        answer = replace(answer, flags=_up_to_next(sampler, lines, points, level))
     points = points.iloc[rows]
     # A normal is (-dz/dx, -dz/dy, 1), scaled to length 1.
     slope = -(answer.normal[:, :2] * points[["east", "north"]].to_numpy()).sum(axis=1) / answer.normal[:, 2]
     table = points.drop(columns=["east", "north"] if len(lines) > 1 else ["line", "east", "north"])
     columns = _columns(answer, level)
     table = table.assign(height_m=columns.pop("height_m"), grade_percent=100 * slope, **columns)
-    apart = ground.largest_tile_step(easting, northing, 1.01 * step_m)
+    apart = sampler.largest_tile_step(easting, northing, 1.01 * step_m)
     note = f"the line crosses tiles that do not meet, by up to {length_text(apart)}; {REMEDY}"
     notes = (note,) if apart > LARGEST_M else ()
-    return AnswerTable(table, easting[rows], northing[rows], crs_of(ground), answer, notes, level=level)
+    return AnswerTable(table, easting[rows], northing[rows], crs_of(sampler), answer, notes, level=level)
 
 
-def _up_to_next(ground: Ground, lines: list[Floats], points: pd.DataFrame, level: int | None) -> Bits:
+def _up_to_next(sampler: RunSampler, lines: list[Floats], points: pd.DataFrame, level: int | None) -> Bits:
     """Return the flags that each line passes from each of its points to the next one."""
     length = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines)
     between = stations(lines, max(PASSED_M, 2 * length / MAX_POINTS))
-    found = ground.at(between.easting.to_numpy(), between.northing.to_numpy(), level).flags
+    found = sampler.at(between.easting.to_numpy(), between.northing.to_numpy(), level).flags
     # Lines one behind the other.
     own, fine = (
         table.line.to_numpy() * (length + 1.0) + table.distance_m.to_numpy() for table in (points, between)
@@ -230,7 +233,7 @@ def on_flagged(result: AnswerTable) -> str:
     return f"{count(number, 'point')} {verb} on flagged places ({told}); {SEE_REPORT}"
 
 
-def outside(result: AnswerTable, ground: Ground) -> str:
+def outside(result: AnswerTable, sampler: RunSampler) -> str:
     """Return a line about the points that lie on no finished tile, empty if there are none.
 
     If all points do, it says where the tiles lie.
@@ -242,7 +245,7 @@ def outside(result: AnswerTable, ground: Ground) -> str:
     line = f"{count(number, 'point')} {verb} on no finished tile; {whose} columns are empty"
     if number < len(result.answer.tile):
         return line
-    bounds = np.array([tile.grid.bounds for tile in ground.run.catalog.usable])
+    bounds = np.array([tile.grid.bounds for tile in sampler.run.catalog.usable])
     west, south = bounds[:, :2].min(axis=0)
     east, north = bounds[:, 2:].max(axis=0)
     line += f"; the tiles lie in W {west:.0f} S {south:.0f} E {east:.0f} N {north:.0f}"

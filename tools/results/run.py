@@ -23,12 +23,12 @@ from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.conductor import Workers, process, reopened
 from flexroad.pipeline.run.finished import FinishedTile, open_variant
 from flexroad.pipeline.run.observer import Observer
-from flexroad.pipeline.run.points import Answer, Ground
+from flexroad.pipeline.run.points import Answer
 from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import sample
-from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface, uniform_knots
 from flexroad.tasks.types import Floats
@@ -247,7 +247,7 @@ class RunView:
         >>> run.lift("streets.osm", "streets_3d.osm").summary        # doctest: +SKIP
         '30 features, 2.41 km'
         """
-        ground = Ground(self.run, self.variant)
+        ground = RunSampler(self.run, self.variant)
         table = None if report is None else Path(report)
         return lift(ground, Path(path), Path(out), options or Options(), crs, report=table)
 
@@ -449,7 +449,7 @@ class RunView:
 
     def _at(self, x: ArrayLike, y: ArrayLike, level: int | None = None) -> tuple[tuple[int, ...], Answer]:
         easting, northing = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-        return easting.shape, Ground(self.run, self.variant).at(easting.ravel(), northing.ravel(), level)
+        return easting.shape, RunSampler(self.run, self.variant).at(easting.ravel(), northing.ravel(), level)
 
 
 def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str | Path] = ()) -> RunView:
@@ -488,7 +488,7 @@ def _of_one_level(tiles: Iterable[FinishedTile]) -> Iterator[NurbsSurface]:
     """Yield the surfaces of tiles; one with levels raises an error, since it is more than its spline."""
     for tile in tiles:
         surface = tile.surface
-        if isinstance(surface, LevelledSurface):
+        if surface.levels:
             raise ConfigError(
                 f"tile {tile.id} has roads above roads, which are no single surface: give bounds without it; "
                 "open_run(...).height(x, y, level=0) has its ground"

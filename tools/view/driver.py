@@ -39,7 +39,6 @@ from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.rasterise import DEFAULTS
 from flexroad.tasks.roads.rasterise import Options as RoadOptions
 from flexroad.tasks.roads.routes import CentreLine
-from flexroad.tasks.spline.levelled import LevelledSurface, top_of
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats
 from flexroad.tools.export.centre_lines import read_centre_lines
@@ -296,10 +295,7 @@ def piece(item: TileItem, look: Look) -> Piece:
     source, notes = tile.tile, list[str]()
     photo = _photo(source, PHOTO_PX, notes)
     quality, surface, core = tile.quality, tile.surface, source.grid
-    top, support = None, quality.support
-    if isinstance(surface, LevelledSurface):
-        top = surface.top(*np.meshgrid(core.eastings, core.northings))
-        support = top_support(quality, top)
+    top = surface.top(*np.meshgrid(core.eastings, core.northings))
     try:
         data, (estimate, _) = tile.data, tile.top_errors
     except ConfigError as error:
@@ -309,9 +305,9 @@ def piece(item: TileItem, look: Look) -> Piece:
     else:
         window = data.grid.window(data.core)
         dsm, dtm = data.dsm[window], data.dtm[window]
-        height = top_of(surface).lattice(data.core.eastings, data.core.northings)
+        height = surface.highest.lattice(core.eastings, core.northings)
         height[tile.road.outside[window]] = np.nan
-        road = tile.road.mask[window] if top is None else tile.road.mask[window] | (top > 0)
+        road = tile.road.mask[window] | (top > 0)
         places = {flag: list(place) for flag, place in tile.flag_places.items()}
         small = encoding.picture(height, road, data.core.cell)
         seen = base64.b64encode(small).decode("ascii")
@@ -320,12 +316,12 @@ def piece(item: TileItem, look: Look) -> Piece:
         glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
         corners(source),
-        support,
+        top_support(quality, top),
         dsm,
         dtm,
         estimate,
-        surface if isinstance(surface, NurbsSurface) and top is None else None,
-        None if top is None else top_of(surface).lattice(core.eastings, core.northings),
+        surface if isinstance(surface, NurbsSurface) and not surface.levels else None,
+        surface.highest.lattice(core.eastings, core.northings) if surface.levels else None,
         _lines(source, look.roads, notes),
     )
     name = f"tiles/{safe_name(tile.id)}{encoding.NAME_TILE}"

@@ -134,12 +134,12 @@ def _without_columns(folder: Path) -> Path:
 def test_ground_at_rgt_equals_dsm(finished, made_survey):
     import rasterio
 
-    from flexroad.pipeline.run.points import Ground
+    from flexroad.pipeline.run.sampler import RunSampler
 
     tile = Catalog.read(made_survey / "catalog.parquet").tiles[1]
     with rasterio.open(tile.paths(tile.layer("dsm"))[0]) as raster:
         dsm = raster.read(1)
-    answer = Ground.open(finished, "rgt").at(tile.grid.eastings[[5, 40]], tile.grid.northings[[7, 50]])
+    answer = RunSampler.open(finished, "rgt").at(tile.grid.eastings[[5, 40]], tile.grid.northings[[7, 50]])
     assert answer.height == pytest.approx([dsm[7, 5], dsm[50, 40]], abs=1e-5)
 
 

@@ -22,9 +22,9 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.garbage import find_garbage
-from flexroad.pipeline.run.points import Ground
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.products import npz
 from flexroad.tasks.quality.support import Support
@@ -514,7 +514,7 @@ def test_networks_of_sumo_and_osm_have_the_level_of_each_road(run, tmp_path, kin
     source.write_text(network(roads) if kind == "net.xml" else streets(roads))
     call("lift", source, run.path, "-o", out, "--report", report).expected(0)
     levels = pd.read_csv(report, dtype=str, keep_default_na=False).set_index("id").levels
-    ground, decks, below = Ground.open(run.path), 0, 0
+    ground, decks, below = RunSampler.open(run.path), 0, 0
     for number, road in enumerate(roads):
         x, y, z = lifted(out, number).T
         on = np.isfinite(z)

@@ -17,9 +17,9 @@ from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.points import Ground
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.run.summary import read_summary
 from flexroad.pipeline.store import codec
@@ -140,7 +140,7 @@ def test_report_tile_and_ground_of_run_in_bucket(run, local):
     tile = opened.catalog.tiles[0]
     assert open_run(str(run.path)).tile(tile.id).identical(open_run(local.path).tile(tile.id))
     east, north = tile.grid.west + 10.3, tile.grid.north - 20.7
-    actual, expected = (Ground.open(each.path).at(east, north) for each in (run, local))
+    actual, expected = (RunSampler.open(each.path).at(east, north) for each in (run, local))
     assert actual.height == expected.height
     assert list(actual.tile) == [tile.id]
 

@@ -14,9 +14,9 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.collection import write_states
 from flexroad.pipeline.run.garbage import find_garbage
-from flexroad.pipeline.run.points import Ground
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.tools.export.source import select
@@ -115,7 +115,7 @@ def test_stale_products_are_used_by_nothing(run, tmp_path):
     height = view.to_xarray().height.sel(x=slice(tile.grid.west, tile.grid.east))
     assert height.isnull().all() or not np.isfinite(height.sel(x=x, y=y, method="nearest"))
     # `query` answers from the last finished state of a tile only if it has not failed since.
-    assert Ground.open(run.path, earlier=True).at([x], [y]).tile.tolist() == [""]
+    assert RunSampler.open(run.path, earlier=True).at([x], [y]).tile.tolist() == [""]
     assert gather(run).tiles == (other.id,)
     write_viewer(run, tmp_path / "viewer", SerialExecutor())
     index = (tmp_path / "viewer" / "run.js").read_text()

@@ -109,7 +109,7 @@ def test_street_below_a_deck_is_inferred_but_in_doubt_only_if_it_is_long(width, 
     labels = street.astype(np.int32)
     own = RoadClusters(grid, labels, levels=(RoadClusters(grid, nowhere.astype(np.int32), level=level),))
     mask = RoadMask(grid, grid, street, nowhere, levels=(level,))
-    surface = SimpleNamespace(lattice=lambda eastings, northings: ground)
+    surface = SimpleNamespace(numbers=(0,), lattice=lambda eastings, northings: ground)
     inputs = TileData("a", grid, grid, dsm, ground), mask, own, surface
     quality, cells = assess(*inputs, Options()), compare(*inputs, 0.3)
     assert quality.inferred_road == pytest.approx((width + 2) / 140)

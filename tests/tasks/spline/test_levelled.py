@@ -10,9 +10,9 @@ from flexroad.catalog.grid import Grid
 from flexroad.pipeline.store import codec
 from flexroad.tasks.spline.frame import Corner, Edge
 from flexroad.tasks.spline.lattice import Lattice
-from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline, top_of
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.space import surface_on
-from flexroad.tasks.types import Level, RoadClusters, RoadMask
+from flexroad.tasks.types import Level, LevelSpline, RoadClusters, RoadMask
 
 GRID = Grid("EPSG:25832", 500000.0, 5600060.0, 1.0, 60, 60)
 WEST, SOUTH = GRID.west, GRID.south
@@ -141,11 +141,11 @@ def test_frame_part_of_missing_level_is_that_of_ground():
 
 def test_top_is_the_deck_and_elsewhere_the_ground():
     surface = made_surface(slope=0.03)
-    top, (x, y) = top_of(surface), np.meshgrid(WEST + np.array([1.5, 30.5, 55.5]), SOUTH + np.array([24.5]))
+    top, (x, y) = surface.highest, np.meshgrid(WEST + np.array([1.5, 30.5, 55.5]), SOUTH + np.array([24.5]))
     expected = [[100.0, 107 + 0.03 * 30.5, 100.0]]
     np.testing.assert_allclose(top.height(x, y), expected, atol=1e-9)
     np.testing.assert_allclose(top.lattice(x[0], y[:, 0]), expected, atol=1e-9)
     np.testing.assert_allclose(top.normal(x, y)[0, :, 0], [0, -0.03 / np.hypot(0.03, 1), 0], atol=1e-9)
     deck = surface.at(1)
-    assert top_of(deck) is deck
+    assert deck.highest is deck
     assert top.bounds == surface.bounds

@@ -15,9 +15,10 @@ from pyproj import CRS
 
 import flexroad
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.run import sampler
 from flexroad.pipeline.run.finished import estimate
 from flexroad.tasks.spline.stepped import without_steps
-from flexroad.tools.export import ground, pieces
+from flexroad.tools.export import pieces
 from flexroad.tools.export.driver import BEGUN, export
 from flexroad.tools.export.source import Options, select
 from tests import validators
@@ -258,11 +259,13 @@ def test_interrupted_export_goes_on_with_the_next_road(city, streets, exported, 
 def test_export_with_few_surfaces_in_memory_is_the_same(city, streets, exported, tmp_path, monkeypatch):
     from functools import lru_cache
 
-    monkeypatch.setattr(ground, "_patch", lru_cache(maxsize=1)(ground._patch.__wrapped__))
+    monkeypatch.setattr(
+        sampler, "surface_and_road", lru_cache(maxsize=1)(sampler.surface_and_road.__wrapped__)
+    )
     export(select(city), tmp_path, ["crg"], Options(roads=str(streets)), SerialExecutor())
     for file in (exported / "crg").glob("*.crg"):
         assert (tmp_path / "crg" / file.name).read_bytes() == file.read_bytes()
-    assert ground._patch.cache_info().currsize == 1
+    assert sampler.surface_and_road.cache_info().currsize == 1
 
 
 def test_workers_write_the_same_files(city, streets, exported, tmp_path, cluster):

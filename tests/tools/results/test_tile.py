@@ -5,9 +5,9 @@ from flexroad.catalog import Catalog, CatalogError
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.points import Ground
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.tools.results.run import open_run
 
 
@@ -23,7 +23,7 @@ def test_tile_of_run_returns_inputs_masks_and_surface(survey, quick_config, tmp_
     assert tuple(dataset.rio.bounds()) == tile.grid.bounds
     assert not (dataset.road_filtered & ~dataset.road).any()
     east, north = np.meshgrid(dataset.x, dataset.y)
-    height = Ground.open(run.path).at(east.ravel(), north.ravel()).height
+    height = RunSampler.open(run.path).at(east.ravel(), north.ravel()).height
     assert np.allclose(dataset.surface.values.ravel(), height, atol=1e-9)
     assert np.array_equal(open_run(run.path, "rgt").tile(tile.id).surface, dataset.dsm)
     with pytest.raises(ConfigError, match="no variant 'x'"):

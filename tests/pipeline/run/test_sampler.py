@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexroad.tools.export.along_route import PlaceLevels
-from flexroad.tools.export.ground import _Patch
+from flexroad.pipeline.run.sampler import on_levels
+from flexroad.tasks.levels.along_route import PlaceLevels
 from tests.tasks.spline.test_levelled import GRID, SOUTH, WEST, made_surface
 
 STEP_M = 0.5
 
 
 @pytest.fixture
-def patch():
+def surface():
     """A deck 7 m above the ground, from 25 to 45 m, with an approach from 9 m; and steps everywhere."""
     surface = made_surface(own=100.0, deck=107.0)
     steps = np.full(GRID.shape, STEP_M, np.float32)
-    return _Patch(GRID, replace(surface, steps=steps), np.zeros(GRID.shape, bool))
+    return replace(surface, steps=steps)
 
 
 @pytest.mark.parametrize(
@@ -36,14 +36,8 @@ def patch():
         (50, 24, 2, True, 100, STEP_M),  # no deck of this level is known
     ],
 )
-def test_height_is_that_of_the_level(patch, x, y, number, own, height, step):
+def test_height_is_that_of_the_level(surface, x, y, number, own, height, step):
     at = np.array([WEST + x, WEST + 55.0]), np.array([SOUTH + y, SOUTH + 24.0])
     levels = PlaceLevels(np.array([number, 0], np.int8), np.array([own, True]))
-    np.testing.assert_allclose(patch.height(*at, levels), [height, 100], atol=1e-9)
-    np.testing.assert_allclose(patch.step(*at, levels), [step, STEP_M], atol=1e-9)
-
-
-def test_heights_without_levels_are_those_of_the_ground(patch):
-    at = np.array([WEST + 35.0, WEST + 20.0]), np.full(2, SOUTH + 24.0)
-    np.testing.assert_allclose(patch.height(*at, None), [100, 107], atol=1e-9)
-    np.testing.assert_allclose(patch.step(*at, None), STEP_M, atol=1e-9)
+    np.testing.assert_allclose(on_levels(surface, *at, levels), [height, 100], atol=1e-9)
+    np.testing.assert_allclose(on_levels(surface, *at, levels, steps=True), [step, STEP_M], atol=1e-9)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from flexroad.tasks.levels.along_route import RouteLevels, Structure, structures
 from flexroad.tasks.roads.routes import CentreLine, Route
-from flexroad.tools.export.along_route import RouteLevels, Structure, structures
 
 
 def route(*parts):
