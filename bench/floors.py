@@ -22,7 +22,7 @@ import numpy as np
 from bench.timing import Peak
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
-SUPPORT = 4
+HEIGHT_SOURCE = 4
 """Basis functions that are not zero at a place, along each axis: degree 3."""
 PER_CELL = 10
 """Operations of a fit at each cell and step besides the surface: difference, weight, its sum."""
@@ -89,7 +89,7 @@ def ecsrc(data: TileData, road: RoadMask, clusters: RoadClusters) -> Work:
 def surface(cells: tuple[int, int], points: tuple[int, int]) -> int:
     """Operations to evaluate a spline at H x W cells by the axes in turn: 2 x 4 x (m x W + H x W)."""
     (height, width), (m, _) = cells, points
-    return 2 * SUPPORT * (m * width + height * width)
+    return 2 * HEIGHT_SOURCE * (m * width + height * width)
 
 
 def fit(size: FitSize) -> Work:
@@ -105,7 +105,7 @@ def fit(size: FitSize) -> Work:
 
 def sample(mesh: Mesh) -> Work:
     """Operations: 2 x 4 x V. Bytes: vertices (24), faces (12) and their classes (1) written."""
-    return Work(2 * SUPPORT * len(mesh.vertices), size_of(mesh))
+    return Work(2 * HEIGHT_SOURCE * len(mesh.vertices), size_of(mesh))
 
 
 def evaluate(mesh: Mesh, data: TileData) -> Work:

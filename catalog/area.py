@@ -15,7 +15,7 @@ from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.guard.open_vector import ERRORS, in_its_encoding, vector_name
-from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.rejected import InputRejected
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.scan.vectors import layers, listed
 from flexroad.catalog.text import count, reason
@@ -57,7 +57,7 @@ class Area:
                 raise CatalogError(f"--area {path} has no layer {layer!r}; it has {listed(found) or 'none'}")
             read = partial(pyogrio.read_dataframe, name, layer=layer, columns=[])
             table = in_its_encoding(read)[0] if found else None
-        except Refused as error:
+        except InputRejected as error:
             raise CatalogError(f"--area {path} {error}") from error
         except ERRORS as error:
             raise CatalogError(f"--area {path} cannot be read: {reason(error)}") from error

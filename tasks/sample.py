@@ -10,8 +10,8 @@ the points on the border and their heights are those of the neighbours too: the 
 A dynamic mesh has edges along the limit of the survey and ends there (`tasks.meshing.survey_limit`). If the
 roads are polygons, it has edges along their outlines, too (`tasks.meshing.road_outline`).
 
-With levels, dynamic meshes have one part per level, which share no vertex. A deck or tube ends at its
-outline, and meets level 0 on its joints (`tasks.meshing.joint_lines`).
+With levels, dynamic meshes have one part per level, which share no vertex. A deck or tunnel ends at its
+outline, and meets level 0 on its abutments (`tasks.meshing.abutment_lines`).
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from pydantic import Field, model_validator
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.meshing.breaklines import breaklines
-from flexroad.tasks.meshing.joint_lines import (
+from flexroad.tasks.meshing.abutment_lines import (
     JoinedGround,
     LevelOutline,
     level_outline,
-    without_joints,
+    without_abutments,
 )
+from flexroad.tasks.meshing.breaklines import breaklines
 from flexroad.tasks.meshing.lines import (
     apart_from,
     divided,
@@ -187,7 +187,7 @@ def _levels(
     options: Options,
     frame: Frame | None,
 ) -> Mesh:
-    """Return the mesh of all levels; they meet on joints and share no vertex."""
+    """Return the mesh of all levels; they meet on abutments and share no vertex."""
     every = (level_outline(own.level, road.core, local, options.road_m) for own in surface.levels)
     outlines = [outline for outline in every if outline]
     first = _dynamic(surface, road, mask, local, options, frame, outlines)
@@ -211,9 +211,9 @@ def _other_level(
     options: Options,
     frame: Frame | None,
 ) -> tuple[Floats, Faces]:
-    """Return points and faces of a deck or tube, which ends at its outline and with the survey.
+    """Return points and faces of a deck or tunnel, which ends at its outline and with the survey.
 
-    - `ground` ``(n, 3)``: the vertices of level 0: on joints at the border of the tile, the level has the
+    - `ground` ``(n, 3)``: the vertices of level 0: on abutments at the border of the tile, the level has the
       same ones.
     """
     limit, lines, area = _limit(road, local, frame), [outline.lines], outline.area
@@ -246,7 +246,7 @@ def _dynamic(
 ) -> Mesh:
     """Return the mesh of road, terrain and border points, with the limit of the survey and roads as edges.
 
-    - `others`: the other levels: their joints are edges, too.
+    - `others`: the other levels: their abutments are edges, too.
     """
     fine = _lattice(surface, road, mask, local, options.road_m)
     coarse = _lattice(surface, road, ~mask, local, options.terrain_m)
@@ -255,12 +255,12 @@ def _dynamic(
     breaks = None
     if isinstance(surface, SteppedSurface) and options.breaklines:
         breaks = breaklines(surface, local)
-        lines.append(without_joints(_divided(breaks.lines, road, mask, options), others))
+        lines.append(without_abutments(_divided(breaks.lines, road, mask, options), others))
     if road.areas is not None and options.mask == "raw":
         outline = road_outline(road.areas, local, options.road_m)
-        lines.append(without_joints(outline.lines, others))
+        lines.append(without_abutments(outline.lines, others))
         fine = fine[outline.contains(fine)]
-    lines += [part for other in others for part in (other.joints, other.feet)]
+    lines += [part for other in others for part in (other.abutments, other.feet)]
     free = np.concatenate([fine, coarse])
     joined = JoinedGround(surface, road.core.origin, others) if others else None
     if frame:
@@ -273,7 +273,7 @@ def _dynamic(
     place = (plan + road.core.origin).T
     z = breaks.height(plan) if breaks else surface.height(*place)
     if joined:
-        z = joined.on_joints(place[0], place[1], z)
+        z = joined.on_abutments(place[0], place[1], z)
     if isinstance(surface, MovingNurbs):
         free, border = (_in_space(part, surface, road.core.origin) for part in (free, border))
     points, number = without_duplicates(np.concatenate([free, border, np.column_stack([plan, z])]))

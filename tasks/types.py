@@ -19,10 +19,10 @@ Bools = NDArray[np.bool_]
 
 BLEND_M = 4.0
 """Beyond an approach the ground returns to its own surface over this distance (m)."""
-ON_JOINT_M = 1e-3
-"""Points within this distance of a joint lie on it (m)."""
+ON_ABUTMENT_M = 1e-3
+"""Points within this distance of an abutment lie on it (m)."""
 FREE_M = 0.05
-"""Points that are nearer to the outline of a level by this (m) than to its joints lie at a free edge."""
+"""Points that are nearer to the outline of a level by this (m) than to its abutments lie at a free edge."""
 
 
 @dataclass(frozen=True)
@@ -87,20 +87,20 @@ class TileData:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """The roads of one level: decks above the ground (number above 0), or tubes below it (below 0).
+    """The roads of one level: decks above the ground (number above 0), or tunnels below it (below 0).
 
     Level 0 is the ground with its streets and has no `Level`. Coordinates are those of the tile's CRS (m).
     """
 
     number: int
     areas: shapely.MultiPolygon
-    """The decks or tubes on and around the tile."""
-    joints: shapely.MultiLineString
+    """The decks or tunnels on and around the tile."""
+    abutments: shapely.MultiLineString
     """The parts of their outline where a road of level 0 goes on."""
     approach: shapely.MultiPolygon
-    """The road of level 0 beyond the joints: there level 0 has the surface of this level."""
+    """The road of level 0 beyond the abutments: there level 0 has the surface of this level."""
     passing: shapely.MultiPolygon = field(default_factory=shapely.MultiPolygon)
-    """The streets of level 0 near the joints that pass below the deck, or above the tube."""
+    """The streets of level 0 near the abutments that pass below the deck, or above the tunnel."""
 
     @cached_property
     def rasters(self) -> dict[tuple[str, Grid], tuple[tuple[slice, ...], Bools]]:
@@ -108,7 +108,7 @@ class Level:
         return {}
 
     def covers(self, easting: Floats, northing: Floats) -> Bools:
-        """Return which points lie on the decks or tubes, in the points' broadcast shape."""
+        """Return which points lie on the decks or tunnels, in the points' broadcast shape."""
         shapely.prepare(self.areas)
         return np.asarray(shapely.intersects_xy(self.areas, easting, northing))
 
@@ -132,8 +132,8 @@ class Level:
         reached = shapely.dwithin(self.approach, places, BLEND_M)
         near[near], places = reached, places[reached]
         share = np.clip(1 - shapely.distance(self.approach, places) / BLEND_M, 0.0, 1.0)
-        away, from_joints = shapely.distance(self.areas, places), shapely.distance(self.joints, places)
-        free = (away < from_joints - FREE_M) | ((away == 0.0) & (from_joints > ON_JOINT_M))
+        away, from_abutments = shapely.distance(self.areas, places), shapely.distance(self.abutments, places)
+        free = (away < from_abutments - FREE_M) | ((away == 0.0) & (from_abutments > ON_ABUTMENT_M))
         shapely.prepare(self.passing)
         free |= shapely.contains_properly(self.passing, places)
         result[near] = np.where(free, 0.0, share * share * (3 - 2 * share))
@@ -144,7 +144,7 @@ class Level:
 class RoadMask:
     """The result of `segment`: the paper's M^r, before the filter.
 
-    With levels, mask and areas are those of level 0, without the decks and tubes.
+    With levels, mask and areas are those of level 0, without the decks and tunnels.
     """
 
     grid: Grid
@@ -292,7 +292,7 @@ class Mesh:
     the centroid is in the road's polygons, if the mesh has their outline."""
     level: NDArray[np.int8] | None = None
     """Level of each face, ``(F,)``; None: all are on level 0. Faces of different levels share no vertex: on a
-    joint both have vertices at the same places."""
+    abutment both have vertices at the same places."""
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -352,15 +352,15 @@ class Metrics:
 
 @dataclass(frozen=True)
 class Structures:
-    """Figures of the decks or tubes of a level on a tile's core."""
+    """Figures of the decks or tunnels of a level on a tile's core."""
 
     area_m2: float
-    joints: int
-    """Number of joints whose middle lies on the core."""
+    abutments: int
+    """Number of abutments whose middle lies on the core."""
     clearance_m: float
-    """Median height of a deck above level 0, or of level 0 above a tube (m); NaN without cells."""
+    """Median height of a deck above level 0, or of level 0 above a tunnel (m); NaN without cells."""
     crossed: float
-    """Share of cells 2 m and more from joints with the deck below level 0, or the tube above it."""
+    """Share of cells 2 m and more from abutments with the deck below level 0, or the tunnel above it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -414,14 +414,14 @@ class Quality:
     """Share of these squares whose difference is within the 90% interval of the error estimate."""
     flags: tuple[str, ...]
     """Names of problems, from `tasks.quality.assess.FLAGS`."""
-    support: NDArray[np.uint8]
-    """Class of the core's cells by `tasks.quality.support.Support`, ``(H, W)``."""
+    height_source: NDArray[np.uint8]
+    """Class of the core's cells by `tasks.quality.height_source.HeightSource`, ``(H, W)``."""
     flagged: NDArray[np.uint16]
     """Raised flags of the core's cells by `tasks.quality.flagged.LOCAL_FLAGS`, ``(H, W)``."""
     levels: tuple[tuple[int, Quality], ...] = ()
-    """Number and quality of each other level, on its decks or tubes: beyond them its support is none."""
+    """Number and quality of each other level; beyond its decks or tunnels the height source is none."""
     structures: Structures | None = None
-    """Figures of these decks or tubes; None for level 0."""
+    """Figures of these decks or tunnels; None for level 0."""
 
     def at(self, number: int) -> Quality:
         """Return the quality of a level, that of level 0 if it has none."""

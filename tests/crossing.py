@@ -34,7 +34,7 @@ class Tile(NamedTuple):
 
 @dataclass(frozen=True)
 class Crossing:
-    """A street that rises to the east and crosses another one on a deck (a tube if the number is below 0)."""
+    """A street that rises to the east and crosses another one on a deck (number below 0: a tunnel)."""
 
     middle: tuple[float, float] = (40.0, 35.0)
     """Middle of the deck, from the south-western corner of the tiles (m)."""
@@ -53,12 +53,12 @@ class Crossing:
 
     @property
     def level(self) -> Level:
-        """The deck with its two joints and approaches."""
+        """The deck with its two abutments and approaches."""
         half, side = self.length / 2, self.width / 2
         deck = shapely.box(-half, -side, half, side)
-        joints = [shapely.LineString([(x, -side), (x, side)]) for x in (-half, half)]
+        abutments = [shapely.LineString([(x, -side), (x, side)]) for x in (-half, half)]
         approaches = [shapely.box(-half - 16, -side, -half, side), shapely.box(half, -side, half + 16, side)]
-        deck, *parts = self._placed(deck, *joints, *approaches)
+        deck, *parts = self._placed(deck, *abutments, *approaches)
         return Level(
             self.number,
             shapely.MultiPolygon([deck]),
@@ -120,8 +120,8 @@ class Crossing:
         places = (
             (east + along, north + 0 * along) if border.kind == "east" else (east + 0 * along, north + along)
         )
-        on_joint = shapely.dwithin(level.joints, shapely.points(*places), 0.05)
-        every = np.union1d(own.crossings, deck.crossings[on_joint])
+        on_abutment = shapely.dwithin(level.abutments, shapely.points(*places), 0.05)
+        every = np.union1d(own.crossings, deck.crossings[on_abutment])
         return replace(own, crossings=every, levels=((self.number, deck),))
 
     def _edge(self, border, areas) -> Edge:

@@ -1,4 +1,4 @@
-"""Synthetic crossings as data of tiles: roads on decks and in tubes, with the true height of each level."""
+"""Synthetic crossings as data of tiles: roads on decks and in tunnels, with the true height of each level."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Survey:
         return TileData("a", grid, grid, dsm, dtm, roads=self.data.roads, decks=decks)
 
     def classes(self, core: Grid) -> dict[str, np.ndarray]:
-        """Return the cells of a tile by class: deck, tube, under, near, beside, approach, other.
+        """Return the cells of a tile by class: deck, tunnel, under, near, beside, approach, other.
 
         Cells on the faces of walls, where one has metres of height, are not beside.
         """
@@ -115,7 +115,7 @@ class Survey:
         steep = np.hypot(*np.gradient(self.world.height(0, x, y), core.cell)) > STEEP
         return {
             "deck": (level == 1) & main,
-            "tube": (level == -1) & main,
+            "tunnel": (level == -1) & main,
             "under": (level == 1) & cross,
             "near": (level == 0) & cross & (away <= 6) & ~main,
             "beside": ~steep & (away > 1.5) & (away <= 6) & ~cross & (np.abs(v) > 6.5),
@@ -131,7 +131,7 @@ class Survey:
         for name, cells in self.classes(core).items():
             if not cells.any():
                 continue
-            number = {"deck": 1, "tube": -1}.get(name, 0)
+            number = {"deck": 1, "tunnel": -1}.get(name, 0)
             # Without levels there is one surface.
             own = result.surface.at(number) if number and result.road.levels else result.surface
             height = own.height(x, y)

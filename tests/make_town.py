@@ -15,8 +15,8 @@ from flexroad.tools.synthetic.crossings import REACH_M, CrossingOptions, Crossin
 from tests.make_roads import write_osm
 
 CRS = "EPSG:25832"
-OPTIONS = CrossingOptions(tubes=0.5)
-"""Of the crossings every second one is a tube."""
+OPTIONS = CrossingOptions(tunnels=0.5)
+"""Of the crossings every second one is a tunnel."""
 SIDE_STREETS_M = (-75.0, -55.0, -35.0, 35.0, 55.0, 75.0)
 """Distances of the side streets from the main road, along the crossing roads (m)."""
 SIDE_TAGS = ("layer=1", "bridge=no", "tunnel=no;layer=-1", "covered=yes", "layer=2", "bridge=no;layer=1")

@@ -18,7 +18,7 @@ from typing import Any
 import rasterio
 from rasterio.errors import CRSError, RasterioError
 
-from flexroad.catalog.guard.refused import Refused, archive_note, head, require_beside
+from flexroad.catalog.guard.rejected import InputRejected, archive_note, head, require_beside
 from flexroad.catalog.storage.paths import Location, gdal_name, sidecars
 
 UNKNOWN = (
@@ -88,7 +88,7 @@ def open_alone(path: Path) -> Any | None:
         dataset = rasterio.open(str(path), driver=driver)
     try:
         _require_no_link(dataset)
-    except Refused:
+    except InputRejected:
         dataset.close()
         raise
     return dataset
@@ -110,7 +110,9 @@ def has_own_blocks(path: Path) -> bool:
 def _remote(path: Any) -> Iterator[Any]:
     driver = SUFFIXES.get(path.suffix.lower())
     if driver is None:
-        raise Refused(f"is not read from object storage: its name does not end in {', '.join(SUFFIXES)}")
+        raise InputRejected(
+            f"is not read from object storage: its name does not end in {', '.join(SUFFIXES)}"
+        )
     names = sidecars(path)
     if path.name not in names:
         raise FileNotFoundError(str(path))
@@ -124,7 +126,7 @@ def _remote(path: Any) -> Iterator[Any]:
 def _require_no_link(dataset: Any) -> None:
     """Raise an error if metadata, of the file or of ``.aux.xml``, names a file of overviews."""
     if any(key.upper() == "OVERVIEW_FILE" for key in dataset.tags(ns="OVERVIEWS")):
-        raise Refused("names another file as its overviews; remove that with gdal_translate")
+        raise InputRejected("names another file as its overviews; remove that with gdal_translate")
 
 
 def _driver(path: Path) -> str:
@@ -138,10 +140,10 @@ def _driver(path: Path) -> str:
         return "XYZ"
     text = data.removeprefix(b"\xef\xbb\xbf").lstrip()
     if text.startswith((b"<VRTDataset", b"<?xml")) and b"<VRTDataset" in data:
-        raise Refused(A_VRT)
+        raise InputRejected(A_VRT)
     # Marks of other formats may stand anywhere in a text.
     if not text or text.startswith(b"{") or NOT_TEXT.search(data):
-        raise Refused(UNKNOWN + archive_note(data))
+        raise InputRejected(UNKNOWN + archive_note(data))
     return "AAIGrid" if ASCII_GRID.match(text) else "XYZ"
 
 
@@ -156,8 +158,8 @@ def _side_cars(path: Path) -> list[Path]:
             _check_side_car(side)
         except FileNotFoundError:
             continue
-        except Refused as error:
-            raise Refused(f"has the side-car file {side.name}, which {error}") from error
+        except InputRejected as error:
+            raise InputRejected(f"has the side-car file {side.name}, which {error}") from error
     return found
 
 
@@ -168,28 +170,28 @@ def _require_plain(path: Path) -> None:
         with env, rasterio.open(str(path), driver="GTiff") as dataset:
             _require_no_link(dataset)
     except (RasterioError, UnicodeDecodeError) as error:
-        raise Refused(f"cannot be read: {error}; fetch it again") from error
+        raise InputRejected(f"cannot be read: {error}; fetch it again") from error
 
 
 def _check_side_car(side: Path) -> None:
     suffix = side.suffix.lower()
     if suffix in (".ovr", ".msk"):
         if MAGIC.get(head(side)[:4]) != "GTiff":
-            raise Refused("is no TIFF; remove it")
+            raise InputRejected("is no TIFF; remove it")
         _side_cars(side)
         # GDAL takes a raster without a mask that it cannot read.
         _require_plain(side)
     elif suffix == ".xml":
         _require_xml(side)
     elif suffix == ".aux" and head(side).startswith(b"EHFA_HEADER_TAG"):
-        raise Refused("is of Erdas Imagine and may name other files; remove it")
+        raise InputRejected("is of Erdas Imagine and may name other files; remove it")
 
 
 def _require_xml(side: Path) -> None:
     """Raise an error if a file is cut off or has zeros: GDAL then takes a raster without its nodata value."""
     data = side.read_bytes()
     if b"\0" in data or not data.rstrip().endswith(b">"):
-        raise Refused("is damaged; fetch it again, or remove it")
+        raise InputRejected("is damaged; fetch it again, or remove it")
 
 
 @lru_cache(maxsize=65536)

@@ -25,7 +25,7 @@ from weakref import finalize
 from xml.parsers import expat
 
 from flexroad.catalog.gdal_options import settle_vectors
-from flexroad.catalog.guard.refused import Refused, archive_note, head, require_beside
+from flexroad.catalog.guard.rejected import InputRejected, archive_note, head, require_beside
 from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, source_stat
 from flexroad.catalog.guard.sqlite_contents import opened, require_sound_contents
 from flexroad.catalog.lazy import lazy
@@ -73,7 +73,7 @@ def vector_name(path: Path) -> str:
     data = head(path)
     text = data.removeprefix(b"\xef\xbb\xbf").lstrip()
     if "!" in str(path) or "?" in str(path):
-        raise Refused("has a ! or ? in its path, which GDAL would not take for a part of it; rename it")
+        raise InputRejected("has a ! or ? in its path, which GDAL would not take for a part of it; rename it")
     if text.startswith(b"{"):
         _require_no_linked_crs(path)
         # The prefix selects the driver, so that a mark of another format in the text has no effect.
@@ -87,7 +87,7 @@ def vector_name(path: Path) -> str:
         path = _complete(path, data)
         is_geopackage = data[68:72] in GEOPACKAGES
         if not (is_geopackage or _is_spatialite(path)):
-            raise Refused(UNKNOWN)
+            raise InputRejected(UNKNOWN)
         _require_own_tables(path)
         require_sound_contents(path, _state(path))
         if not is_geopackage:
@@ -96,7 +96,7 @@ def vector_name(path: Path) -> str:
     elif not (
         data.startswith(b"fgb\x03") or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader") or _is_osm(text)
     ):
-        raise Refused(UNKNOWN + archive_note(data))
+        raise InputRejected(UNKNOWN + archive_note(data))
     return str(path)
 
 
@@ -116,7 +116,9 @@ def _require_complete(part: Path) -> None:
         stated = 2 * int.from_bytes(data[24:28], "big")
         whole = data.startswith(SHAPEFILE) and SHAPEFILE_HEADER_BYTES <= stated <= size
     if not whole:
-        raise Refused(f"is a damaged Shapefile: {part.name} is shorter than its header says; restore it")
+        raise InputRejected(
+            f"is a damaged Shapefile: {part.name} is shorter than its header says; restore it"
+        )
 
 
 def _objects(path: Path, condition: str) -> list[tuple[str, str]]:
@@ -139,7 +141,7 @@ def _require_own_tables(path: Path) -> None:
     """Raise an error if an SQLite file has a table that may be made of another file."""
     for name, statement in _objects(path, "sql LIKE '%virtual%'"):
         if VIRTUAL.match(statement) and not INDEX.match(statement):
-            raise Refused(
+            raise InputRejected(
                 f"has the virtual table {name!r}, which may be made of another file; convert it with ogr2ogr"
             )
 
@@ -234,8 +236,8 @@ def _require_own_parts(path: Path, parts: Iterable[Path]) -> None:
             require_beside(part, path)
         except FileNotFoundError:
             continue
-        except Refused as error:
-            raise Refused(f"has the part {part.name}, which {error}") from error
+        except InputRejected as error:
+            raise InputRejected(f"has the part {part.name}, which {error}") from error
 
 
 def _require_no_linked_crs(path: Path) -> None:
@@ -247,7 +249,9 @@ def _require_no_linked_crs(path: Path) -> None:
                 # A value, not a key.
                 continue
             if not rest.startswith(b":") or _is_link(rest[1:]):
-                raise Refused("has its CRS by a link; give it one, e.g. ogr2ogr -a_srs EPSG:25832 NEW FILE")
+                raise InputRejected(
+                    "has its CRS by a link; give it one, e.g. ogr2ogr -a_srs EPSG:25832 NEW FILE"
+                )
 
 
 def _is_link(rest: bytes) -> bool:

@@ -16,7 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from urllib.parse import quote
 
-from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.rejected import InputRejected
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.text import one_line
 
@@ -66,7 +66,7 @@ def require_sound_contents(path: Path, state: FileStat) -> None:
     - `state`: its state, by which the answer is kept.
     """
     if fault := _fault(path, state):
-        raise Refused(fault)
+        raise InputRejected(fault)
 
 
 @lru_cache(maxsize=256)

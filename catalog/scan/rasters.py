@@ -29,7 +29,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.gdal_options import CHOSEN, DEFAULTS
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.rejected import InputRejected
 from flexroad.catalog.scan.valid_cells import color_kinds
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.storage.settings import gdal_options
@@ -260,7 +260,7 @@ def _open(root: Path, path: Path, crs: str | None, heights: bool) -> RasterFile:
             tags = {**src.tags(), **src.tags(ns="IMAGERY")}
             unit = src.units[0]
         modified = path.stat().st_mtime
-    except Refused as error:
+    except InputRejected as error:
         raise _Skip(f"it {error}") from error
     except ERRORS as error:
         if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE):

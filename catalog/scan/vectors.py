@@ -18,7 +18,7 @@ from flexroad.catalog.crs_checks import angle_fault, crs_of, elsewhere
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, union
 from flexroad.catalog.guard.open_vector import ERRORS, layer_info, vector_name
-from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.rejected import InputRejected
 from flexroad.catalog.guard.spatial_index import real_bounds
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.scan.rasters import matching
@@ -103,7 +103,7 @@ def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFi
         if not no_bounds:
             infos = [layer_info(file, name, force_total_bounds=True) for name in names]
             infos = [info | {"total_bounds": real_bounds(file, info)} for info in infos]
-    except Refused as error:
+    except InputRejected as error:
         raise CatalogError(f"--roads {path} {error}") from error
     except ERRORS as error:
         if why := access_reason(error):

@@ -13,7 +13,7 @@ from flexroad.catalog import Catalog, CatalogError, Layer, Tile
 from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.guard.refused import Refused, head
+from flexroad.catalog.guard.rejected import InputRejected, head
 from flexroad.catalog.scan.cover import AS_TEXT, height_share
 from flexroad.catalog.scan.rasters import heights_fault, quiet
 from flexroad.catalog.storage.listed_files import StatCache
@@ -121,7 +121,7 @@ def _no_access(path: Location, stat: StatCache) -> str | None:
             head(path)
         except FileNotFoundError:
             return MISSING
-        except Refused:
+        except InputRejected:
             return NO_FILE
         except OSError as error:
             return access_reason(error) or str(error)

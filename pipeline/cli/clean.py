@@ -14,7 +14,7 @@ from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.garbage import MEANING, delete, exclusive, find_garbage
+from flexroad.pipeline.run.cleanup import MEANING, delete, exclusive, find_garbage
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_links
 from flexroad.pipeline.run.store_users import runs_using, unregister

@@ -275,7 +275,7 @@ class FinishedTile:
 
     @property
     def quality(self) -> Quality:
-        """Figures and support of the surface."""
+        """Figures and height source of the surface."""
         quality: Quality = self._result("assess")
         return quality
 
@@ -294,7 +294,7 @@ class FinishedTile:
 
     @property
     def cell_errors(self) -> tuple[Floats, NDArray[np.uint8]]:
-        """Estimated error (m) and support of each cell of the core; needs the source files."""
+        """Estimated error (m) and height source of each cell of the core; needs the source files."""
         return self.level_errors(0)
 
     def level_errors(self, number: int) -> tuple[Floats, NDArray[np.uint8]]:
@@ -392,10 +392,10 @@ def surface_and_road(tile: GroundTile) -> tuple[Surface, RoadMask]:
 def estimate(tile: GroundTile, number: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]] | None:
     """Return `FinishedTile.level_errors`; None if the tile's input cannot be read any more."""
     try:
-        error, support = tile.unread.level_errors(number)
+        error, height_source = tile.unread.level_errors(number)
     except ConfigError:
         return None
-    return error.astype(np.float32), support
+    return error.astype(np.float32), height_source
 
 
 @lru_cache(maxsize=ESTIMATES)

@@ -9,7 +9,7 @@
     RUN/store/           artefacts, unless the store is shared
     RUN/metrics.parquet  one row per (tile, variant); metrics.previous.parquet: before the last execution
     RUN/failures.csv     one row per failure
-    RUN/levels.csv       one row per tile, variant and level, if tiles have decks or tubes
+    RUN/levels.csv       one row per tile, variant and level, if tiles have decks or tunnels
     RUN/log.jsonl        one event per line
     RUN/collection.json  STAC collection of the done tiles
     RUN/*.vrt            their rasters as mosaics; RUN/*.qml: their styles for QGIS

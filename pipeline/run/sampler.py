@@ -62,7 +62,7 @@ class SurfaceSampler(ABC):
         A point on the edge of two finished tiles belongs to the one first in the catalog. A surface goes on
         beyond the survey, but its heights there are no heights of the ground.
 
-        - `level`: 0 is the ground, others are where they have decks or tubes; None: the highest there is.
+        - `level`: 0 is the ground, others are where they have decks or tunnels; None: the highest there is.
         """
         easting = np.atleast_1d(np.asarray(easting, dtype=np.float64))
         northing = np.atleast_1d(np.asarray(northing, dtype=np.float64))
@@ -150,7 +150,7 @@ class SurfaceSampler(ABC):
         NaN off the tiles and beyond the survey. Where tiles meet, the first one with a height counts.
 
         - `levels`: the levels of the points, of which heights are; level 0 where the tile does not have it,
-          but NaN in tubes. None: all of level 0.
+          but NaN in tunnels. None: all of level 0.
         """
         easting, northing = np.broadcast_arrays(easting, northing)
         shape, levels = easting.shape, _flat(levels, easting.size)
@@ -163,21 +163,21 @@ class SurfaceSampler(ABC):
         return values.reshape(shape)
 
     def errors(self, easting: Floats, northing: Floats, numbers: Numbers) -> tuple[Floats, NDArray[np.uint8]]:
-        """Return the estimated errors (m) and the `tasks.quality.support.Support` of n points on levels.
+        """Return the estimated errors (m) and the `HeightSource` of n points on levels.
 
         They are those of the cell at each point. NaN and 0 off the finished tiles, and where the sources of a
         tile have changed or are gone.
         """
-        error, support = np.full(easting.shape, np.nan), np.zeros(easting.shape, np.uint8)
+        error, height_source = np.full(easting.shape, np.nan), np.zeros(easting.shape, np.uint8)
         free = np.ones(easting.shape, np.bool_)
         for tile, here in self.under(easting, northing, free):
             for number, on in _by_number(numbers, here):
                 estimates = None if tile.earlier else estimate(tile, number)
                 if estimates is not None:
                     cells = tile.grid.cells(easting[on], northing[on])
-                    error[on], support[on] = (values[cells] for values in estimates)
-            free[here] = support[here] == 0
-        return error, support
+                    error[on], height_source[on] = (values[cells] for values in estimates)
+            free[here] = height_source[here] == 0
+        return error, height_source
 
     def flags(self, easting: Floats, northing: Floats, numbers: Numbers) -> int:
         """Return the flags that n points on given levels pass (`tasks.quality.flagged.flag_names`)."""

@@ -12,7 +12,7 @@ from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.quality.assess import NO_ROAD
 
 MetricsRow = dict[str, Any]
-"""One row of metrics.parquet, by column; for a tile with decks or tubes also its rows of levels.csv."""
+"""One row of metrics.parquet, by column; for a tile with decks or tunnels also its rows of levels.csv."""
 LEVELS = "levels"
 """Name of these rows."""
 MeshDistances = dict[str, dict[str, float]]

@@ -25,7 +25,7 @@ pyarrow = lazy("pyarrow")
 METRICS, PREVIOUS = "metrics.parquet", "metrics.previous.parquet"
 """Tables of a run, and before its last execution."""
 OF_LEVELS = "levels.csv"
-"""Figures of decks and tubes: a row per tile, variant and level."""
+"""Figures of decks and tunnels: a row per tile, variant and level."""
 CHUNK = 10_000
 """Rows held in memory at a time; also the row groups of metrics.parquet."""
 
@@ -105,7 +105,7 @@ def _schema() -> Any:
 def write_tables(
     run: Location, rows: Iterable[MetricsRow], failures: Iterable[Failure], flushed: bool = False
 ) -> None:
-    """Write metrics.parquet and failures.csv in chunks, and levels.csv if a tile has decks or tubes.
+    """Write metrics.parquet and failures.csv in chunks, and levels.csv if a tile has decks or tunnels.
 
     With ``flushed`` their contents are on the disk before they replace the old tables.
     """
@@ -127,7 +127,7 @@ def write_tables(
 
 
 def level_rows(rows: Iterable[MetricsRow]) -> list[dict[str, Any]]:
-    """Return the figures of the decks and tubes in the rows of tiles, with tile and variant."""
+    """Return the figures of the decks and tunnels in the rows of tiles, with tile and variant."""
     return [
         {"tile_id": row["tile_id"], "variant": row["variant"], **level}
         for row in rows

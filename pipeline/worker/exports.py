@@ -24,7 +24,7 @@ from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.levels.seen import top_mask
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import cog, glb, npz, ply
-from flexroad.tasks.quality.support import of_faces, top_support
+from flexroad.tasks.quality.height_source import of_faces, top_height_source
 from flexroad.tasks.roads.level_numbers import HIGHEST
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Quality, Surface
@@ -64,15 +64,19 @@ class Product:
 
 
 GLB = Kind("mesh", glb.NAME, glb.MEDIA_TYPE, "Mesh for viewers: small coordinates, Y up")
-PLY = Kind("ply", ply.NAME, ply.MEDIA_TYPE, "Mesh in coordinates of the CRS, with class and support per face")
+PLY = Kind(
+    "ply", ply.NAME, ply.MEDIA_TYPE, "Mesh in coordinates of the CRS, with class and height source per face"
+)
 HEIGHT = Kind("height", cog.NAME_HEIGHT, cog.MEDIA_TYPE, "Height of the surface", cog.HEIGHT)
 ROAD = Kind("road", cog.NAME_ROAD, cog.MEDIA_TYPE, "Road mask after the filter", cog.ROAD)
-SUPPORT = Kind("support", cog.NAME_SUPPORT, cog.MEDIA_TYPE, "Source of each height", cog.SUPPORT)
+HEIGHT_SOURCE = Kind(
+    "height_source", cog.NAME_HEIGHT_SOURCE, cog.MEDIA_TYPE, "Source of each height", cog.HEIGHT_SOURCE
+)
 NPZ = Kind("surface", npz.NAME, npz.MEDIA_TYPE, "NURBS surface, as NumPy archive")
 KINDS: dict[str, tuple[Kind, ...]] = {
     "glb": (GLB,),
     "ply": (PLY,),
-    "cog": (HEIGHT, ROAD, SUPPORT),
+    "cog": (HEIGHT, ROAD, HEIGHT_SOURCE),
     "npz": (NPZ,),
 }
 """The kinds of product of each format."""
@@ -87,8 +91,10 @@ def of_level(kind: Kind, number: int) -> Kind:
     )
 
 
-LEVEL_KINDS = tuple(of_level(kind, number) for kind in (HEIGHT, SUPPORT) for number in range(-HIGHEST, 1))
-"""Further kinds of the format ``cog``, for tiles with decks or tubes."""
+LEVEL_KINDS = tuple(
+    of_level(kind, number) for kind in (HEIGHT, HEIGHT_SOURCE) for number in range(-HIGHEST, 1)
+)
+"""Further kinds of the format ``cog``, for tiles with decks or tunnels."""
 
 
 def file_name(tile_id: str, variant: str, kind: Kind) -> str:
@@ -142,8 +148,8 @@ def products(
 def _ply(nodes: dict[str, str], evaluate: Callable[[str], Any], normals: Floats | None) -> dict[Kind, bytes]:
     mesh = evaluate(nodes["sample"])
     quality = evaluate(nodes["assess"])
-    support = of_faces(quality.support, evaluate(nodes["segment"]), mesh, quality.levels)
-    return {PLY: ply.encode(mesh, support, normals)}
+    height_source = of_faces(quality.height_source, evaluate(nodes["segment"]), mesh, quality.levels)
+    return {PLY: ply.encode(mesh, height_source, normals)}
 
 
 def _cog(
@@ -157,11 +163,11 @@ def _cog(
     kept, quality = top_mask(evaluate(nodes["ecsrc"]))[window], evaluate(nodes["assess"])
     # Without a common one, GDAL's environment is set up and cleared for each call.
     with quiet():
-        support, others = _of_levels(core, road.outside[window], surface, quality, vertical)
+        height_source, others = _of_levels(core, road.outside[window], surface, quality, vertical)
         return {
             HEIGHT: cog.encode_height(heights, core, vertical),
             ROAD: cog.encode_mask(kept, core),
-            SUPPORT: cog.encode_support(support, core),
+            HEIGHT_SOURCE: cog.encode_height_source(height_source, core),
             **others,
         }
 
@@ -169,7 +175,7 @@ def _cog(
 def _of_levels(
     core: Grid, outside: Bools, surface: Surface, quality: Quality, vertical: str | None
 ) -> tuple[NDArray[np.uint8], dict[Kind, bytes]]:
-    """Return the support of the highest level, and rasters of level 0 below decks and of tubes."""
+    """Return the height source of the highest level, and rasters of level 0 below decks and of tunnels."""
     at = np.meshgrid(core.eastings, core.northings)
     top, lower = surface.top(*at), {}
     if (top > 0).any():
@@ -182,8 +188,10 @@ def _of_levels(
     files = {}
     for number, heights in sorted(lower.items()):
         files[of_level(HEIGHT, number)] = cog.encode_height(heights, core, vertical)
-        files[of_level(SUPPORT, number)] = cog.encode_support(quality.at(number).support, core)
-    return top_support(quality, top), files
+        files[of_level(HEIGHT_SOURCE, number)] = cog.encode_height_source(
+            quality.at(number).height_source, core
+        )
+    return top_height_source(quality, top), files
 
 
 def _npz(nodes: dict[str, str], evaluate: Callable[[str], Any]) -> dict[Kind, bytes]:

@@ -203,7 +203,7 @@ def _row(graph: TileGraph, variant: str, evaluator: Evaluator) -> MetricsRow:
 
 
 def _of_levels(quality: Quality) -> list[dict[str, Any]]:
-    """Return the figures of the decks and tubes of a tile, for each level that has some."""
+    """Return the figures of the decks and tunnels of a tile, for each level that has some."""
     return [
         no_nan(
             {"level": number}

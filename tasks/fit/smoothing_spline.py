@@ -48,8 +48,8 @@ BEYOND_DATA_M = 15.0
 """The distance is at least this (m) larger than that of the corner or edge to the farthest ground."""
 NEAR_M = 25.0
 """A corner or edge has control points of the levels within this distance (m)."""
-ON_JOINT_M = 0.05
-"""Crossings of the outline of a level within this distance of its joints (m) are those of joints."""
+ON_ABUTMENT_M = 0.05
+"""Crossings of the outline of a level within this distance of its abutments (m) are those of abutments."""
 TOLERANCE, BORDER_TOLERANCE = 1e-4, 1e-6
 """The fit of a tile, and of a corner or edge, ends when the loss falls by less than this share in a step.
 Corners and edges are small, and in a void the loss changes little."""
@@ -259,10 +259,10 @@ def edge(
                 crossings=crossings(mine.areas, border),
                 levels=(),
             )
-            on_joints = part.crossings[_on_joints(level, part.crossings, border)]
+            on_abutments = part.crossings[_on_abutments(level, part.crossings, border)]
             own = replace(
                 own,
-                crossings=np.union1d(own.crossings, on_joints),
+                crossings=np.union1d(own.crossings, on_abutments),
                 levels=(*own.levels, (level.number, part)),
             )
     if splines:
@@ -305,11 +305,11 @@ def _near(clusters: RoadClusters, border: Border) -> Iterator[tuple[Level, RoadC
             yield level, own
 
 
-def _on_joints(level: Level, positions: Floats, border: Border) -> Bools:
-    """Return which positions on an edge (m from its start) lie on the joints of a level."""
+def _on_abutments(level: Level, positions: Floats, border: Border) -> Bools:
+    """Return which positions on an edge (m from its start) lie on the abutments of a level."""
     (east, north), along = border.start, positions
     places = (east + along, north + 0 * along) if border.kind == "east" else (east + 0 * along, north + along)
-    return np.asarray(shapely.dwithin(level.joints, shapely.points(*places), ON_JOINT_M))
+    return np.asarray(shapely.dwithin(level.abutments, shapely.points(*places), ON_ABUTMENT_M))
 
 
 def _lattice(cells: tuple[int, int], cell: float, options: Options) -> Lattice:

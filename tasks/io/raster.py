@@ -22,7 +22,7 @@ from flexroad.catalog.crs import short
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.guard.kept_rasters import kept_raster
 from flexroad.catalog.guard.open_raster import ERRORS, has_own_blocks, open_raster
-from flexroad.catalog.guard.refused import Refused, read_through
+from flexroad.catalog.guard.rejected import InputRejected, read_through
 from flexroad.catalog.guard.source_files import files_of
 from flexroad.catalog.scan.rasters import heights_fault
 from flexroad.catalog.scan.valid_cells import transparent
@@ -209,9 +209,9 @@ def _fault(
         if unread := _unread(path):
             text = f"{name} cannot be read: {unread}; mend that and run again"
             return Unreadable(text, str(path)) if absent else TaskError(text, str(path))
-    elif not isinstance(error, Refused):
+    elif not isinstance(error, InputRejected):
         return TaskError(f"{name} cannot be read: {why}; run again, or repair it", str(path))
-    if isinstance(error, Refused):
+    if isinstance(error, InputRejected):
         return Unreadable(f"{name} {error}", str(path))
     kind = DamagedCells if opened else Unreadable
     return kind(f"{name} cannot be read: {why}; fetch it again", str(path))
@@ -235,7 +235,7 @@ def _unread(path: Path) -> str:
     try:
         for file in files_of(path):
             read_through(file)
-    except Refused:
+    except InputRejected:
         return ""
     except OSError as error:
         which = f" ({error.filename})" if error.filename not in (None, str(path)) else ""

@@ -28,7 +28,7 @@ from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.guard.open_vector import ERRORS, encoding_note, in_its_encoding, layer_info, vector_name
-from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.rejected import InputRejected
 from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.guard.spatial_index import has_complete_index
 from flexroad.catalog.lazy import lazy
@@ -186,7 +186,7 @@ def _file(request: Query, version: FileStat) -> str:
     try:
         local = request.path if isinstance(request.path, Path) else _copied(request.path, version).path
         return vector_name(local)
-    except Refused as error:
+    except InputRejected as error:
         raise _error(request, str(error)) from error
     except OSError as error:
         raise _error(request, f"cannot be read: {error.strerror}; run again") from error

@@ -1,4 +1,4 @@
-"""The level of each place along a route: that of its centre lines, and beyond the ends of decks and tubes."""
+"""The level of each place along a route: by its centre lines, and beyond the ends of structures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import shapely
 import shapely.ops
 from numpy.typing import NDArray
 
-from flexroad.tasks.levels.joints import APPROACH_M
+from flexroad.tasks.levels.abutments import APPROACH_M
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats
 
@@ -22,7 +22,7 @@ class PlaceLevels:
 
     number: NDArray[np.int8]
     own: Bools
-    """Whether the centre line there is of this level; else it is of level 0, near a deck or tube."""
+    """Whether the centre line there is of this level; else it is of level 0, near a deck or tunnel."""
 
     def __getitem__(self, places: Bools | NDArray[np.intp]) -> PlaceLevels:
         return PlaceLevels(self.number[places], self.own[places])
@@ -35,7 +35,7 @@ class PlaceLevels:
 
 @dataclass(frozen=True)
 class Structure:
-    """A piece of a road on a deck or in a tube, by distances along the road (m)."""
+    """A piece of a road on a deck or in a tunnel, by distances along the road (m)."""
 
     level: int
     start: float
@@ -43,7 +43,7 @@ class Structure:
 
 
 def structures(levels: NDArray[np.int8], s: Floats) -> tuple[Structure, ...]:
-    """Return the decks and tubes of a road from its levels at points, and their distances along it (m)."""
+    """Return the decks and tunnels of a road from its levels at points, and their distances along it (m)."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(levels)) + 1, [len(levels)]])
     return tuple(
         Structure(int(levels[a]), float(s[a]), float(s[b - 1]))
@@ -54,7 +54,7 @@ def structures(levels: NDArray[np.int8], s: Floats) -> tuple[Structure, ...]:
 
 @dataclass(frozen=True, eq=False)
 class RouteLevels:
-    """The levels along a route of which a part is on a deck or in a tube."""
+    """The levels along a route of which a part is on a deck or in a tunnel."""
 
     spans: NDArray[np.object_]
     """Lines, of one level each, in the route's coordinates."""

@@ -1,7 +1,7 @@
 """What each level sees of the heights of a tile: levels differ in nothing else.
 
 Level 0 does not see the decks, and not the approaches, where it takes the surface of their level. A deck sees
-itself and its approaches, and beyond 12 m of them everything that level 0 sees. A tube sees its approaches;
+itself and its approaches, and beyond 12 m of them everything that level 0 sees. A tunnel sees its approaches;
 its own heights are inferred from them.
 """
 
@@ -26,7 +26,7 @@ HIDDEN_M = 1.0
 APART_M = 12.0
 """Heights of level 0 so near to a deck (m) are left out: a control point acts up to 10.8 m away."""
 MOST = 400
-"""Most cells of the approaches from which the heights of a tube are inferred."""
+"""Most cells of the approaches from which the heights of a tunnel are inferred."""
 LEAST = 20
 """Fewest cells with which they are inferred."""
 SMOOTHING = 10.0
@@ -110,7 +110,7 @@ def hidden(levels: tuple[Level, ...], number: int, grid: Grid) -> Bools:
 
 
 def off_ground(levels: tuple[Level, ...], grid: Grid) -> Bools:
-    """Return the cells of level 0 below and beside decks, and above tubes, ``(H, W)``: roads go on there."""
+    """Return the cells of level 0 below and beside decks, and above tunnels, ``(H, W)``."""
     return _any(grid, [_hidden(levels, grid), *(_own(level, grid) for level in levels if level.number < 0)])
 
 
@@ -166,9 +166,9 @@ def _replaced(data: TileData, dsm: Floats, dtm: Floats) -> TileData:
 
 
 def _inferred(data: TileData, level: Level, visible: Bools) -> Floats:
-    """Return the DSM with the heights of a tube: a thin plate through its approaches."""
+    """Return the DSM with the heights of a tunnel: a thin plate through its approaches."""
     grid, own = data.grid, _own(level, data.grid)
-    # Other roads near the portals may lie above the tube.
+    # Other roads near the portals may lie above the tunnel.
     row, col = np.nonzero(visible & _taken(level, grid))
     if len(row) < LEAST or not own.any():
         return data.dsm
@@ -205,7 +205,7 @@ def _any(grid: Grid, masks: list[Bools]) -> Bools:
 
 
 def _own(level: Level, grid: Grid) -> Bools:
-    """Return the cells of the decks or tubes."""
+    """Return the cells of the decks or tunnels."""
     return _once(level, grid, "own", lambda: _cells(level.areas, grid))
 
 

@@ -1,4 +1,4 @@
-"""Heights (the paper's R^S), road mask and support of a tile as cloud-optimised GeoTIFF."""
+"""Heights (the paper's R^S), road mask and height source of a tile as cloud-optimised GeoTIFF."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexroad.catalog.crs import compound
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.quality.support import Support
+from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.types import Bools, Floats
 
 rasterio = lazy("rasterio")
@@ -21,7 +21,7 @@ rasterio = lazy("rasterio")
 VERSION = 4
 NAME_HEIGHT = "_height.tif"
 NAME_ROAD = "_road.tif"
-NAME_SUPPORT = "_support.tif"
+NAME_HEIGHT_SOURCE = "_height_source.tif"
 NAME_STYLE = ".qml"
 MEDIA_TYPE = "image/tiff; application=geotiff; profile=cloud-optimized"
 BLOCK = 512
@@ -71,16 +71,16 @@ ROAD = Band(
         RasterClass(1, "road", "Road that the surface follows", (70, 70, 80)),
     ),
 )
-SUPPORT = Band(
-    "support",
+HEIGHT_SOURCE = Band(
+    "height_source",
     "Source of the surface's height",
     "uint8",
-    nodata=int(Support.NONE),
+    nodata=int(HeightSource.NONE),
     classes=(
-        RasterClass(Support.NONE, "outside", "Beyond the survey", (255, 255, 255)),
-        RasterClass(Support.MEASURED, "measured", "The surface model shows the ground", (90, 160, 90)),
-        RasterClass(Support.DTM, "dtm", "Hidden ground: the height comes from the DTM", (240, 190, 70)),
-        RasterClass(Support.INFERRED, "inferred", "No height: extrapolated from around", (205, 80, 70)),
+        RasterClass(HeightSource.NONE, "outside", "Beyond the survey", (255, 255, 255)),
+        RasterClass(HeightSource.MEASURED, "measured", "The surface model shows the ground", (90, 160, 90)),
+        RasterClass(HeightSource.DTM, "dtm", "Hidden ground: the height comes from the DTM", (240, 190, 70)),
+        RasterClass(HeightSource.INFERRED, "inferred", "No height: extrapolated from around", (205, 80, 70)),
     ),
 )
 
@@ -114,15 +114,15 @@ def encode_mask(road: Bools, grid: Grid) -> bytes:
     return _encode(values, grid, grid.crs, ROAD, overview_resampling="mode")
 
 
-def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
-    """Return the `Support` of each cell, ``(H, W)``, as GeoTIFF: uint8; 0 is nodata.
+def encode_height_source(height_source: NDArray[np.uint8], grid: Grid) -> bytes:
+    """Return the `HeightSource` of each cell, ``(H, W)``, as GeoTIFF: uint8; 0 is nodata.
 
     Raises
     ------
     TaskError
         If the array does not have the grid's shape.
     """
-    return _encode(support, grid, grid.crs, SUPPORT, overview_resampling="mode")
+    return _encode(height_source, grid, grid.crs, HEIGHT_SOURCE, overview_resampling="mode")
 
 
 def encode_style(band: Band) -> bytes:

@@ -106,7 +106,7 @@ def encode(
     -------
     bytes
         A node translated by the tile's origin minus the run's, with child nodes ``road`` and ``terrain`` (a
-        class without faces has no node). A deck or tube is the child ``road`` of a node ``level 1``, by the
+        class without faces has no node). A deck or tunnel is the child ``road`` of a node ``level 1``, by the
         number of its level. Axes: x east, y up, z south; metres. Equal inputs give equal bytes.
     """
     normals = mesh_normals(mesh) if normals is None else normals

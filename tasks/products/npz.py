@@ -30,7 +30,7 @@ WITH_LEVELS = 3
 """Version of files with several levels."""
 NAME = "_surface.npz"
 STEPS = ("steps", "south_north", "west_east")
-SHAPES = ("areas", "joints", "approach", "passing")
+SHAPES = ("areas", "abutments", "approach", "passing")
 """Fields of a `Level` that are written."""
 MEDIA_TYPE = "application/zip"
 
@@ -45,8 +45,8 @@ def encode(surface: NurbsSurface) -> bytes:
     their grid (west, north and cell size in m, columns, rows).
 
     A `LevelledSurface`, version 3, has ``levels``, the numbers of its other levels, and for each of them, as
-    level 1, ``A_1`` (its coefficients) and the shapes of its `Level` as WKB (m): ``areas_1``, ``joints_1``,
-    ``approach_1`` and ``passing_1``.
+    level 1, ``A_1`` (its coefficients) and the shapes of its `Level` as WKB (m): ``areas_1``,
+    ``abutments_1``, ``approach_1`` and ``passing_1``.
 
     ``z(u, v) = datum + A(u, v) / W(u, v)``, with u and v affine over ``bounds`` (west, south, east, north;
     m), from the knot with the number ``degree`` to the one as far from the end. Coefficients are (row, col)

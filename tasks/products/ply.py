@@ -1,8 +1,8 @@
-"""The paper's final mesh as binary PLY, with class and support per face: for CloudCompare, QGIS and scripts.
+"""The paper's final mesh as binary PLY, with class and height source per face.
 
 Coordinates are absolute and float64. trimesh and VTK write float32 vertices, whose resolution is 0.5 m at a
 northing of 5.6 million; therefore the file is written here. VTK also reads them as float32. Vertices have
-normals, and class and support, too: CloudCompare takes scalars of vertices alone.
+normals, and class and height source, too: CloudCompare takes scalars of vertices alone.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.meshing.normals import mesh_normals
-from flexroad.tasks.quality.support import Support
+from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.types import Floats, Mesh
 
 VERSION = 3
@@ -21,8 +21,8 @@ MEDIA_TYPE = "application/octet-stream"
 ROAD, GROUND = 11, 2
 """Classes of faces: the ASPRS codes of LAS files for road surface and ground."""
 
-VERTEX = np.dtype([("place", "<f8", (3,)), ("normal", "<f4", (3,)), ("class", "u1"), ("support", "u1")])
-FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", (3,)), ("class", "u1"), ("support", "u1")])
+VERTEX = np.dtype([("place", "<f8", (3,)), ("normal", "<f4", (3,)), ("class", "u1"), ("height_source", "u1")])
+FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", (3,)), ("class", "u1"), ("height_source", "u1")])
 
 HEADER = """\
 ply
@@ -30,7 +30,7 @@ format binary_little_endian 1.0
 comment crs {crs}
 comment origin {origin}
 comment class {ground} ground, {road} road surface (ASPRS)
-comment support {support}
+comment height_source {height_source}
 element vertex {vertices}
 property double x
 property double y
@@ -39,22 +39,22 @@ property float nx
 property float ny
 property float nz
 property uchar class
-property uchar support
+property uchar height_source
 {level}element face {faces}
 property list uchar int vertex_indices
 property uchar class
-property uchar support
+property uchar height_source
 {level}end_header
 """
 LEVEL = "property char level\n"
 
 
-def encode(mesh: Mesh, support: NDArray[np.uint8], normals: Floats | None = None) -> bytes:
-    """Return a mesh as PLY with the support of each face (`tasks.quality.support.Support`, ``(F,)``).
+def encode(mesh: Mesh, height_source: NDArray[np.uint8], normals: Floats | None = None) -> bytes:
+    """Return a mesh as PLY with the `HeightSource` of each face, ``(F,)``.
 
     Vertices are (easting, northing, height) in metres. A vertex is road if one of its faces is, and has the
-    highest code of support of its faces: the least certain one. A mesh with levels has the property ``level``
-    of vertices and faces. Header comments give the CRS and, as
+    highest code of height source of its faces: the least certain one. A mesh with levels has the
+    property ``level`` of vertices and faces. Header comments give the CRS and, as
     ``origin``, the tile's whole-metre origin, which programs that compute in float32 can subtract.
 
     Parameters
@@ -67,7 +67,7 @@ def encode(mesh: Mesh, support: NDArray[np.uint8], normals: Floats | None = None
         origin=" ".join(f"{v:.15g}" for v in mesh.origin),
         ground=GROUND,
         road=ROAD,
-        support=", ".join(f"{kind} {kind.name.lower()}" for kind in Support),
+        height_source=", ".join(f"{kind} {kind.name.lower()}" for kind in HeightSource),
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
         level="" if mesh.level is None else LEVEL,
@@ -77,14 +77,14 @@ def encode(mesh: Mesh, support: NDArray[np.uint8], normals: Floats | None = None
     faces["corners"] = 3
     faces["vertices"] = mesh.faces
     faces["class"] = np.where(mesh.road, ROAD, GROUND)
-    faces["support"] = support
+    faces["height_source"] = height_source
     vertices = np.zeros(len(mesh.vertices), [*VERTEX.descr, *levelled])
     vertices["place"] = mesh.vertices + np.asarray(mesh.origin, np.float64)
     vertices["normal"] = mesh_normals(mesh) if normals is None else normals
     vertices["class"] = GROUND
     vertices["class"][mesh.faces[mesh.road]] = ROAD
-    for kind in sorted(Support):
-        vertices["support"][mesh.faces[support == kind]] = kind
+    for kind in sorted(HeightSource):
+        vertices["height_source"][mesh.faces[height_source == kind]] = kind
     if mesh.level is not None:
         faces["level"] = mesh.level
         vertices["level"][mesh.faces] = mesh.level[:, None]

@@ -1,1 +1,1 @@
-"""Quality of a surface without ground truth: support, flags, error estimate."""
+"""Quality of a surface without ground truth: height source, flags, error estimate."""

@@ -20,9 +20,9 @@ from flexroad.tasks.levels.seen import level_data, level_road
 from flexroad.tasks.metrics.statistics import mean, nmad
 from flexroad.tasks.quality.estimate import Compared, compare
 from flexroad.tasks.quality.flagged import flagged_cells
+from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.quality.holdout import Refit, holdout
 from flexroad.tasks.quality.structures import STRUCTURE_FLAGS, structures
-from flexroad.tasks.quality.support import Support
 from flexroad.tasks.quality.worst import worst_piece
 from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
@@ -103,8 +103,8 @@ def assess(
     -------
     Quality
         Figures over the road cells of the core; NaN where the tile or the surface has no such data. With
-        levels, those of level 0, and of each other one on its decks or tubes, without a second fit; flags
-        of decks and tubes are those of level 0, too.
+        levels, those of level 0, and of each other one on its decks or tunnels, without a second fit; flags
+        of decks and tunnels are those of level 0, too.
     """
     own = _assess(data, road, clusters, surface, options, refit)
     others = []
@@ -117,8 +117,10 @@ def assess(
         found, flags = structures(road, surface, number)
         # Away from its decks a level has no figures: it is no road that was lost.
         own_flags = (*quality.flags, *flags) if found else ()
-        support = _hidden(quality.support) if number < 0 else quality.support
-        others.append((number, replace(quality, structures=found, flags=own_flags, support=support)))
+        height_source = _hidden(quality.height_source) if number < 0 else quality.height_source
+        others.append(
+            (number, replace(quality, structures=found, flags=own_flags, height_source=height_source))
+        )
     raised = {flag for _, quality in others for flag in quality.flags}
     flags = (*own.flags, *(flag for flag in STRUCTURE_FLAGS if flag in raised))
     return replace(own, flags=flags, levels=tuple(others))
@@ -143,9 +145,9 @@ def _assess(
         "residual_p95_m": _quantile(np.abs(residuals), 95),
         "curvature_per_m": _largest(_second_differences(height, on_road) / cell**2),
         "edge_step_m": _quantile(_edge_steps(cells.smooth, on_road, cells.goes_on), 95),
-        "measured_road": mean(classes[on_road] == Support.MEASURED),
-        "dtm_road": mean(classes[on_road] == Support.DTM),
-        "inferred_road": mean(classes[on_road] == Support.INFERRED),
+        "measured_road": mean(classes[on_road] == HeightSource.MEASURED),
+        "dtm_road": mean(classes[on_road] == HeightSource.DTM),
+        "inferred_road": mean(classes[on_road] == HeightSource.INFERRED),
         "dropped_road": mean(~kept[on_road]),
         "dsm_excess_m": _quantile(_finite(cells.excess[kept]), 50),
         "off_dtm_m": _quantile(to_dtm, 50),
@@ -165,7 +167,7 @@ def _assess(
     if not kept.any():
         flags = [NO_ROAD, *flags]
     flagged = flagged_cells(cells, cell, LIMITS, options.dsm_dtm_tolerance_m, flags)
-    return Quality(**figures, flags=tuple(flags), support=classes, flagged=flagged)
+    return Quality(**figures, flags=tuple(flags), height_source=classes, flagged=flagged)
 
 
 def _worst(cells: Compared, core: Grid) -> dict[str, float]:
@@ -183,10 +185,10 @@ def cell_errors(
     options: Options,
     number: int = 0,
 ) -> tuple[Floats, NDArray[np.uint8]]:
-    """Return the estimated error (m) and the `Support` of each cell of the core, ``(H, W)``; see `assess`.
+    """Return the estimated error (m) and the `HeightSource` of each cell of the core, ``(H, W)``.
 
     They are those of a level, or of level 0 if the tile does not have it. The estimate is NaN beyond the
-    survey, and beyond decks and tubes.
+    survey, and beyond decks and tunnels.
     """
     own = [own for own in clusters.levels if own.number == number and number in surface.numbers]
     if own:
@@ -194,12 +196,12 @@ def cell_errors(
         clusters = own[0]
     cells = compare(data, road, clusters, surface, options.dsm_dtm_tolerance_m)
     classes = _hidden(cells.classes) if number < 0 else cells.classes
-    return np.where(classes == Support.NONE, np.nan, cells.estimate), classes
+    return np.where(classes == HeightSource.NONE, np.nan, cells.estimate), classes
 
 
 def _hidden(classes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the support in tubes, of which no height is measured."""
-    return np.where(classes == Support.NONE, classes, np.uint8(Support.INFERRED))
+    """Return the height source in tunnels, of which no height is measured."""
+    return np.where(classes == HeightSource.NONE, classes, np.uint8(HeightSource.INFERRED))
 
 
 def top_errors(
@@ -228,7 +230,7 @@ def _second_differences(height: Floats, on_road: Bools) -> Floats:
 def _edge_steps(height: Floats, on_road: Bools, goes_on: Bools) -> Floats:
     """Return the distance of each first cell beside the road to the line of the last two on it, ``(n,)``.
 
-    At a joint there is none: the road goes on as a deck or in a tube.
+    At an abutment there is none: the road goes on as a deck or in a tunnel.
     """
     parts, beside = [], ~(on_road | goes_on)
     for z, road, edge in ((height, on_road, beside), (height.T, on_road.T, beside.T)):

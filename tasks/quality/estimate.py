@@ -14,9 +14,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from flexroad.tasks.levels.joints import TUBE_M
+from flexroad.tasks.levels.abutments import TUNNEL_M
 from flexroad.tasks.levels.seen import hidden, level_data, off_ground, with_approaches
-from flexroad.tasks.quality.support import Support, support
+from flexroad.tasks.quality.height_source import HeightSource, height_source
 from flexroad.tasks.roads.distances import distances, filled
 from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M, ground_to_fit, rise
 from flexroad.tasks.roads.flat_patches import CLIMB
@@ -165,7 +165,7 @@ class Compared:
     kept: Bools
     """Those that the filter kept and that have a DSM height."""
     classes: NDArray[np.uint8]
-    """The cells' `Support`."""
+    """The cells' `HeightSource`."""
     height: Floats
     """Height of the surface (m)."""
     smooth: Floats
@@ -183,10 +183,10 @@ class Compared:
     """Estimated error of the surface (m), by `quality.estimate.error_estimate`; at least the distance to the
     DTM on objects that it climbs, and the deviation where that exceeds ``dsm_dtm_tolerance_m``."""
     goes_on: Bools
-    """Cells of level 0 below decks or above tubes: a road that ends there at a joint goes on."""
+    """Cells of level 0 below decks or above tunnels: a road that ends there at an abutment goes on."""
     lacking: Bools
-    """Inferred road cells, but for those below decks within half the length of a tube (`TUBE_M`) of road with
-    a height: that a deck hides the street below it is no fault of the data."""
+    """Inferred road cells, but for those below decks within half the length of a tunnel (`TUNNEL_M`) of road
+    with a height: that a deck hides the street below it is no fault of the data."""
 
 
 def compare(
@@ -206,18 +206,18 @@ def compare(
     data, clusters = level_data(data, clusters), with_approaches(clusters)
     window = data.grid.window(data.core)
     fitted = with_road_heights(data, clusters)
-    every = support(data, road, _with_ground(clusters, surface, data), dsm_dtm_tolerance_m)
+    every = height_source(data, road, _with_ground(clusters, surface, data), dsm_dtm_tolerance_m)
     classes, below = every[window], hidden(road.levels, clusters.number, data.grid)
-    on_road = road.mask[window] & (classes != Support.NONE)
+    on_road = road.mask[window] & (classes != HeightSource.NONE)
     kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
     height = surface.lattice(data.core.eastings, data.core.northings)
     smooth = height - surface.steps if isinstance(surface, SteppedSurface) else height
     off_dsm, off_dtm = height - fitted.dsm[window], height - data.dtm[window]
     spread = scatter(fitted.dsm[window], data.dtm[window], kept, data.core.cell)
     residual = height - ground_to_fit(fitted, clusters, window)
-    residual[classes == Support.NONE] = np.nan
+    residual[classes == HeightSource.NONE] = np.nan
     estimate = error_estimate(residual, off_dtm, spread, kept, on_road, data.core.cell, only_road)
-    inferred = classes == Support.INFERRED
+    inferred = classes == HeightSource.INFERRED
     away = deviation(off_dsm, off_dtm, spread, kept, inferred)
     on_object = climbed(smooth, data.dtm[window], kept, data.core.cell, dsm_dtm_tolerance_m)
     # Within `dsm_dtm_tolerance_m` DSM and DTM show the same ground, and residuals say more.
@@ -236,11 +236,11 @@ def compare(
 
 def _lacking(road: Bools, classes: NDArray[np.uint8], below: Bools, cell: float) -> Bools:
     """Return the inferred road cells that no deck explains, ``(H, W)``; see `Compared.lacking`."""
-    lacking = road & (classes == Support.INFERRED)
+    lacking = road & (classes == HeightSource.INFERRED)
     by_deck = lacking & below
     if by_deck.any():
-        known = road & ((classes == Support.MEASURED) | (classes == Support.DTM))
-        lacking[by_deck] = distances(by_deck, known) * cell > TUBE_M / 2
+        known = road & ((classes == HeightSource.MEASURED) | (classes == HeightSource.DTM))
+        lacking[by_deck] = distances(by_deck, known) * cell > TUNNEL_M / 2
     return np.asarray(lacking)
 
 

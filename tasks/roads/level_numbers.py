@@ -1,4 +1,4 @@
-"""Levels of roads from their attributes: 0 on the ground, above 0 on decks, below 0 in tubes."""
+"""Levels of roads from their attributes: 0 on the ground, above 0 on decks, below 0 in tunnels."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ def roads(source: Source | None, grid: Grid, options: Options, levels: bool = Fa
             "no roads layer in the catalog: give a vector file with --roads to `flexroad catalog` "
             "or `flexroad prepare`"
         )
-    # Both portals of a tube that reaches the grid are seen.
+    # Both portals of a tunnel that reaches the grid are seen.
     reach = max(widths.MAX_WIDTH_M / 2, FARTHEST_M if levels else 0.0)
     west, south, east, north = grid.bounds
     bounds = (west - reach, south - reach, east + reach, north + reach)
@@ -173,7 +173,7 @@ def selected(
 ) -> tuple[Any, NDArray[np.object_], NDArray[np.int64], tuple[str, ...]]:
     """Return the rows of a table that are roads, the class of each, in lower case or empty, and its level.
 
-    And notes on levels that cannot be read. With levels, tubes are not left out as hidden.
+    And notes on levels that cannot be read. With levels, tunnels are not left out as hidden.
     """
     numbers, notes = np.zeros(len(table), np.int64), tuple[str, ...]()
     if levels:
@@ -193,13 +193,13 @@ def _classes(table: Any, columns: tuple[str, ...]) -> NDArray[np.object_]:
     return classes
 
 
-def _is_road(table: Any, classes: NDArray[np.object_], options: Options, tubes: Bools) -> Bools:
+def _is_road(table: Any, classes: NDArray[np.object_], options: Options, tunnels: Bools) -> Bools:
     road: Bools = ~np.isin(classes, [name.lower() for name in options.left_out])
     if any(tag in table for tag in CLASS_TAGS):
         road &= _classes(table, CLASS_TAGS) != ""
     if not options.tunnels:
         for tag in HIDDEN_TAGS:
-            road &= tubes | ~is_yes(table, tag)
+            road &= tunnels | ~is_yes(table, tag)
     return road
 
 

@@ -43,7 +43,7 @@ class CentreLine:
     """Whether traffic goes only from the first point to the last."""
     name: str = ""
     level: int = 0
-    """0 on the ground, above 0 on a deck, below 0 in a tube."""
+    """0 on the ground, above 0 on a deck, below 0 in a tunnel."""
 
     @property
     def length_m(self) -> float:

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from flexroad.tasks.levels.joints import levels_of
+from flexroad.tasks.levels.abutments import levels_of
 from flexroad.tasks.meshing.road_outline import encoded
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.extent import beyond_extent

@@ -60,7 +60,7 @@ class Edge:
     ``steps``."""
     levels: tuple[tuple[int, Edge], ...] = ()
     """Number and edge of each other level near it; its own control points, classes and steps are those of
-    level 0. Crossings of a level are those of the outline of its decks; those on joints are also among the
+    level 0. Crossings of a level are those of the outline of its decks; those on abutments are also among the
     crossings of level 0."""
 
     def at(self, number: int) -> Edge:

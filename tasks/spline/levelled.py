@@ -1,6 +1,6 @@
-"""The surfaces of a tile with several levels: the ground, and decks above or tubes below it.
+"""The surfaces of a tile with several levels: the ground, and decks above or tunnels below it.
 
-Each level has a spline over the complete tile. Near a joint, the ground has the surface of the level that
+Each level has a spline over the complete tile. Near an abutment, the ground has the surface of the level that
 begins there, so that both are one spline across it. Its own spline, with control points metres apart, cannot
 follow the end of an embankment.
 """
@@ -91,7 +91,7 @@ class LevelledSurface(SteppedSurface):
         return by_easting, by_northing
 
     def _joined(self, heights: Floats, easting: Floats, northing: Floats) -> Floats:
-        """Return heights of the spline of level 0 (m) with those of the other levels near their joints."""
+        """Return heights of the spline of level 0 (m) with those of the other levels near their abutments."""
         east, north = np.broadcast_arrays(np.asarray(easting, float), np.asarray(northing, float))
         result = np.array(heights)
         for own in self.levels:
@@ -140,7 +140,7 @@ class HighestSurface(Surface):
 
 
 def _rise(level: Level, easting: Floats, northing: Floats, aside: tuple[float, float]) -> Floats:
-    """Return the derivative of the weight of a level in a direction (1/m), 0 at its jump at the joint."""
+    """Return the derivative of the weight of a level in a direction (1/m), 0 at its jump at the abutment."""
     east, north = aside
     ahead, behind = (level.weight(easting + s * east, northing + s * north) for s in (1, -1))
     rise = (ahead - behind) / (2 * GRADIENT_M)

@@ -1,4 +1,4 @@
-"""Meshes of tiles with several levels meet on joints, and on the borders of tiles."""
+"""Meshes of tiles with several levels meet on abutments, and on the borders of tiles."""
 
 from dataclasses import replace
 from functools import cache
@@ -18,11 +18,11 @@ PLACES = {
     "over a border": Crossing((60.0, 30.0)),
     "over a corner": Crossing((60.0, 60.0), angle=45.0),
     "acute": Crossing((61.0, 30.0), angle=83.0),
-    "joint on a border": Crossing((50.0, 30.0)),
-    "joint near a border": Crossing((53.0, 30.0)),
-    "joint crosses a border": Crossing((30.0, 59.0), width=8.0),
+    "abutment on a border": Crossing((50.0, 30.0)),
+    "abutment near a border": Crossing((53.0, 30.0)),
+    "abutment crosses a border": Crossing((30.0, 59.0), width=8.0),
     "side on a border": Crossing((30.0, 56.0)),
-    "tube": Crossing((58.0, 33.0), angle=20.0, number=-1),
+    "tunnel": Crossing((58.0, 33.0), angle=20.0, number=-1),
 }
 CASES = pytest.mark.parametrize("crossing", PLACES.values(), ids=PLACES.keys())
 
@@ -40,19 +40,19 @@ def absolute(mesh):
     return mesh.vertices + mesh.origin, mesh.faces
 
 
-def at_joints(mesh, level):
-    """Vertices on the joints: their place in plan and their height, as a GLB has it."""
-    near = shapely.dwithin(level.joints, shapely.points(mesh.vertices[:, :2] + mesh.origin[:2]), 0.02)
+def at_abutments(mesh, level):
+    """Vertices on the abutments: their place in plan and their height, as a GLB has it."""
+    near = shapely.dwithin(level.abutments, shapely.points(mesh.vertices[:, :2] + mesh.origin[:2]), 0.02)
     return {tuple(vertex) for vertex in mesh.vertices[near].astype(np.float32).tolist()}
 
 
 @CASES
-def test_levels_are_height_fields_with_common_vertices_on_joints(crossing):
+def test_levels_are_height_fields_with_common_vertices_on_abutments(crossing):
     number, level, count = crossing.number, crossing.level, 0
     for mesh in meshes(crossing):
         assert all(faults(mesh.at(k)) == () for k in mesh.numbers)
         if number in mesh.numbers:
-            of_ground, of_deck = (at_joints(mesh.at(k), level) for k in (0, number))
+            of_ground, of_deck = (at_abutments(mesh.at(k), level) for k in (0, number))
             assert of_ground == of_deck
             count += len(of_deck)
     assert count >= 4
@@ -75,20 +75,20 @@ def test_levels_have_no_open_edge_over_borders(crossing):
 
 
 @CASES
-def test_edges_of_deck_on_joints_are_edges_of_ground(crossing):
+def test_edges_of_deck_on_abutments_are_edges_of_ground(crossing):
     level = crossing.level
 
-    def edges_on_joints(mesh, most):
+    def edges_on_abutments(mesh, most):
         pairs = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
         pairs, uses = np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
         ends = mesh.vertices[pairs[uses <= most]] + mesh.origin
         middles = shapely.points(ends[..., :2].mean(axis=1))
-        on_joint = shapely.dwithin(level.joints, middles, 0.02)
-        return {frozenset(map(tuple, pair)) for pair in ends[on_joint].tolist()}
+        on_abutment = shapely.dwithin(level.abutments, middles, 0.02)
+        return {frozenset(map(tuple, pair)) for pair in ends[on_abutment].tolist()}
 
     parts = meshes(crossing)
-    ground = set().union(*(edges_on_joints(mesh.at(0), 2) for mesh in parts))
-    deck = set().union(*(edges_on_joints(mesh.at(crossing.number), 1) for mesh in parts))
+    ground = set().union(*(edges_on_abutments(mesh.at(0), 2) for mesh in parts))
+    deck = set().union(*(edges_on_abutments(mesh.at(crossing.number), 1) for mesh in parts))
     assert deck
     assert deck <= ground
 
@@ -103,7 +103,7 @@ def test_heights_of_meshes_are_those_of_levels():
     inside = shapely.intersects_xy(level.areas, x, y)
     np.testing.assert_array_equal(np.isfinite(deck), inside)
     np.testing.assert_allclose(deck[inside], (107 + RISE * (x - WEST))[inside], atol=0.003)
-    away = inside & ~shapely.dwithin(level.joints, shapely.points(x, y), 1.0)
+    away = inside & ~shapely.dwithin(level.abutments, shapely.points(x, y), 1.0)
     np.testing.assert_allclose(ground[away], GROUND_M, atol=0.003)
     assert (ground[inside] < deck[inside] - 0.05).all()
     assert mesh.road[mesh.level == 1].all()
@@ -123,7 +123,7 @@ def test_mesh_of_tile_far_from_decks_is_that_without_levels():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(30))
-def test_random_decks_and_tubes_meet_the_ground(seed):
+def test_random_decks_and_tunnels_meet_the_ground(seed):
     rng = np.random.default_rng(seed)
     crossing = Crossing(
         middle=tuple(rng.uniform(28, 92, 2)),
@@ -132,6 +132,6 @@ def test_random_decks_and_tubes_meet_the_ground(seed):
         width=rng.uniform(2.5, 14),
         number=int(rng.choice([1, -1, 2])),
     )
-    test_levels_are_height_fields_with_common_vertices_on_joints(crossing)
+    test_levels_are_height_fields_with_common_vertices_on_abutments(crossing)
     test_levels_have_no_open_edge_over_borders(crossing)
-    test_edges_of_deck_on_joints_are_edges_of_ground(crossing)
+    test_edges_of_deck_on_abutments_are_edges_of_ground(crossing)

@@ -85,7 +85,7 @@ def features(
 ) -> bytes:
     """Return the lines of one tile: its road and its terrain, or one of them if the other has no face.
 
-    A deck is a bridge, and a tube a tunnel, with the number of its level as attribute.
+    A deck is a bridge, and a tunnel a tunnel, with the number of its level as attribute.
 
     Vertices that round to the same millimetres are one vertex, and faces that two of them share are left out:
     they have no area.

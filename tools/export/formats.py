@@ -42,9 +42,7 @@ from flexroad.tools.export.source import Options, Source, TileItem, photographed
 MATERIALS = "materials.mtl"
 """Name of the file of materials that all OBJ files share."""
 BEYOND = "a part of the surface is beyond the survey (beyond_survey_m2)"
-OF_LEVEL_0 = (
-    "the surface is that of level 0, which within 20 m of the joints of decks and tubes is not the road's"
-)
+OF_LEVEL_0 = "the surface is that of level 0, which within 20 m of abutments is not the road's"
 CUT = "surface cut to the rectangle that the survey covers"
 NO_PHOTO = "no orthophoto, in plain colours"
 

@@ -145,10 +145,10 @@ def _mean(values: Any) -> float | None:
 def _arrays(along: Stations, unit: RouteUnit, work: Work) -> dict[str, Any]:
     easting, northing = work.frame.to_run(along.x, along.y)
     middle = along.middle_x, along.middle_y
-    error, support = unit.sampler.errors(*work.frame.to_run(*middle), unit.levels_on(*middle))
+    error, height_source = unit.sampler.errors(*work.frame.to_run(*middle), unit.levels_on(*middle))
     return {
         "points": np.column_stack([easting, northing, along.z]),
-        "support": support,
+        "height_source": height_source,
         "s_m": along.s[:-1],
         "height_m": along.height,
         "grade_percent": PERCENT * along.grade,
@@ -171,5 +171,5 @@ def _of_route(folder: Location, row: Row) -> Iterator[RoadLine]:
             own = {
                 name.removeprefix(prefix): arrays[name] for name in arrays.files if name.startswith(prefix)
             }
-            points, support = own.pop("points"), own.pop("support")
-            yield RoadLine(road, points, own, support)
+            points, height_source = own.pop("points"), own.pop("height_source")
+            yield RoadLine(road, points, own, height_source)

@@ -1,4 +1,4 @@
-"""Heights, normals, road and support of a run, each as one cloud-optimised GeoTIFF over all its tiles.
+"""Heights, normals, road and height source of a run, each as one cloud-optimised GeoTIFF over all its tiles.
 
 Cells are sampled from the surface at their centres. The values are collected in a temporary raster without
 compression, of which only the blocks with tiles exist, and copied to the final files when all tiles are
@@ -30,7 +30,7 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.levels.seen import top_mask, with_approaches
 from flexroad.tasks.products import cog
-from flexroad.tasks.quality.support import Support, top_support
+from flexroad.tasks.quality.height_source import HeightSource, top_height_source
 from flexroad.tasks.types import Bools, Floats, Surface
 from flexroad.tools.export.source import Options, Source
 
@@ -76,7 +76,7 @@ LAYERS = (
         "average",
     ),
     _Layer((replace(cog.ROAD, nodata=NO_ROAD),), "mode"),
-    _Layer((cog.SUPPORT,), "mode"),
+    _Layer((cog.HEIGHT_SOURCE,), "mode"),
 )
 
 
@@ -175,9 +175,9 @@ class _Shown:
     surface: Surface
     kept: Bools
     """Filtered road cells, on the grid of the tile's road mask."""
-    support: NDArray[np.uint8]
+    height_source: NDArray[np.uint8]
     level: int = 0
-    """A deck or tube; 0 if it is shown everywhere."""
+    """A deck or tunnel; 0 if it is shown everywhere."""
 
 
 def _shown(tile: FinishedTile, level: int | None) -> _Shown | None:
@@ -186,14 +186,14 @@ def _shown(tile: FinishedTile, level: int | None) -> _Shown | None:
     if level is None:
         core = tile.tile.grid
         top = surface.top(*np.meshgrid(core.eastings, core.northings))
-        return _Shown(surface.highest, top_mask(clusters), top_support(quality, top))
+        return _Shown(surface.highest, top_mask(clusters), top_height_source(quality, top))
     if level == 0:
-        return _Shown(surface, with_approaches(clusters).mask, quality.support)
+        return _Shown(surface, with_approaches(clusters).mask, quality.height_source)
     if level not in surface.numbers:
         return None
     (own,) = (own for own in clusters.levels if own.number == level)
-    support = dict(quality.levels)[level].support
-    return _Shown(surface.at(level), own.mask, support, level)
+    height_source = dict(quality.levels)[level].height_source
+    return _Shown(surface.at(level), own.mask, height_source, level)
 
 
 def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile, shown: _Shown) -> None:
@@ -203,11 +203,11 @@ def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile, shown: _Shown) 
         eastings, northings = part.eastings, part.northings
         outside = road.outside[_cells(road.grid, eastings, northings)]
         is_road = shown.kept[_cells(road.grid, eastings, northings)].astype(np.uint8)
-        support = shown.support[_cells(core, eastings, northings)]
+        height_source = shown.height_source[_cells(core, eastings, northings)]
         if shown.level:
             beyond = ~tile.surface.covers(shown.level, *np.meshgrid(eastings, northings))
             outside, is_road = outside | beyond, np.where(beyond, NO_ROAD, is_road)
-            support = np.where(beyond, Support.NONE, support)
+            height_source = np.where(beyond, HeightSource.NONE, height_source)
         heights = surface.lattice(eastings, northings)
         heights[outside] = np.nan
         normals = encoded_normals(surface.normal(eastings[None, :], northings[:, None]))
@@ -216,7 +216,7 @@ def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile, shown: _Shown) 
             heights.astype(np.float32)[None],
             normals,
             is_road.astype(np.uint8)[None],
-            support.astype(np.uint8)[None],
+            height_source.astype(np.uint8)[None],
         )
         window = rasterio.windows.Window(column, line, part.width, part.height)
         for raster, new in zip(rasters, values, strict=True):

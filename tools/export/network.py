@@ -49,7 +49,7 @@ class Network:
     """Number of road polygons that were left out."""
     notes: tuple[str, ...]
     levels: bool = False
-    """Whether the run has levels, and one of the roads is on a deck or in a tube."""
+    """Whether the run has levels, and one of the roads is on a deck or in a tunnel."""
 
 
 @lru_cache(maxsize=1)

@@ -37,7 +37,7 @@ COLOURS = {"road": (0.23, 0.23, 0.25), "terrain": (0.77, 0.745, 0.68)}
 def encode(mesh: Mesh, materials: str, place: Georeference, photo: Bounds | None = None) -> bytes:
     """Return a mesh as OBJ with a group and a material for road and for terrain.
 
-    Decks and tubes are groups ``level_1``, by the number of their level, with the material of roads.
+    Decks and tunnels are groups ``level_1``, by the number of their level, with the material of roads.
 
     Coordinates are rounded to 0.05 mm, texture coordinates to 5e-8 of the image. Faces are counter-clockwise
     from above. A class without faces has no group.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.vectors import vector_date
-from flexroad.tasks.quality.support import Support
+from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.types import Floats
 
 pyogrio = lazy("pyogrio")
@@ -28,8 +28,12 @@ ROADS, SEGMENTS = "roads", "segments"
 """Layers of the file."""
 BATCH = 50_000
 """Number of segments that are written at once."""
-SUPPORT = {Support.MEASURED: "measured", Support.DTM: "dtm", Support.INFERRED: "inferred"}
-"""Values of the column ``support``."""
+HEIGHT_SOURCE = {
+    HeightSource.MEASURED: "measured",
+    HeightSource.DTM: "dtm",
+    HeightSource.INFERRED: "inferred",
+}
+"""Values of the column ``height_source``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +46,8 @@ class RoadLine:
     """``(n + 1, 3)``: easting, northing, height (m)."""
     segments: Mapping[str, Floats]
     """Columns of the layer ``segments``, ``(n,)`` each."""
-    support: NDArray[np.uint8]
-    """Class of each segment by `Support`, ``(n,)``."""
+    height_source: NDArray[np.uint8]
+    """Class of each segment by `HeightSource`, ``(n,)``."""
 
 
 def write(path: Path, roads: Iterable[RoadLine], crs: str, date: datetime) -> None:
@@ -61,7 +65,7 @@ def write(path: Path, roads: Iterable[RoadLine], crs: str, date: datetime) -> No
     with vector_date(date):
         for road in roads:
             batch.append(road)
-            if sum(len(each.support) for each in batch) >= BATCH:
+            if sum(len(each.height_source) for each in batch) >= BATCH:
                 _append(path, batch, crs, new)
                 batch, new = [], False
         if batch:
@@ -78,10 +82,10 @@ def _append(path: Path, batch: list[RoadLine], crs: str, new: bool) -> None:
     pairs = np.concatenate([np.stack([road.points[:-1], road.points[1:]], axis=1) for road in batch])
     key = next(iter(columns))
     numbers = {name: np.concatenate([road.segments[name] for road in batch]) for name in batch[0].segments}
-    support = np.concatenate([road.support for road in batch])
-    names = np.array([SUPPORT.get(Support(kind)) for kind in range(len(Support))], object)
-    owner = np.repeat(_column(columns[key]), [len(road.support) for road in batch])
-    values = {f"road_{key}": owner, **numbers, "support": names[support]}
+    height_source = np.concatenate([road.height_source for road in batch])
+    names = np.array([HEIGHT_SOURCE.get(HeightSource(kind)) for kind in range(len(HeightSource))], object)
+    owner = np.repeat(_column(columns[key]), [len(road.height_source) for road in batch])
+    values = {f"road_{key}": owner, **numbers, "height_source": names[height_source]}
     _table(path, SEGMENTS, shapely.linestrings(pairs), values, crs, new)
 
 

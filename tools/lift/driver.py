@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds
 from flexroad.catalog.crs import in_plan, short
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.guard.refused import Refused, head
+from flexroad.catalog.guard.rejected import InputRejected, head
 from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import made_folder, output_file
@@ -358,7 +358,7 @@ def _explained(source: Path) -> Iterator[None]:
     """Name the file in errors of reading it."""
     try:
         yield
-    except (TaskError, Refused) as error:
+    except (TaskError, InputRejected) as error:
         raise ConfigError(f"{source} {error}") from error
 
 

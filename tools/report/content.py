@@ -63,8 +63,8 @@ ESTIMATES = {
     "dropped_road": "dropped (%)",
     "bounded_weights": "weights at bounds (%)",
 }
-SUPPORT = {"measured_road": "measured (%)", "dtm_road": "DTM (%)", "inferred_road": "inferred (%)"}
-"""Shares of the road by the support of the surface."""
+HEIGHT_SOURCE = {"measured_road": "measured (%)", "dtm_road": "DTM (%)", "inferred_road": "inferred (%)"}
+"""Shares of the road by the height source of the surface."""
 ESTIMATE_MEANING = (
     "The error estimate follows from what the surface leaves of the heights that it was fitted to, around "
     "each cell of the raw road mask, and from the scatter of the DSM that the filter kept. It estimates the "
@@ -75,15 +75,15 @@ DECKS = {
     "tile_id": "tile",
     "level": "level",
     "area_m2": "area (m²)",
-    "joints": "joints",
+    "abutments": "abutments",
     "clearance_m": "clearance (m)",
     "error_estimate_m": ESTIMATES["error_estimate_m"],
-    "measured_road": SUPPORT["measured_road"],
+    "measured_road": HEIGHT_SOURCE["measured_road"],
     "flags": "flags",
 }
-"""Columns of the table of decks and tubes."""
+"""Columns of the table of decks and tunnels."""
 DECKS_MEANING = (
-    "Levels above 0 are decks, levels below 0 tubes. Joints are the ends where a road of level 0 goes on, "
+    "Levels above 0 are decks, levels below 0 tunnels. Abutments are ends where a road of level 0 goes on, "
     "clearance is the median height between the level and level 0. docs/levels.md explains the flags."
 )
 HOLDOUT = "A second fit did without these squares of road (`assess.holdout`); 90% intervals hold 90% of them."
@@ -116,7 +116,7 @@ class Content:
     worst: pd.DataFrame
     """Tiles with the highest road L2 of the exported variant."""
     quality: pd.DataFrame
-    """Error estimates and support per variant, mean over tiles; empty if the run has none."""
+    """Error estimates and height source per variant, mean over tiles; empty if the run has none."""
     worst_estimates: pd.DataFrame
     """Tiles with the highest error estimate of the exported variant; needs no ground truth."""
     meshes: pd.DataFrame
@@ -134,7 +134,7 @@ class Content:
     results: Results = field(default_factory=dict)
     """Where the surfaces of the finished tiles are in the store."""
     levels: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """Decks and tubes of the exported variant; empty if no tile has some."""
+    """Decks and tunnels of the exported variant; empty if no tile has some."""
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
     """Second fits beside the squares withheld from them, per variant; empty if nothing was withheld."""
 
@@ -174,7 +174,7 @@ def gather(run: Run, track: Track = untracked) -> Content:
         strata=_per_stratum(done, variants),
         worst=_worst(done, exported),
         quality=over_tiles(done, variants),
-        levels=decks_and_tubes(of_levels, exported),
+        levels=decks_and_tunnels(of_levels, exported),
         held_out=held_out(done, variants),
         worst_estimates=highest_error_estimates(done, exported, WORST),
         meshes=mesh_checks(rows, run.config.chains),
@@ -280,14 +280,14 @@ def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
     """
     if not done["error_estimate_m"].notna().any():
         return pd.DataFrame()
-    table = done.groupby("variant")[[*ESTIMATES, *SUPPORT]].mean().reindex(variants)
+    table = done.groupby("variant")[[*ESTIMATES, *HEIGHT_SOURCE]].mean().reindex(variants)
     flagged = done["flags"].map(needs_look).groupby(done.variant).sum()
     table = _labelled(table)
     table.insert(0, "flagged tiles", flagged.reindex(variants))
     return table.reset_index().rename(columns={"variant": "method"})
 
 
-def decks_and_tubes(rows: list[dict[str, Any]], variant: str) -> pd.DataFrame:
+def decks_and_tunnels(rows: list[dict[str, Any]], variant: str) -> pd.DataFrame:
     """Return one row per tile and level of a variant, those with flags first; empty if there are none."""
     own = [row for row in rows if row["variant"] == variant]
     if not own:
@@ -321,7 +321,7 @@ def highest_error_estimates(done: pd.DataFrame, variant: str, most: int) -> pd.D
     table = done[(done.variant == variant) & done["error_estimate_m"].notna()].nlargest(
         most, "error_estimate_m"
     )
-    result = _labelled(table[[*ESTIMATES, *SUPPORT]])
+    result = _labelled(table[[*ESTIMATES, *HEIGHT_SOURCE]])
     result.insert(0, "tile", table.tile_id)
     places = table[["worst_easting", "worst_northing"]].itertuples(index=False)
     result["worst at (E / N)"] = [
@@ -332,6 +332,6 @@ def highest_error_estimates(done: pd.DataFrame, variant: str, most: int) -> pd.D
 
 def _labelled(table: pd.DataFrame) -> pd.DataFrame:
     """Rename columns to their labels, and convert shares to percent."""
-    names = ESTIMATES | SUPPORT
+    names = ESTIMATES | HEIGHT_SOURCE
     shares = [name for name in names if "%" in names[name]]
     return table.assign(**{name: 100 * table[name] for name in shares}).rename(columns=names)

@@ -33,9 +33,9 @@ from flexroad.tools.report.render import (
     error_map,
     estimate_picture,
     filter_picture,
+    height_source_picture,
     hillshade,
     log,
-    support_picture,
 )
 
 MOST = 24
@@ -105,7 +105,10 @@ def _maps(tile: FinishedTile) -> TilePictures:
             ("Error estimate along the road", estimate_picture(dsm, cells.estimate, raw, core, at)),
             ("DSM", hillshade(dsm, core)),
             ("Road mask: before and after the filter", filter_picture(dsm, raw, kept, core)),
-            ("Support of the surface along the road", support_picture(dsm, quality.support, raw, core)),
+            (
+                "Height source of the surface along the road",
+                height_source_picture(dsm, quality.height_source, raw, core),
+            ),
             (
                 f"{tile.variant} minus {against}",
                 error_map(drape(mesh, core) + mesh.origin[2] - truth, core, road=raw),

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flexroad.catalog import Grid
+from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.quality.places import Place
-from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Bools, Floats
 
 log = logging.getLogger(__name__)
@@ -77,16 +77,16 @@ def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid) -> bytes
     return _parts_picture(height, (("kept", kept, KEPT), ("dropped", raw & ~kept, DROPPED)), grid)
 
 
-def support_picture(height: Floats, support: NDArray[np.uint8], road: Bools, grid: Grid) -> bytes:
-    """Draw the support of the surface on road cells over the relief; the legend gives the areas.
+def height_source_picture(height: Floats, height_source: NDArray[np.uint8], road: Bools, grid: Grid) -> bytes:
+    """Draw the height source of the surface on road cells over the relief; the legend gives the areas.
 
     - `height`: the DSM (m), ``(H, W)``.
-    - `support`: class of each cell, a `flexroad.tasks.quality.support.Support`, ``(H, W)``.
+    - `height_source`: class of each cell, a `flexroad.tasks.quality.height_source.HeightSource`, ``(H, W)``.
     - `road`: road cells before the filter, ``(H, W)``.
     """
-    kinds = (Support.MEASURED, KEPT), (Support.DTM, BY_DTM), (Support.INFERRED, DROPPED)
-    names = {Support.MEASURED: "measured", Support.DTM: "DTM", Support.INFERRED: "inferred"}
-    parts = [(names[kind], road & (support == kind), colour) for kind, colour in kinds]
+    kinds = (HeightSource.MEASURED, KEPT), (HeightSource.DTM, BY_DTM), (HeightSource.INFERRED, DROPPED)
+    names = {HeightSource.MEASURED: "measured", HeightSource.DTM: "DTM", HeightSource.INFERRED: "inferred"}
+    parts = [(names[kind], road & (height_source == kind), colour) for kind, colour in kinds]
     return _parts_picture(height, parts, grid)
 
 

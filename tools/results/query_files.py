@@ -17,7 +17,7 @@ import shapely
 
 from flexroad.catalog.crs import in_plan, is_geographic, same, short
 from flexroad.catalog.guard.open_vector import ERRORS, encoding_note, in_its_encoding, vector_name
-from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.rejected import InputRejected
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import reason, shown
 from flexroad.pipeline.errors import ConfigError
@@ -175,7 +175,7 @@ def read_features(path: Path, given: str | None, layer: str | None) -> tuple[Any
             raise ConfigError(f"{path}: has the layers {', '.join(spatial)}; name one with --layer")
         read = partial(pyogrio.read_dataframe, file, layer=layer or spatial[0], force_2d=True)
         table, encoding = in_its_encoding(read)
-    except Refused as error:
+    except InputRejected as error:
         raise ConfigError(f"{path} {error}") from error
     except ERRORS as error:
         text = error.strerror if isinstance(error, OSError) and error.strerror else reason(error)

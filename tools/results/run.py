@@ -20,7 +20,7 @@ from flexroad.catalog.storage.paths import exists, read
 from flexroad.catalog.text import access_reason, count, with_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import has_borders
-from flexroad.pipeline.run.conductor import Workers, process, reopened
+from flexroad.pipeline.run.api import Workers, process, reopened
 from flexroad.pipeline.run.finished import FinishedTile, open_variant
 from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.points import Answer
@@ -160,7 +160,7 @@ class RunView:
             Eastings and northings (m) in the CRS of the tiles, of shapes that broadcast.
         level : int, optional
             The level of roads above roads (``segment.levels``): 0 is the ground with its streets, 1 a deck
-            above it, -1 a tube below it; NaN where there is none. By default the highest at each point.
+            above it, -1 a tunnel below it; NaN where there is none. By default the highest at each point.
 
         Returns
         -------
@@ -309,7 +309,7 @@ class RunView:
         ------
         ConfigError
             If there is no finished tile in the bounds, or the tiles have no common lattice: only the method
-            ``smoothing_spline`` fits one surface; or one of them has decks or tubes (``segment.levels``).
+            ``smoothing_spline`` fits one surface; or one of them has decks or tunnels (``segment.levels``).
 
         Examples
         --------

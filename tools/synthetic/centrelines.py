@@ -31,7 +31,7 @@ class CentreLine:
     highway: str
     """Class: a value of OSM's ``highway`` key."""
     level: int = 0
-    """Number of the level: above 0 on a deck, below 0 in a tube."""
+    """Number of the level: above 0 on a deck, below 0 in a tunnel."""
 
 
 def centre_lines(

@@ -37,7 +37,7 @@ def catalog_synthetic(
     dop: Annotated[bool, typer.Option("--dop", help="Also make orthophotos with pixels of 0.5 m.")] = False,
     decks: Annotated[
         bool,
-        typer.Option("--decks", help="Make roads on decks and in tubes, with the heights of both levels."),
+        typer.Option("--decks", help="Make roads on decks and in tunnels, with the heights of both levels."),
     ] = False,
 ) -> None:
     """Make synthetic scenes with known truth, and their catalog."""

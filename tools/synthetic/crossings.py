@@ -1,8 +1,8 @@
-"""Scenes of a main road that crosses other roads on decks and in tubes, with the true height of each level.
+"""Scenes of a main road that crosses other roads on decks and in tunnels, with the true height of each level.
 
 The main road is straight, along x in the plan's frame. Every `SPACING_M` another road crosses it. Level 0 is
-the ground with its roads, also below decks; level 1 is on decks, level -1 in tubes. Everything is a function
-of seed and absolute coordinates, so tiles join.
+the ground with its roads, also below decks; level 1 is on decks, level -1 in tunnels. Everything is a
+function of seed and absolute coordinates, so tiles join.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MAIN_M, CROSS_M = 4.0, 3.5
 DECK_M, CREST_M = 5.0, 5.5
 """Half widths of a deck and of an embankment's crest (m)."""
 TROUGH_M = 4.5
-"""Half width of the main road's cutting at a tube, between its walls (m)."""
+"""Half width of the main road's cutting at a tunnel, between its walls (m)."""
 REACH_M = 90.0
 """Length of a crossing road on either side of the main road (m)."""
 RAMP_M, LEVEL_M = 70.0, 12.0
@@ -72,8 +72,11 @@ class CrossingOptions(Options):
     slopes: float = Field(
         0.5, ge=0, le=1, description="fraction of the decks that end on slopes instead of walls"
     )
-    tubes: float = Field(
-        0.25, ge=0, le=1, description="fraction of the crossings at which the main road lies below, in a tube"
+    tunnels: float = Field(
+        0.25,
+        ge=0,
+        le=1,
+        description="fraction of the crossings at which the main road lies below, in a tunnel",
     )
     density: float = Field(1.0, ge=0, le=1, description="fraction of cars, trees and parapets that exist")
     dsm_noise_m: float = Field(0.04, ge=0, description="noise of the DSM (standard deviation, m)")
@@ -94,7 +97,7 @@ class _Crossing:
     clearance_m: float
     wall_m: float
     slopes: bool
-    tube: bool
+    tunnel: bool
 
     @property
     def along(self) -> float:
@@ -104,13 +107,13 @@ class _Crossing:
     @property
     def level(self) -> int:
         """Level of the main road there."""
-        return -1 if self.tube else 1
+        return -1 if self.tunnel else 1
 
     @property
     def half_length_m(self) -> float:
-        """Half length of the deck or tube."""
-        bank = self.clearance_m / SLOPE if self.slopes and not self.tube else 0.0
-        corner = (TROUGH_M if self.tube else DECK_M) * abs(math.sin(self.skew))
+        """Half length of the deck or tunnel."""
+        bank = self.clearance_m / SLOPE if self.slopes and not self.tunnel else 0.0
+        corner = (TROUGH_M if self.tunnel else DECK_M) * abs(math.sin(self.skew))
         return (CROSS_M + self.wall_m + bank + corner) / math.cos(self.skew)
 
     def across(self, s: Floats, v: Floats) -> tuple[Floats, Floats]:
@@ -157,7 +160,7 @@ class Crossings:
         return z
 
     def areas(self, level: int, bounds: Bounds) -> NDArray[np.object_]:
-        """Return the decks or tubes of a level near some bounds, as polygons, ``(n,)``."""
+        """Return the decks or tunnels of a level near some bounds, as polygons, ``(n,)``."""
         half = DECK_M if level > 0 else MAIN_M
         lines = [
             self._line(c, -c.half_length_m, c.half_length_m) for c in self._at(bounds) if c.level == level
@@ -168,7 +171,7 @@ class Crossings:
         return strips
 
     def roads(self, bounds: Bounds) -> list[CentreLine]:
-        """Return the roads near some bounds; the main road is cut at the ends of decks and tubes."""
+        """Return the roads near some bounds; the main road is cut at the ends of decks and tunnels."""
         lines = list[CentreLine]()
         for crossing in self._at(bounds):
             half, end = crossing.half_length_m, SPACING_M / 2
@@ -184,7 +187,7 @@ class Crossings:
         for crossing, near in self._near(s):
             inside, (t, u) = _inside(crossing, s, v), crossing.across(s, v)
             cross = (np.abs(u) <= CROSS_M) & (np.abs(t) <= REACH_M)
-            here = (road & ~inside) | cross if crossing.tube else road | (cross & ~inside)
+            here = (road & ~inside) | cross if crossing.tunnel else road | (cross & ~inside)
             road = np.where(near, here, road)
         return road
 
@@ -194,7 +197,7 @@ class Crossings:
         z = self.height(0, easting, northing)
         for crossing, near in self._near(s):
             hidden = near & (np.abs(v) < BESIDE_M) & (np.abs(s - crossing.along) < crossing.half_length_m + 1)
-            if not crossing.tube and hidden.any():
+            if not crossing.tunnel and hidden.any():
                 at, share = s[hidden], (v[hidden] + BESIDE_M) / (2 * BESIDE_M)
                 right, left = (
                     self._ground(crossing, at, np.full(at.shape, side)) for side in (-BESIDE_M, BESIDE_M)
@@ -209,7 +212,7 @@ class Crossings:
             rng = generator(self.seed, "crossing objects", crossing.number)
             cars += self._cars(crossing, rng)
             crowns += self._crowns(crossing, rng)
-            if not crossing.tube and self.options.density > 0:
+            if not crossing.tunnel and self.options.density > 0:
                 rails.append(self._rails(crossing))
         x, y, z = np.concatenate(rails, axis=1)
         return Objects((), tuple(crowns), tuple(cars), (), (), (), (), Trace(x, y, z), Trace.none())
@@ -233,8 +236,8 @@ class Crossings:
             rng.uniform(*options.wall_m),
             rng.random(),
         )
-        tube = math.floor((number + 1) * options.tubes) > math.floor(number * options.tubes)
-        return _Crossing(number, float(skew), float(clearance), float(wall), slopes < options.slopes, tube)
+        tunnel = math.floor((number + 1) * options.tunnels) > math.floor(number * options.tunnels)
+        return _Crossing(number, float(skew), float(clearance), float(wall), slopes < options.slopes, tunnel)
 
     def _along(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
         """Return coordinates along and across the main road (m)."""
@@ -282,7 +285,7 @@ class Crossings:
         z = terrain * (1 - weight) + low * weight
         inside = crossing.half_length_m - np.abs(s - crossing.along)
         top, aside = self._main(crossing, s, v), np.abs(v)
-        if crossing.tube:
+        if crossing.tunnel:
             cut = top + WALL * np.maximum(aside - TROUGH_M, 0)
             return np.where(inside > 0, z, np.maximum(np.minimum(z, cut), _embankment(top, aside)))
         z = np.where(inside > 0, z, np.minimum(z, top + SLOPE * np.maximum(aside - CREST_M, 0)))
@@ -306,13 +309,13 @@ class Crossings:
         return np.column_stack(self.plan.to_map(s + self._origin[0], v + self._origin[1]))
 
     def _cars(self, crossing: _Crossing, rng: np.random.Generator) -> Iterator[Car]:
-        """Yield cars on both roads, none below a deck or in a tube."""
+        """Yield cars on both roads, none below a deck or in a tunnel."""
         for main, reach in ((True, SPACING_M / 2), (False, REACH_M)):
             for along in np.arange(4 - reach, reach - 4, 23.0) + rng.uniform(0, 10):
                 lane, exists = 1.8 * rng.choice((-1, 1)), rng.random() < self.options.density
                 sin, cos = (1.0, 0.0) if main else (math.sin(crossing.skew), math.cos(crossing.skew))
                 s, v = crossing.along + along * sin + lane * cos, along * cos - lane * sin
-                hidden = _inside(crossing, np.array([s]), np.array([v]), 4.0)[0] and main == crossing.tube
+                hidden = _inside(crossing, np.array([s]), np.array([v]), 4.0)[0] and main == crossing.tunnel
                 if exists and not hidden:
                     x, y = s + self._origin[0], v + self._origin[1]
                     yield Car(float(x), float(y), math.atan2(cos, sin), 2.2, 0.9, 1.5, moving=False)
@@ -337,8 +340,8 @@ class Crossings:
 
 
 def _inside(crossing: _Crossing, s: Floats, v: Floats, margin_m: float = 0.0) -> Bools:
-    """Return which points, given along and across the main road, are on a deck or in a tube."""
-    half = (MAIN_M if crossing.tube else DECK_M) + margin_m
+    """Return which points, given along and across the main road, are on a deck or in a tunnel."""
+    half = (MAIN_M if crossing.tunnel else DECK_M) + margin_m
     return (np.abs(s - crossing.along) <= crossing.half_length_m + margin_m) & (np.abs(v) <= half)
 
 

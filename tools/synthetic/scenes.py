@@ -84,7 +84,7 @@ def write_scenes(
     - `size_m`: side of a tile (m); 250 if None. The size of a preset's tiles is fixed.
     - `dop`: whether to write orthophotos; the preset dsc3d always has them.
     - `preset`: one of `PRESETS`; None for a block of neighbouring tiles.
-    - `decks`: whether the block has roads on decks and in tubes (`tools.synthetic.crossings`).
+    - `decks`: whether the block has roads on decks and in tunnels (`tools.synthetic.crossings`).
     """
     if decks and (dop or preset):
         what = "--dop" if dop else f"--preset {preset}"
@@ -194,7 +194,7 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
 
 
 def _level_columns(lines: Sequence[CentreLine]) -> dict[str, list[Any]]:
-    """Return OSM's tags of decks and tubes, and the level as a number."""
+    """Return OSM's tags of decks and tunnels, and the level as a number."""
     return {
         "bridge": ["yes" if line.level > 0 else None for line in lines],
         "tunnel": ["yes" if line.level < 0 else None for line in lines],

@@ -34,7 +34,7 @@ from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.load import layer_source
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import glb
-from flexroad.tasks.quality.support import top_support
+from flexroad.tasks.quality.height_source import top_height_source
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.rasterise import DEFAULTS
 from flexroad.tasks.roads.rasterise import Options as RoadOptions
@@ -316,7 +316,7 @@ def piece(item: TileItem, look: Look) -> Piece:
         glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
         corners(source),
-        top_support(quality, top),
+        top_height_source(quality, top),
         dsm,
         dtm,
         estimate,

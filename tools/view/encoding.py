@@ -56,8 +56,8 @@ class TileScene:
     """The tile's core."""
     corners: Floats
     """Longitude and latitude of the corners, ``(4, 2)``: south-west, south-east, north-west, north-east."""
-    support: NDArray[np.uint8]
-    """The core's `tasks.quality.support.Support`, ``(H, W)``."""
+    height_source: NDArray[np.uint8]
+    """The core's `tasks.quality.height_source.HeightSource`, ``(H, W)``."""
     dsm: Floats | None = None
     """``(H, W)``, m; NaN where unknown; None if the source files cannot be read. So the next two."""
     dtm: Floats | None = None
@@ -75,7 +75,7 @@ def encode_tile(scene: TileScene) -> bytes:
     """Return the script of a tile. Equal inputs give equal bytes."""
     stride = max(1, -(-max(scene.grid.shape) // MOST_CELLS))
     thinned = slice(stride // 2, None, stride)
-    rows, cols = scene.support[thinned, thinned].shape
+    rows, cols = scene.height_source[thinned, thinned].shape
     shift = (stride // 2 + 0.5 - stride / 2) * scene.grid.cell
     west, north = scene.grid.west + shift, scene.grid.north - shift
     content = {
@@ -88,7 +88,7 @@ def encode_tile(scene: TileScene) -> bytes:
             "cols": cols,
         },
         "corners": np.round(scene.corners, 8).tolist(),
-        "support": _packed(scene.support[thinned, thinned].tobytes()),
+        "height_source": _packed(scene.height_source[thinned, thinned].tobytes()),
         "dsm": _heights(scene.dsm, thinned),
         "dtm": _heights(scene.dtm, thinned),
         "estimate": _estimate(scene.estimate, thinned),

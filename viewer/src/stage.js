@@ -218,7 +218,7 @@ export class Stage {
   }
 
   /**
-   * Returns the height of the surface at a place (m); null where no tile is loaded. With decks or tubes it is that
+   * Returns the height of the surface at a place (m); null where no tile is loaded. With decks or tunnels it is that
    * of what is seen from above, or of the level that is nearest to a height.
    */
   heightAt(easting, northing, near = null) {

@@ -84,7 +84,7 @@ export class TileObject {
     if (this.points) this.points.visible = points;
   }
 
-  /** The numbers of its levels: 0, and those of decks and tubes. */
+  /** The numbers of its levels: 0, and those of decks and tunnels. */
   get levels() {
     return [...new Set(Object.values(this.data.parts).map(({ level }) => level))];
   }

@@ -92,7 +92,7 @@ export class TileView {
     const colours = [
       { key: "class", label: "Class" },
       { key: "photo", label: "Photo", off: lacks(data?.photo, "orthophoto") },
-      { key: "support", label: "Support", off: lacks(data?.support, "support") },
+      { key: "support", label: "Height source", off: lacks(data?.support, "support") },
       { key: "estimate", label: "Error estimate", off: lacks(data?.estimate, "error estimate") },
     ];
     const layer = (name, label, off) => check(name, label, look[name], (on) => this.apply({ [name]: on }), off);
@@ -105,7 +105,7 @@ export class TileView {
         "Show",
         layer("road", "Road"),
         layer("terrain", "Terrain"),
-        this.run.levels ? layer("levels", "Decks and tubes") : null,
+        this.run.levels ? layer("levels", "Decks and tunnels") : null,
         layer("wire", "Wireframe"),
         layer("points", "Scan points (DSM)", lacks(data?.dsm, "scan to compare with")),
         look.points ? legend(POINTS) : null,

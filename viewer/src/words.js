@@ -20,9 +20,9 @@ const FLAGS = {
   dropped: "most of the road mask was dropped by the filter",
   weights: "many weights of the surface are at their limit",
   "no-road": "no road on this tile",
-  below: "a deck lies partly below the ground, or a tube above it",
+  below: "a deck lies partly below the ground, or a tunnel above it",
   "no-rise": "a deck hardly lies above the ground",
-  "no-joint": "at a deck no road of the ground goes on",
+  "no-abutment": "at a deck no road of the ground goes on",
 };
 
 const STATES = ["not computed", "done", "failed"];

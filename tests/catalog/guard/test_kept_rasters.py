@@ -12,7 +12,7 @@ from rasterio.errors import RasterioError
 
 from flexroad.catalog.guard import kept_rasters
 from flexroad.catalog.guard.kept_rasters import kept_raster
-from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.rejected import InputRejected
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_side_car_file_that_comes_later_is_read_and_checked(kept, tmp_path):
         assert not raster.read_masks(1).any()
     assert path not in kept.files
     (tmp_path / "a.tif.msk").write_text("<VRTDataset/>")
-    with pytest.raises(Refused, match="a.tif.msk"), kept_raster(path):
+    with pytest.raises(InputRejected, match="a.tif.msk"), kept_raster(path):
         pass
 
 

@@ -9,7 +9,7 @@ import pytest
 import rasterio
 
 from flexroad.catalog.guard.open_raster import open_raster
-from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.rejected import InputRejected
 from tests.make_rasters import UTM, write, write_xyz
 
 FLAT = np.full((32, 32), 7.0, np.float32)
@@ -32,7 +32,7 @@ def read(path):
 
 
 def check_refused(path, match):
-    with pytest.raises(Refused, match=match):
+    with pytest.raises(InputRejected, match=match):
         read(path)
 
 

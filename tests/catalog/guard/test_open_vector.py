@@ -15,7 +15,7 @@ from shapely import LineString
 
 from flexroad.catalog import CatalogError
 from flexroad.catalog.guard.open_vector import vector_name
-from flexroad.catalog.guard.refused import Refused
+from flexroad.catalog.guard.rejected import InputRejected
 from flexroad.catalog.scan.vectors import opened
 from tests.make_rasters import UTM
 
@@ -31,7 +31,7 @@ OSM = (
 
 def check_refused(path, content, match):
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(Refused, match=match):
+    with pytest.raises(InputRejected, match=match):
         vector_name(path)
     with pytest.raises(CatalogError, match=match):
         opened(path, UTM)
@@ -56,7 +56,9 @@ def test_damaged_part_of_shapefile_is_refused(tmp_path, part, damage):
     data = file.read_bytes()
     left = {"zeroed": data[:8] + bytes(len(data) - 8), "cut off": data[:-40], "empty": b""}[damage]
     file.write_bytes(left)
-    with pytest.raises(Refused, match=f"roads.{part} is shorter than its header says|is not a vector file"):
+    with pytest.raises(
+        InputRejected, match=f"roads.{part} is shorter than its header says|is not a vector file"
+    ):
         vector_name(path)
     file.write_bytes(data)
     assert len(pyogrio.read_dataframe(vector_name(path))) == 20
@@ -139,15 +141,15 @@ def test_json_of_another_format_asks_no_server(tmp_path, web):
 def test_only_regular_files_are_opened(tmp_path):
     pipe = tmp_path / "roads.gpkg"
     os.mkfifo(pipe)
-    with pytest.raises(Refused, match="is not a regular file"):
+    with pytest.raises(InputRejected, match="is not a regular file"):
         vector_name(pipe)
-    with pytest.raises(Refused, match="is not a regular file"):
+    with pytest.raises(InputRejected, match="is not a regular file"):
         vector_name(tmp_path)
     path = tmp_path / "roads.shp"
     geopandas.GeoDataFrame(geometry=[LineString([(0, 0), (9, 9)])], crs=UTM).to_file(path)
     path.with_suffix(".prj").unlink()
     os.mkfifo(path.with_suffix(".prj"))
-    with pytest.raises(Refused, match="has the part roads.prj, which is not a regular file"):
+    with pytest.raises(InputRejected, match="has the part roads.prj, which is not a regular file"):
         vector_name(path)
 
 
@@ -162,7 +164,7 @@ def test_part_is_no_link_to_another_folder(tmp_path, name, part):
     (path.parent / part).unlink(missing_ok=True)
     (tmp_path / part).write_bytes(b"secret")
     (path.parent / part).symlink_to(tmp_path / part)
-    with pytest.raises(Refused, match=f"has the part {part}, which is a link to another folder"):
+    with pytest.raises(InputRejected, match=f"has the part {part}, which is a link to another folder"):
         vector_name(path)
     # A folder of links to the files of another folder.
     (tmp_path / "links").mkdir()
@@ -174,7 +176,7 @@ def test_part_is_no_link_to_another_folder(tmp_path, name, part):
 def test_path_that_gdal_would_divide_is_refused(tmp_path):
     path = tmp_path / "a!b.geojson"
     path.write_text(json.dumps(ROADS))
-    with pytest.raises(Refused, match="rename it"):
+    with pytest.raises(InputRejected, match="rename it"):
         vector_name(path)
 
 
@@ -238,7 +240,7 @@ REFUSED = {
 @pytest.mark.parametrize(("queries", "why"), REFUSED.values(), ids=REFUSED)
 def test_view_that_may_not_end_is_refused_with_the_remedy(tmp_path, queries, why):
     path = with_view(tmp_path / "a#b.gpkg", *queries)
-    with pytest.raises(Refused) as error:
+    with pytest.raises(InputRejected) as error:
         vector_name(path)
     assert str(error.value) == f"has the view 'v', which {why}" + REMOVE.format(path)
     command = str(error.value).rpartition("remove it: ")[2].replace("python", sys.executable, 1)
@@ -278,7 +280,9 @@ def test_column_that_is_computed_when_it_is_read_is_refused_with_the_remedy(tmp_
     path = with_view(tmp_path / "a.gpkg", "CREATE VIEW v AS SELECT fid, geom FROM roads")
     with contextlib.closing(sqlite3.connect(path)) as file:
         file.execute("ALTER TABLE roads ADD COLUMN g TEXT AS (hex(zeroblob(400000000))) VIRTUAL")
-    with pytest.raises(Refused, match="has the computed column 'g', whose values may have no end") as error:
+    with pytest.raises(
+        InputRejected, match="has the computed column 'g', whose values may have no end"
+    ) as error:
         vector_name(path)
     command = str(error.value).rpartition("remove it: ")[2].replace("python", sys.executable, 1)
     subprocess.run(command, shell=True, check=True)
@@ -300,7 +304,7 @@ def test_more_features_than_stated_are_refused_with_the_remedy(tmp_path, kind):
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as file:
         file.execute(f"UPDATE {table} SET {column} = 2")
     with pytest.raises(
-        Refused, match="states 2 features of 'roads', which has 5; have them counted"
+        InputRejected, match="states 2 features of 'roads', which has 5; have them counted"
     ) as error:
         vector_name(path)
     command = str(error.value).rpartition("again: ")[2].replace("python", sys.executable, 1)
@@ -315,7 +319,7 @@ def test_geopackage_with_a_table_of_another_file_is_refused(tmp_path):
         statement = "CREATE VIRTUAL TABLE other USING VirtualOGR('/etc/secret.gpkg')"
         file.execute("INSERT INTO sqlite_master VALUES ('table', 'other', 'other', 0, ?)", (statement,))
         file.commit()
-    with pytest.raises(Refused, match="virtual table 'other', which may be made of another file"):
+    with pytest.raises(InputRejected, match="virtual table 'other', which may be made of another file"):
         vector_name(path)
 
 
@@ -338,7 +342,7 @@ def test_other_sqlite_files_are_refused(tmp_path):
     path = tmp_path / "roads.sqlite"
     with contextlib.closing(sqlite3.connect(path)) as file:
         file.execute("CREATE TABLE roads (w REAL)")
-    with pytest.raises(Refused, match="it is no GeoPackage, SpatiaLite"):
+    with pytest.raises(InputRejected, match="it is no GeoPackage, SpatiaLite"):
         vector_name(path)
 
 
@@ -355,7 +359,7 @@ def test_spatialite_with_a_table_of_another_file_is_refused(spatialite, statemen
         file.execute("PRAGMA writable_schema = ON")
         file.execute("INSERT INTO sqlite_master VALUES ('table', 'other', 'other', 0, ?)", (statement,))
         file.commit()
-    with pytest.raises(Refused, match="virtual table 'other', which may be made of another file"):
+    with pytest.raises(InputRejected, match="virtual table 'other', which may be made of another file"):
         vector_name(spatialite)
 
 
@@ -363,5 +367,5 @@ def test_spatialite_with_a_view_that_repeats_itself_is_refused(spatialite):
     with contextlib.closing(sqlite3.connect(spatialite)) as file:
         file.execute("CREATE VIEW v AS WITH r AS (SELECT 1 AS n UNION ALL SELECT n FROM r) SELECT * FROM r")
         file.commit()
-    with pytest.raises(Refused, match="the view 'v', which does not end"):
+    with pytest.raises(InputRejected, match="the view 'v', which does not end"):
         vector_name(spatialite)

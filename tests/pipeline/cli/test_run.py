@@ -185,7 +185,7 @@ def test_run_interrupted_ends_with_130_and_one_line(flexroad, nightly, monkeypat
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexroad.pipeline.run.conductor.run_tiles", interrupted)
+    monkeypatch.setattr("flexroad.pipeline.run.api.run_tiles", interrupted)
     said = flexroad(*nightly, expect=130)
     assert said.endswith("interrupted; the same command goes on from here\n")
 

@@ -18,7 +18,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from tests.whole_run import LIGHT
 
-RASTERS = ("height", "road", "support")
+RASTERS = ("height", "road", "height_source")
 
 
 @pytest.fixture(scope="module")

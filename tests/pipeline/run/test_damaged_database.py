@@ -14,7 +14,7 @@ import pytest
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.garbage import find_garbage
+from flexroad.pipeline.run.cleanup import find_garbage
 from flexroad.pipeline.run.lock import Owner
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import _failures, _rows, plan_run, run_tiles

@@ -20,14 +20,14 @@ from flexroad.catalog.grid import Grid
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.run.cleanup import find_garbage
 from flexroad.pipeline.run.finished import FinishedTile
-from flexroad.pipeline.run.garbage import find_garbage
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.products import npz
-from flexroad.tasks.quality.support import Support
+from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tools.synthetic.centrelines import MAIN, SIDE
 from flexroad.tools.synthetic.crossings import CROSS_M, MAIN_M, Crossings
@@ -160,16 +160,19 @@ def test_decks_have_figures_in_a_table_and_in_the_report(run):
         mesh = tiles[row.tile_id].mesh.at(1)
         area = shapely.area(shapely.polygons(mesh.vertices[mesh.faces][:, :, :2])).sum()
         assert row.area_m2 == pytest.approx(area, abs=0.5)
-    assert table.joints.sum() == 2
+    assert table.abutments.sum() == 2
     assert table.clearance_m.max() > 5
     assert table.error_estimate_m.max() < 0.05
     assert table["flags"].isna().all()
     call("report", run.path).expected(0)
     text = (run.path / "report.md").read_text()
-    assert "| tile | level | area (m²) | joints | clearance (m) |" in text.partition("## Decks and tubes")[2]
+    assert (
+        "| tile | level | area (m²) | abutments | clearance (m) |"
+        in text.partition("## Decks and tunnels")[2]
+    )
     call("report", run.path, "--format", "html").expected(0)
     page = (run.path / "report.html").read_text()
-    assert "<summary>Decks and tubes</summary>" in page
+    assert "<summary>Decks and tunnels</summary>" in page
     assert '"no-rise"' not in page
 
 
@@ -188,14 +191,14 @@ def test_viewer_has_heights_and_estimates_of_the_highest_level(run, tmp_path):
         at = np.meshgrid(tile.tile.grid.eastings, tile.tile.grid.northings)
         np.testing.assert_allclose(heights(made["top"], made["grid"]), view.height(*at), atol=1e-3)
         deck = np.isfinite(view.height(*at, 1))
-        (top, support), (low, _) = tile.top_errors, tile.cell_errors
+        (top, height_source), (low, _) = tile.top_errors, tile.cell_errors
         np.testing.assert_array_equal(top[~deck], low[~deck])
-        on_decks.append((top[deck], low[deck], support[deck]))
-    top, low, support = (np.concatenate(values) for values in zip(*on_decks, strict=True))
+        on_decks.append((top[deck], low[deck], height_source[deck]))
+    top, low, height_source = (np.concatenate(values) for values in zip(*on_decks, strict=True))
     assert len(top) > 100
     assert top.mean() < 0.05
     assert low.mean() > 0.2
-    assert (support == Support.MEASURED).mean() > 0.5
+    assert (height_source == HeightSource.MEASURED).mean() > 0.5
 
 
 @pytest.mark.slow
@@ -228,22 +231,22 @@ def test_rasters_show_the_highest_level_and_the_ground_below_decks(run, cells):
     with rasterio.open(run.path / "height.vrt") as top, rasterio.open(run.path / "height_level0.vrt") as low:
         np.testing.assert_allclose(top.read(1), view.height(x, y), atol=1e-4)
         np.testing.assert_allclose(low.read(1), view.height(x, y, 0), atol=1e-4)
-    with rasterio.open(run.path / "support.vrt") as file:
+    with rasterio.open(run.path / "height_source.vrt") as file:
         deck = file.read(1)[np.isfinite(view.height(x, y, 1))]
-    assert (deck == Support.MEASURED).mean() > 0.5
-    assert (deck != Support.NONE).all()
+    assert (deck == HeightSource.MEASURED).mean() > 0.5
+    assert (deck != HeightSource.NONE).all()
 
 
 def test_tiles_with_decks_alone_have_rasters_of_level_0(run):
     for tile in finished(run):
         item = json.loads((run.path / "tiles" / tile.id / "item.json").read_bytes())
         assert ("height_level0" in item["assets"]) == (1 in tile.mesh.numbers)
-        assert ("support_level0" in item["assets"]) == (1 in tile.mesh.numbers)
+        assert ("height_source_level0" in item["assets"]) == (1 in tile.mesh.numbers)
     assert "height_level0" in json.loads((run.path / "collection.json").read_bytes())["assets"]
     assert [waste.path.name for waste in find_garbage([run]) if waste.kind == "products"] == []
 
 
-def test_meshes_of_levels_meet_on_borders_and_joints(run):
+def test_meshes_of_levels_meet_on_borders_and_abutments(run):
     tiles = finished(run)
     inner_x, inner_y = max(t.tile.grid.west for t in tiles), min(t.tile.grid.north for t in tiles)
     for number in (0, 1):
@@ -255,15 +258,15 @@ def test_meshes_of_levels_meet_on_borders_and_joints(run):
     common = 0
     for tile in tiles:
         mesh, level = tile.mesh, tile.road.levels[0]
-        ground, deck = (on_joints(mesh.at(number), level) for number in (0, 1))
+        ground, deck = (on_abutments(mesh.at(number), level) for number in (0, 1))
         if 1 in mesh.numbers:
             assert ground == deck
             common += len(deck)
     assert common > 10
 
 
-def on_joints(mesh, level):
-    near = shapely.dwithin(level.joints, shapely.points(mesh.vertices[:, :2] + mesh.origin[:2]), 0.02)
+def on_abutments(mesh, level):
+    near = shapely.dwithin(level.abutments, shapely.points(mesh.vertices[:, :2] + mesh.origin[:2]), 0.02)
     return {tuple(vertex) for vertex in mesh.vertices[near].astype(np.float32).tolist()}
 
 
@@ -301,8 +304,8 @@ def test_mosaic_of_a_level_has_its_heights_alone(run, cells, level, tmp_path):
     with rasterio.open(tmp_path / "mosaic" / "road.tif") as file:
         road = file.read(1)
     assert ((road == 255) == ~known).all()
-    with rasterio.open(tmp_path / "mosaic" / "support.tif") as file:
-        assert ((file.read(1) == Support.NONE) == ~known).all()
+    with rasterio.open(tmp_path / "mosaic" / "height_source.tif") as file:
+        assert ((file.read(1) == HeightSource.NONE) == ~known).all()
     with rasterio.open(tmp_path / "mosaic" / "normal.tif") as file:
         assert ((file.read(3) == -32768) == ~known).all()
     if level == 1:
@@ -346,15 +349,15 @@ def test_lines_have_the_heights_of_their_level(along):
         if road.level:
             assert ((own.level == 1) == at).mean() > 0.98
             assert own.error_m[at].max() < 0.1
-            assert (own.support[at] == "measured").all()
+            assert (own.height_source[at] == "measured").all()
         else:
             assert np.abs(own.grade_percent[at]).max() < 2
             assert (own.level == 0).all()
-            assert (own.support[at] == "inferred").mean() > 0.5
+            assert (own.height_source[at] == "inferred").mean() > 0.5
         assert crossing.sum() > 5
 
 
-def test_grids_across_a_joint_are_on_the_deck(along):
+def test_grids_across_a_abutment_are_on_the_deck(along):
     """Bilinear interpolation between the nodes of a grid would show a fall of 7 m."""
     report = pd.read_csv(along / "crg" / "roads.csv")
     assert len(report) == 2
@@ -526,7 +529,7 @@ def test_networks_of_sumo_and_osm_have_the_level_of_each_road(run, tmp_path, kin
         else:
             below += np.isfinite(deck).sum()
             deck = np.full(on.sum(), np.nan)
-        # Beyond its joints a road on a deck is on the ground.
+        # Beyond its abutments a road on a deck is on the ground.
         np.testing.assert_allclose(z[on], np.where(np.isfinite(deck), deck, low), atol=0.006)
     assert min(decks, below) > 0
 

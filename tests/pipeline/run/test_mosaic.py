@@ -26,7 +26,7 @@ def done(made_survey, tmp_path_factory) -> Run:
     return run
 
 
-@pytest.mark.parametrize("name", ["height", "road", "support"])
+@pytest.mark.parametrize("name", ["height", "road", "height_source"])
 def test_mosaic_in_a_moved_run_has_the_cells_of_all_tiles(name, done, tmp_path):
     moved = shutil.copytree(done.path, tmp_path / "elsewhere")
     with rasterio.open(moved / f"{name}.vrt") as mosaic:
@@ -46,7 +46,7 @@ def test_mosaic_in_a_moved_run_has_the_cells_of_all_tiles(name, done, tmp_path):
 
 
 def test_mosaic_names_the_classes(done):
-    names = [category.text for category in ET.parse(done.path / "support.vrt").iter("Category")]
+    names = [category.text for category in ET.parse(done.path / "height_source.vrt").iter("Category")]
     assert names == ["outside", "measured", "dtm", "inferred"]
 
 
@@ -54,7 +54,7 @@ def test_each_mosaic_has_its_style_beside_it(done):
     """QGIS takes the style of the same name: heights as hillshade, classes with their meanings."""
     styles = {path.stem: ET.parse(path).find("pipe/rasterrenderer") for path in done.path.glob("*.qml")}
     assert {name: style.get("type") for name, style in styles.items()} == {
-        "height": "hillshade", "road": "paletted", "support": "paletted"
+        "height": "hillshade", "road": "paletted", "height_source": "paletted"
     }  # fmt: skip
     entries = {entry.get("value"): entry.get("label") for entry in styles["road"].iter("paletteEntry")}
     assert entries["1"] == "Road that the surface follows"
@@ -64,7 +64,7 @@ def test_each_mosaic_has_its_style_beside_it(done):
 def test_mosaic_of_some_tiles_has_nodata_elsewhere(done, tmp_path):
     moved = Run.open(shutil.copytree(done.path, tmp_path / "part"))
     tiles = [done.catalog.tiles[0], done.catalog.tiles[3]]
-    assert [kind.key for kind in write_mosaics(moved, tiles)] == ["height", "road", "support"]
+    assert [kind.key for kind in write_mosaics(moved, tiles)] == ["height", "road", "height_source"]
     with rasterio.open(moved.path / "height.vrt") as mosaic:
         assert np.isnan(mosaic.read(1)).mean() == 0.5
 

@@ -28,7 +28,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.graph import sources
 from flexroad.pipeline.graph.graph import Pattern
-from flexroad.pipeline.run.conductor import rerun_filter
+from flexroad.pipeline.run.api import rerun_filter
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles

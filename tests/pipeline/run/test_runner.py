@@ -16,7 +16,7 @@ from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.graph.graph import Pattern
-from flexroad.pipeline.run.conductor import rerun_filter
+from flexroad.pipeline.run.api import rerun_filter
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import summary
@@ -432,7 +432,7 @@ def test_item_is_valid_stac_with_checksums(run, executor):
     folder = run.folder(tile.id).path
     item = pystac.Item.from_file(str(folder / "item.json"))
     assert item.id == tile.id
-    assert set(item.assets) == {"mesh", "ply", "height", "road", "support", "surface"}
+    assert set(item.assets) == {"mesh", "ply", "height", "road", "height_source", "surface"}
     assert {path.name for path in folder.iterdir()} == {
         *(asset.href for asset in item.assets.values()),
         "item.json",

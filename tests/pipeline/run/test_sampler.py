@@ -31,7 +31,7 @@ def surface():
         (20, 34, 1, False, 100, STEP_M),  # farther away the deck's surface does not count
         (46, 24, 1, False, 100, STEP_M),  # where no road goes on from the deck
         (44, 24, 1, False, 107, 0),  # the deck is longer than its centre line
-        (35, 24, -1, True, np.nan, 0),  # a tube that was left out
+        (35, 24, -1, True, np.nan, 0),  # a tunnel that was left out
         (50, 24, -1, False, 100, STEP_M),
         (50, 24, 2, True, 100, STEP_M),  # no deck of this level is known
     ],

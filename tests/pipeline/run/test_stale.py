@@ -12,8 +12,8 @@ import flexroad as library
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run.cleanup import find_garbage
 from flexroad.pipeline.run.collection import write_states
-from flexroad.pipeline.run.garbage import find_garbage
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.sampler import RunSampler
@@ -105,7 +105,7 @@ def test_stale_products_are_used_by_nothing(run, tmp_path):
     text = (run.path / "collection.json").read_text()
     assert f"tiles/{other.id}/" in text
     assert f"tiles/{tile.id}/" not in text
-    for name in ("height.vrt", "road.vrt", "support.vrt"):
+    for name in ("height.vrt", "road.vrt", "height_source.vrt"):
         text = (run.path / name).read_text()
         assert (tile.id in text, other.id in text) == (False, True), name
     chosen = select(run.path)

@@ -35,15 +35,15 @@ def check_errors(survey, core, beside_m=BESIDE_M):
 @pytest.mark.parametrize("seed", [0, pytest.param(3, marks=pytest.mark.slow)])
 def test_levels_have_their_true_heights(tmp_path, seed):
     core = block(80)
-    check_errors(Survey.of(tmp_path, seed, core, tubes=0), core)
+    check_errors(Survey.of(tmp_path, seed, core, tunnels=0), core)
 
 
 @pytest.mark.parametrize("seed", [5, pytest.param(1, marks=pytest.mark.slow)])
-def test_tube_has_its_true_height(tmp_path, seed):
+def test_tunnel_has_its_true_height(tmp_path, seed):
     core = block(80)
-    survey = Survey.of(tmp_path, seed, core, tubes=1)
+    survey = Survey.of(tmp_path, seed, core, tunnels=1)
     errors, before = survey.errors(survey.tile(core)), survey.errors(survey.tile(core, levels=False))
-    assert errors["tube"] <= UNDER_M
+    assert errors["tunnel"] <= UNDER_M
     assert errors["near"] <= UNDER_M
     assert errors["approach"] <= 0.03
     assert errors["other"] <= before["other"] + 0.001
@@ -65,7 +65,7 @@ def border_heights(result, number, x, y):
 
 
 def check_borders(survey, core):
-    """Check that the levels of neighbours meet, and return the number of points on decks or tubes."""
+    """Check that the levels of neighbours meet, and return the number of points on decks or tunnels."""
     tiles = quarters(core)
     results = {key: survey.tile(tile) for key, tile in tiles.items()}
     along = np.random.default_rng(1).uniform(0, core.width / 2, 500)
@@ -96,10 +96,10 @@ def check_borders(survey, core):
     return on_levels
 
 
-@pytest.mark.parametrize("tubes", [0, 1])
-def test_neighbours_meet_on_every_level(tmp_path, tubes):
+@pytest.mark.parametrize("tunnels", [0, 1])
+def test_neighbours_meet_on_every_level(tmp_path, tunnels):
     core = block(100)
-    assert check_borders(Survey.of(tmp_path, 2, core, tubes=tubes), core) > 0
+    assert check_borders(Survey.of(tmp_path, 2, core, tunnels=tunnels), core) > 0
 
 
 @pytest.mark.slow
@@ -107,24 +107,24 @@ def test_neighbours_meet_on_every_level(tmp_path, tubes):
 @pytest.mark.parametrize("seed", range(50))
 def test_random_crossings_have_their_true_heights_and_meet(tmp_path, seed):
     core = block(100)
-    survey = Survey.of(tmp_path, seed, core, tubes=0)
+    survey = Survey.of(tmp_path, seed, core, tunnels=0)
     check_errors(survey, core)
     check_borders(survey, core)
 
 
-def test_tile_neighbour_and_edge_find_the_same_joints(tmp_path):
+def test_tile_neighbour_and_edge_find_the_same_abutments(tmp_path):
     core = block(100)
-    survey = Survey.of(tmp_path, 0, core, tubes=0)
+    survey = Survey.of(tmp_path, 0, core, tunnels=0)
     levels = [level for tile in (core, *quarters(core).values()) for level in survey.tile(tile).road.levels]
     assert len(levels) == 5
-    joints, *others = (shapely.normalize(level.joints) for level in levels)
-    assert len(joints.geoms) == 2
-    assert all(shapely.equals_exact(joints, other) for other in others)
+    abutments, *others = (shapely.normalize(level.abutments) for level in levels)
+    assert len(abutments.geoms) == 2
+    assert all(shapely.equals_exact(abutments, other) for other in others)
 
 
 def test_tile_without_decks_has_the_bytes_of_one_without_the_option(tmp_path):
     core = block(60)
-    survey = Survey.of(tmp_path, 0, core, lambda lines: [replace(line, level=0) for line in lines], tubes=0)
+    survey = Survey.of(tmp_path, 0, core, lambda lines: [replace(line, level=0) for line in lines], tunnels=0)
     with_option, without = survey.tile(core), survey.tile(core, levels=False)
     assert with_option.road.mask.any()
     for name in ("road", "clusters", "surface"):
@@ -134,7 +134,7 @@ def test_tile_without_decks_has_the_bytes_of_one_without_the_option(tmp_path):
 
 def test_levels_see_their_own_heights(tmp_path):
     core = block(80)
-    survey = Survey.of(tmp_path, 0, core, tubes=0)
+    survey = Survey.of(tmp_path, 0, core, tunnels=0)
     result = survey.tile(core)
     (level,) = result.road.levels
     grid = result.data.grid
@@ -153,7 +153,7 @@ def test_levels_see_their_own_heights(tmp_path):
 
 def test_raster_of_a_level_is_made_once_and_kept_without_empty_cells(tmp_path, monkeypatch):
     core = block(80)
-    result = Survey.of(tmp_path, 0, core, tubes=0).tile(core)
+    result = Survey.of(tmp_path, 0, core, tunnels=0).tile(core)
     (level,) = result.road.levels
     made = Counter()
     monkeypatch.setattr(

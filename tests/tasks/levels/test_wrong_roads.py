@@ -9,15 +9,15 @@ from scipy.ndimage import binary_dilation
 
 from flexroad.tasks.metrics.mesh_check import faults
 from flexroad.tasks.quality.assess import Options, assess
+from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.quality.structures import NO_RISE
-from flexroad.tasks.quality.support import Support
 from flexroad.tasks.sample import Options as SampleOptions
 from flexroad.tasks.sample import sample
 from tests.make_crossings import Survey, block
 
 
 def changed(width=1.0, shift=0.0, ends=0.0, gap=0.0):
-    """Return a change of the main road: its width (share), place across, and lengths at its joints (m)."""
+    """Return a change of the main road: its width (share), place across, and lengths at its abutments (m)."""
 
     def change(lines):
         result = []
@@ -62,7 +62,7 @@ def _deck_heights(survey):
 )
 def test_wrong_polygons_keep_heights(tmp_path, change, deck, approach):
     core = block(80)
-    survey = Survey.of(tmp_path, 0, core, changed(**change), tubes=0)
+    survey = Survey.of(tmp_path, 0, core, changed(**change), tunnels=0)
     result = survey.tile(core)
     errors = survey.errors(result)
     assert errors["deck"] <= deck
@@ -70,14 +70,14 @@ def test_wrong_polygons_keep_heights(tmp_path, change, deck, approach):
     assert errors["near"] <= 0.06
     assert errors["approach"] <= approach
     (level,) = result.road.levels
-    assert len(level.joints.geoms) == 2
+    assert len(level.abutments.geoms) == 2
 
 
 def test_gap_beyond_reach_is_noted_and_ends_the_ground_by_itself(tmp_path):
     core = block(80)
-    survey = Survey.of(tmp_path, 0, core, changed(gap=2.5), tubes=0)
+    survey = Survey.of(tmp_path, 0, core, changed(gap=2.5), tunnels=0)
     result = survey.tile(core)
-    assert any("without a joint" in note for note in result.road.notes)
+    assert any("without an abutment" in note for note in result.road.notes)
     assert survey.errors(result)["deck"] <= 0.03
 
 
@@ -102,12 +102,12 @@ def test_deck_drawn_on_the_ground_is_flagged_and_keeps_the_road(tmp_path):
         return result
 
     core = block(80)
-    survey = Survey.of(tmp_path, 0, core, change, tubes=0)
+    survey = Survey.of(tmp_path, 0, core, change, tunnels=0)
     result = survey.tile(core)
     own, deck = quality_of(result)
     assert NO_RISE in own.flags
     assert NO_RISE in deck.flags
-    assert deck.structures.joints > 0
+    assert deck.structures.abutments > 0
     x, y = np.meshgrid(core.eastings, core.northings)
     off = result.surface.at(1).height(x, y) - survey.world.height(0, x, y)
     assert np.abs(off[result.road.levels[0].covers(x, y)]).mean() <= 0.02
@@ -115,10 +115,10 @@ def test_deck_drawn_on_the_ground_is_flagged_and_keeps_the_road(tmp_path):
 
 @pytest.mark.parametrize("beyond", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_deck_at_the_rim_of_the_survey_ends_there(tmp_path, beyond):
-    """The survey ends so far (m) beyond a joint."""
+    """The survey ends so far (m) beyond an abutment."""
     core = block(80)
-    survey = Survey.of(tmp_path, 0, core, tubes=0)
-    ends = [line.centroid for line in shapely.get_parts(survey.tile(core).road.levels[0].joints)]
+    survey = Survey.of(tmp_path, 0, core, tunnels=0)
+    ends = [line.centroid for line in shapely.get_parts(survey.tile(core).road.levels[0].abutments)]
     (x, y), (east, north) = (np.array(end.coords[0]) for end in ends)
     at = np.meshgrid(survey.data.grid.eastings, survey.data.grid.northings)
     gone = (at[0] - x) * (x - east) + (at[1] - y) * (y - north) > beyond * np.hypot(x - east, y - north)
@@ -135,7 +135,7 @@ def test_deck_at_the_rim_of_the_survey_ends_there(tmp_path, beyond):
 @pytest.mark.parametrize("dtm", ["with decks", "unknown below decks"])
 def test_terrain_models_tell_nothing_of_the_ground_below_decks(tmp_path, dtm):
     core = block(80)
-    survey = Survey.of(tmp_path, 0, core, tubes=0)
+    survey = Survey.of(tmp_path, 0, core, tunnels=0)
     decks = binary_dilation(np.isfinite(_deck_heights(survey)))
     heights = survey.data.dsm if dtm == "with decks" else np.nan
     data = replace(survey.data, dtm=np.where(decks, heights, survey.data.dtm))
@@ -148,7 +148,7 @@ def test_terrain_models_tell_nothing_of_the_ground_below_decks(tmp_path, dtm):
 @pytest.mark.slow
 def test_deck_without_any_height_follows_its_approaches(tmp_path):
     core = block(80)
-    survey = Survey.of(tmp_path, 1, core, tubes=0)
+    survey = Survey.of(tmp_path, 1, core, tunnels=0)
     decks = np.isfinite(_deck_heights(survey))
     data = replace(survey.data, dsm=np.where(decks, np.nan, survey.data.dsm))
     survey = replace(survey, data=data, parts={})
@@ -158,14 +158,18 @@ def test_deck_without_any_height_follows_its_approaches(tmp_path):
     assert errors["under"] <= 0.06
     deck = quality_of(result)[1]
     assert deck.inferred_road > 0.9
-    assert set(np.unique(deck.support)) <= {Support.NONE, Support.INFERRED, Support.MEASURED}
+    assert set(np.unique(deck.height_source)) <= {
+        HeightSource.NONE,
+        HeightSource.INFERRED,
+        HeightSource.MEASURED,
+    }
 
 
 @pytest.mark.slow
 def test_layer_of_decks_gives_the_deck_its_height(tmp_path):
     """Where crowns hide it."""
     core = block(80)
-    survey = Survey.of(tmp_path, 0, core, tubes=0)
+    survey = Survey.of(tmp_path, 0, core, tunnels=0)
     deck = _deck_heights(survey)
     hidden = np.where(
         np.isfinite(deck), deck + 6 + np.random.default_rng(1).random(deck.shape), survey.data.dsm

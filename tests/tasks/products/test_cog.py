@@ -11,7 +11,7 @@ from rio_cogeo import cog_validate
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.products import cog
-from flexroad.tasks.quality.support import Support
+from flexroad.tasks.quality.height_source import HeightSource
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 600, 250)
 
@@ -49,12 +49,14 @@ def test_encode_height_with_vertical_crs_has_compound_crs():
         assert raster.bounds == GRID.bounds
 
 
-@pytest.mark.parametrize("band", [cog.HEIGHT, cog.ROAD, cog.SUPPORT], ids=lambda band: band.name)
+@pytest.mark.parametrize("band", [cog.HEIGHT, cog.ROAD, cog.HEIGHT_SOURCE], ids=lambda band: band.name)
 def test_encoded_raster_declares_what_its_band_means(band):
     encoded = {
         "height": lambda: cog.encode_height(plane(GRID), GRID),
         "road": lambda: cog.encode_mask(plane(GRID) > 104, GRID),
-        "support": lambda: cog.encode_support(np.full(GRID.shape, Support.DTM, np.uint8), GRID),
+        "height_source": lambda: cog.encode_height_source(
+            np.full(GRID.shape, HeightSource.DTM, np.uint8), GRID
+        ),
     }[band.name]()
     with MemoryFile(encoded) as file, file.open() as raster:
         assert raster.dtypes == (band.dtype,)
@@ -109,7 +111,7 @@ def test_encode_block_is_as_large_as_a_small_raster(size, block, tmp_path):
         assert raster.block_shapes == [(block, block)]
 
 
-@pytest.mark.parametrize("band", [cog.ROAD, cog.SUPPORT], ids=["road", "support"])
+@pytest.mark.parametrize("band", [cog.ROAD, cog.HEIGHT_SOURCE], ids=["road", "height_source"])
 def test_encode_style_classes_have_the_names_and_colours_of_the_raster(band):
     renderer = ET.fromstring(cog.encode_style(band)).find("pipe/rasterrenderer")
     assert (renderer.attrib["type"], renderer.attrib["band"]) == ("paletted", "1")

@@ -16,7 +16,7 @@ def roof(crs: str = "EPSG:25832") -> Mesh:
     return Mesh(crs, (295500.0, 5629250.0, 150.0), vertices, faces, np.array([False, True, False]))
 
 
-SUPPORT = np.array([1, 2, 3], np.uint8)
+HEIGHT_SOURCE = np.array([1, 2, 3], np.uint8)
 
 
 def parse(data: bytes) -> tuple[list[str], np.ndarray, np.ndarray]:
@@ -40,25 +40,25 @@ def parse(data: bytes) -> tuple[list[str], np.ndarray, np.ndarray]:
 
 def test_encode_coordinates_are_absolute_and_exact():
     mesh = roof()
-    _, vertices, faces = parse(ply.encode(mesh, SUPPORT))
+    _, vertices, faces = parse(ply.encode(mesh, HEIGHT_SOURCE))
     truth = mesh.vertices + np.array(mesh.origin)
     for axis, name in enumerate("xyz"):
         np.testing.assert_array_equal(vertices[name], truth[:, axis])
     assert (faces["count"] == 3).all()
     np.testing.assert_array_equal(faces["vertex_indices"], mesh.faces)
     np.testing.assert_array_equal(faces["class"], [2, 11, 2])
-    np.testing.assert_array_equal(faces["support"], SUPPORT)
+    np.testing.assert_array_equal(faces["height_source"], HEIGHT_SOURCE)
 
 
-def test_encode_vertices_have_normals_class_and_support():
-    _, vertices, _ = parse(ply.encode(roof(), SUPPORT))
-    # The faces are (0, 1, 2), (0, 2, 3), which is road, and (3, 2, 4), with support 1, 2 and 3.
+def test_encode_vertices_have_normals_class_and_height_source():
+    _, vertices, _ = parse(ply.encode(roof(), HEIGHT_SOURCE))
+    # The faces are (0, 1, 2), (0, 2, 3), which is road, and (3, 2, 4), with height source 1, 2 and 3.
     np.testing.assert_array_equal(vertices["class"], [11, 2, 11, 11, 2])
-    np.testing.assert_array_equal(vertices["support"], [2, 1, 3, 3, 3])
+    np.testing.assert_array_equal(vertices["height_source"], [2, 1, 3, 3, 3])
     normals = np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
     up = np.tile([0.0, 0.0, 1.0], (5, 1))
-    given = parse(ply.encode(roof(), SUPPORT, up))[1]
+    given = parse(ply.encode(roof(), HEIGHT_SOURCE, up))[1]
     np.testing.assert_array_equal([given[name] for name in ("nx", "ny", "nz")], up.T)
     # Vertex 1 is a corner of the first face alone.
     a, b, c = roof().vertices[:3]
@@ -67,7 +67,7 @@ def test_encode_vertices_have_normals_class_and_support():
 
 
 def test_encode_header_has_crs_and_origin():
-    lines, _, _ = parse(ply.encode(roof(), SUPPORT))
+    lines, _, _ = parse(ply.encode(roof(), HEIGHT_SOURCE))
     assert lines[:4] == [
         "ply",
         "format binary_little_endian 1.0",
@@ -78,14 +78,14 @@ def test_encode_header_has_crs_and_origin():
 
 @pytest.mark.parametrize("crs", ['PROJCRS["a",\n  BASEGEOGCRS["b"]]', 'PROJCRS["Réunion"]'])
 def test_encode_wkt_is_one_ascii_line(crs):
-    lines, vertices, _ = parse(ply.encode(roof(crs), SUPPORT))
+    lines, vertices, _ = parse(ply.encode(roof(crs), HEIGHT_SOURCE))
     assert len([line for line in lines if line.startswith("comment crs PROJCRS")]) == 1
     assert len(vertices) == 5
 
 
 def test_encode_is_read_by_trimesh():
     mesh = roof()
-    read = trimesh.load_mesh(io.BytesIO(ply.encode(mesh, SUPPORT)), file_type="ply", process=False)
+    read = trimesh.load_mesh(io.BytesIO(ply.encode(mesh, HEIGHT_SOURCE)), file_type="ply", process=False)
     np.testing.assert_array_equal(read.vertices, mesh.vertices + np.array(mesh.origin))
     np.testing.assert_array_equal(read.faces, mesh.faces)
 
@@ -93,14 +93,14 @@ def test_encode_is_read_by_trimesh():
 def test_encode_is_read_by_vtk(tmp_path):
     mesh = roof()
     path = tmp_path / "mesh.ply"
-    path.write_bytes(ply.encode(mesh, SUPPORT))
+    path.write_bytes(ply.encode(mesh, HEIGHT_SOURCE))
     read = pyvista.read(path)
     np.testing.assert_array_equal(read.faces.reshape(-1, 4)[:, 1:], mesh.faces)
     np.testing.assert_allclose(read.points, mesh.vertices + np.array(mesh.origin), rtol=1e-7)
 
 
 def test_encode_equal_meshes_give_equal_bytes():
-    assert ply.encode(roof(), SUPPORT) == ply.encode(roof(), SUPPORT)
+    assert ply.encode(roof(), HEIGHT_SOURCE) == ply.encode(roof(), HEIGHT_SOURCE)
 
 
 def test_encode_faces_and_vertices_have_their_level():
@@ -112,4 +112,4 @@ def test_encode_faces_and_vertices_have_their_level():
     np.testing.assert_array_equal(vertices["level"][faces["vertex_indices"]], np.stack([mesh.level] * 3, 1))
     read = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
     np.testing.assert_array_equal(read.faces, mesh.faces)
-    assert "level" not in ply.encode(roof(), SUPPORT).split(b"end_header")[0].decode()
+    assert "level" not in ply.encode(roof(), HEIGHT_SOURCE).split(b"end_header")[0].decode()

@@ -10,7 +10,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import nurbs, plane, smoothing_spline
 from flexroad.tasks.quality.assess import NO_ROAD, Options, assess
 from flexroad.tasks.quality.estimate import FACTOR, LEAST_M
-from flexroad.tasks.quality.support import Support
+from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Quality, RoadClusters, RoadMask, TileData
 
@@ -23,7 +23,7 @@ NOISE = 0.05 * np.random.default_rng(4).standard_normal(GRID.shape)
 CROWN = STREET & (np.hypot(ROW - 55, COL - 60) < 9)
 DOME = 5 + np.random.default_rng(5).uniform(-2, 2, GRID.shape)
 FIT = nurbs.Options(control_points=(18, 16), weights="unit")
-OTHERS = ("flags", "flagged", "support", "levels", "structures", "bounded_weights")
+OTHERS = ("flags", "flagged", "height_source", "levels", "structures", "bounded_weights")
 FLOATS = [field.name for field in fields(Quality) if not field.name.startswith(("holdout", *OTHERS))]
 
 
@@ -122,7 +122,7 @@ def test_assess_missing_road_data_is_inferred():
     )
     assert {"inferred", "error-estimate"} <= set(quality.flags)
     assert quality.inferred_road == pytest.approx(gap.sum() / STREET.sum())
-    np.testing.assert_array_equal(quality.support == Support.INFERRED, gap)
+    np.testing.assert_array_equal(quality.height_source == HeightSource.INFERRED, gap)
     assert assessed(tile(), None, kept=STREET & (COL < 40)).flags == ("dropped",)
 
 
@@ -181,10 +181,10 @@ def test_assess_steps_beside_road_are_supported_and_no_steps_of_surface():
     road = RoadMask(GRID, GRID, STREET, NOWHERE)
     smooth, stepped = (assess(data, road, clusters, surface, Options()) for surface in surfaces)
     beside = verge & ~STREET
-    assert (smooth.support[beside] == Support.INFERRED).all()
-    assert (stepped.support[beside] != Support.INFERRED).all()
+    assert (smooth.height_source[beside] == HeightSource.INFERRED).all()
+    assert (stepped.height_source[beside] != HeightSource.INFERRED).all()
     assert stepped.edge_step_m == smooth.edge_step_m
-    np.testing.assert_array_equal(stepped.support[STREET], smooth.support[STREET])
+    np.testing.assert_array_equal(stepped.height_source[STREET], smooth.height_source[STREET])
 
 
 def test_assess_ignores_reference():

@@ -11,8 +11,8 @@ from flexroad.catalog.grid import Grid
 from flexroad.pipeline.store import codec
 from flexroad.tasks.quality.assess import Options, assess, cell_errors
 from flexroad.tasks.quality.estimate import compare
-from flexroad.tasks.quality.structures import BELOW, NO_JOINT, NO_RISE, structures
-from flexroad.tasks.quality.support import Support
+from flexroad.tasks.quality.height_source import HeightSource
+from flexroad.tasks.quality.structures import BELOW, NO_ABUTMENT, NO_RISE, structures
 from flexroad.tasks.types import Level, RoadClusters, RoadMask, Structures, TileData
 from tests.tasks.spline.test_levelled import GRID, LEVEL, SOUTH, WEST, made_surface
 
@@ -40,16 +40,16 @@ def test_figures_of_deck(rise, crossed, flags):
     assert raised == flags
 
 
-def test_tube_is_below_the_ground():
+def test_tunnel_is_below_the_ground():
     found, raised = of_plane(-5.0, replace(LEVEL, number=-1))
     assert (found.clearance_m, found.crossed, raised) == (pytest.approx(5, abs=1e-9), 0, ())
 
 
-@pytest.mark.parametrize(("east", "flags"), [(45, (NO_JOINT,)), (60, ())])
-def test_deck_without_joint_is_flagged_if_its_ends_are_known(east, flags):
+@pytest.mark.parametrize(("east", "flags"), [(45, (NO_ABUTMENT,)), (60, ())])
+def test_deck_without_abutment_is_flagged_if_its_ends_are_known(east, flags):
     deck = shapely.multipolygons([shapely.box(WEST + 25, SOUTH + 20, WEST + east, SOUTH + 28)])
     found, raised = of_plane(7.0, Level(1, deck, shapely.MultiLineString(), shapely.MultiPolygon()))
-    assert (found.joints, raised) == (0, flags)
+    assert (found.abutments, raised) == (0, flags)
 
 
 def test_deck_beside_the_core_has_no_figures():
@@ -76,9 +76,11 @@ def test_flags_of_decks_are_those_of_the_tile_and_results_keep_them():
     assert codec.decode(codec.encode(quality, {})).value.levels[0][1].structures == own[1].structures
 
 
-@pytest.mark.parametrize(("number", "support"), [(1, Support.MEASURED), (-1, Support.INFERRED)])
-def test_heights_in_tubes_are_inferred_and_those_of_decks_measured(number, support):
-    """The DSM of a tube is made from its approaches."""
+@pytest.mark.parametrize(
+    ("number", "height_source"), [(1, HeightSource.MEASURED), (-1, HeightSource.INFERRED)]
+)
+def test_heights_in_tunnels_are_inferred_and_those_of_decks_measured(number, height_source):
+    """The DSM of a tunnel is made from its approaches."""
     level = replace(LEVEL, number=number)
     surface = made_surface(100.0, 107.0)
     surface = replace(surface, levels=(replace(surface.levels[0], level=level),))
@@ -91,10 +93,10 @@ def test_heights_in_tubes_are_inferred_and_those_of_decks_measured(number, suppo
     clusters = RoadClusters(GRID, NOWHERE.astype(np.int32), levels=(own,))
     inputs = data, road(level), clusters, surface, Options()
     error, classes = cell_errors(*inputs, number)
-    assert (classes[covered] == support).all()
-    assert (classes[~covered] == Support.NONE).all()
+    assert (classes[covered] == height_source).all()
+    assert (classes[~covered] == HeightSource.NONE).all()
     assert np.isfinite(error[covered]).all()
-    np.testing.assert_array_equal(assess(*inputs).levels[0][1].support, classes)
+    np.testing.assert_array_equal(assess(*inputs).levels[0][1].height_source, classes)
 
 
 @pytest.mark.parametrize(("width", "doubtful"), [(8, False), (44, False), (60, True)])
@@ -119,8 +121,8 @@ def test_street_below_a_deck_is_inferred_but_in_doubt_only_if_it_is_long(width, 
 
 
 @pytest.mark.parametrize("number", [1, -1])
-def test_road_that_goes_on_as_deck_or_tube_has_no_step_at_its_end(number):
-    """The ground below the deck lies 7 m lower, and that above the tube 7 m higher."""
+def test_road_that_goes_on_as_deck_or_tunnel_has_no_step_at_its_end(number):
+    """The ground below the deck lies 7 m lower, and that above the tunnel 7 m higher."""
     level = replace(LEVEL, number=number)
     on_deck = level.covers(*np.meshgrid(GRID.eastings, GRID.northings))
     approach = np.zeros(GRID.shape, np.bool_)

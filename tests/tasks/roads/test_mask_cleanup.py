@@ -101,7 +101,7 @@ def test_pieces_at_grid_edge_are_kept():
 def test_clean_closes_gaps_before_dropping_pieces():
     mask = np.zeros((40, 60), bool)
     mask[18:22, 5:55] = True
-    mask[:, 10::6] = False  # joints of one metre
+    mask[:, 10::6] = False  # abutments of one metre
     data = tile(mask.shape)
     assert not drop(mask, 1.0, 25).any()
     whole = clean(mask, data, "pieces")

@@ -38,11 +38,11 @@ def test_line_is_buffered_to_its_width_with_flat_ends(tmp_path):
 @settings(max_examples=30)
 @given(turn=st.floats(-2.5, 2.5), wide=st.floats(2, 20), narrow=st.floats(2, 20))
 def test_joined_lines_leave_no_wedge(tmp_path_factory, turn, wide, narrow):
-    """Everything within the narrower half width of the joint is road, nothing beyond the round buffers."""
+    """Everything within the narrower half width of the abutment is road, nothing beyond the round buffers."""
     middle = (50.0, 50.0)
     far = (50 + 40 * np.cos(turn), 50 + 40 * np.sin(turn))
     lines = [LineString(on_grid((10, 50), middle)), LineString(on_grid(middle, far))]
-    path = tmp_path_factory.mktemp("joint") / "r.geojson"
+    path = tmp_path_factory.mktemp("abutment") / "r.geojson"
     write(path, lines, width_m=[wide, narrow])
     result = shapely.union_all(roads(tile(path).roads, GRID, Options()).areas)
     disc = Point(*on_grid(middle)[0]).buffer(min(wide, narrow) / 2, quad_segs=8)
@@ -124,7 +124,7 @@ def test_bridges_are_road_and_flagged(tmp_path):
     assert kept(cells(result.areas, GRID), 6) == [True] * 6
 
 
-def test_joint_of_bridges_only_is_bridge(tmp_path):
+def test_abutment_of_bridges_only_is_bridge(tmp_path):
     lines = [LineString(on_grid((10 + 20 * i, 50), (30 + 20 * i, 50))) for i in range(3)]
     path = write(tmp_path / "r.gpkg", lines, width=[6] * 3, bridge=["no", "yes", "yes"])
     result = roads(tile(path).roads, GRID, Options())
@@ -250,7 +250,7 @@ def test_levels_of_roads_are_read_if_they_are_wanted(tmp_path):
     lines = [LineString(on_grid((5, 20 + 20 * i), (95, 20 + 20 * i))) for i in range(3)]
     path = write(tmp_path / "r.gpkg", lines, width=[6] * 3, **values)
     assert roads(tile(path).roads, GRID, Options()).level.tolist() == [0, 0]
-    # A tube is a road then, whatever the option for tunnels says.
+    # A tunnel is a road then, whatever the option for tunnels says.
     assert roads(tile(path).roads, GRID, Options(), levels=True).level.tolist() == [1, -1, 0]
 
 

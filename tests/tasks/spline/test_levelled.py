@@ -1,4 +1,4 @@
-"""The surfaces of several levels: weights beside joints, heights, slopes, and the copy in a store."""
+"""The surfaces of several levels: weights beside abutments, heights, slopes, and the copy in a store."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ LEVEL = Level(
     shapely.multilinestrings([shapely.LineString([(WEST + 25, SOUTH + 28), (WEST + 25, SOUTH + 20)])]),
     shapely.multipolygons([shapely.box(WEST + 9, SOUTH + 20, WEST + 25, SOUTH + 28)]),
 )
-"""A deck of 20 m with one joint, in the west, and its approach."""
+"""A deck of 20 m with one abutment, in the west, and its approach."""
 
 
 def made_surface(own=100.0, deck=107.0, slope=0.0):
@@ -39,7 +39,7 @@ def made_surface(own=100.0, deck=107.0, slope=0.0):
     ("x", "y", "expected"),
     [
         (20, 24, 1.0),  # on the approach
-        (25, 24, 1.0),  # on the joint
+        (25, 24, 1.0),  # on the abutment
         (25.01, 24, 0.0),  # below the deck
         (7, 24, 0.5),  # behind the approach
         (4.9, 24, 0.0),
@@ -63,7 +63,7 @@ def test_height_is_that_of_ground_with_approaches():
     assert surface.numbers == (0, 1)
 
 
-def test_surfaces_meet_on_joint():
+def test_surfaces_meet_on_abutment():
     surface = made_surface(slope=0.03)
     x, y = np.full(9, WEST + 25.0), SOUTH + np.linspace(20, 28, 9)
     np.testing.assert_array_equal(surface.height(x, y), surface.at(1).height(x, y))

@@ -37,7 +37,7 @@ def test_deck_whose_road_does_not_go_on_may_be_a_roof(road, ends):
 
 @pytest.mark.parametrize("step", [0.3, 1.3])
 def test_end_has_the_height_of_the_deck(step):
-    """A step of 0.3 m is that of a joint; with 1.3 m it is another road."""
+    """A step of 0.3 m is that of an abutment; with 1.3 m it is another road."""
     lower = np.where(COL >= 60, GROUND - step, GROUND)
     (deck,) = decks(dsm=lower, dtm=np.where(SPAN, GROUND - 6, lower))
     assert deck.ends == (2 if step < 0.5 else 1)
@@ -78,9 +78,9 @@ def test_cells_of_half_a_metre():
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_decks_of_crossings_are_found_and_tubes_are_not(seed):
+def test_decks_of_crossings_are_found_and_tunnels_are_not(seed):
     grid = Grid("EPSG:25832", 499_980, 5_600_100, 1.0, 120, 120)
-    options = CrossingOptions(tubes=0)
+    options = CrossingOptions(tunnels=0)
     scene = make_crossings(grid, seed, options)
     (deck,) = likely_decks(scene.dsm, scene.dtm, scene.road_mask, grid)
     areas = Crossings(seed, options).areas(1, grid.bounds)
@@ -89,8 +89,8 @@ def test_decks_of_crossings_are_found_and_tubes_are_not(seed):
     assert shapely.intersection(true, deck.area).area > 0.75 * deck.area.area
     assert deck.area.area > 0.4 * true.area
     assert deck.is_sure
-    tube = make_crossings(grid, seed, CrossingOptions(tubes=1))
-    assert likely_decks(tube.dsm, tube.dtm, tube.road_mask, grid) == []
+    tunnel = make_crossings(grid, seed, CrossingOptions(tunnels=1))
+    assert likely_decks(tunnel.dsm, tunnel.dtm, tunnel.road_mask, grid) == []
 
 
 @pytest.mark.slow

@@ -100,7 +100,7 @@ def test_lines_lie_on_the_surface_with_its_grade_and_crossfall(city, exported):
     assert mine.curvature_per_m.abs().max() < 0.1
     assert mine.error_m.notna().all()
     assert 0 < mine.error_m.median() < 0.5
-    assert set(mine.support) <= {"measured", "dtm", "inferred"}
+    assert set(mine.height_source) <= {"measured", "dtm", "inferred"}
 
 
 def test_report_has_the_error_by_elevation_alone_and_wide_roads_are_noted(city, tmp_path):

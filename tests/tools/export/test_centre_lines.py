@@ -124,7 +124,7 @@ def test_name_in_another_encoding_than_declared_is_read_with_a_note(suffix, data
     assert f"was read as {encoding};" in note
 
 
-def test_levels_are_read_and_tubes_kept_if_they_are_asked_for():
+def test_levels_are_read_and_tunnels_kept_if_they_are_asked_for():
     columns = {
         "highway": ["primary"] * 4,
         "bridge": ["yes", None, None, None],

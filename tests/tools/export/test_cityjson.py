@@ -57,7 +57,7 @@ def test_write_reads_back_within_half_a_millimetre():
 
 
 @pytest.mark.parametrize(("number", "kind"), [(1, "Bridge"), (-1, "Tunnel")])
-def test_write_deck_is_a_bridge_and_tube_a_tunnel(number, kind):
+def test_write_deck_is_a_bridge_and_tunnel_a_tunnel(number, kind):
     mesh, _ = Crossing((40.0, 30.0), number=number).mesh()
     lines = written([mesh])
     deck = mesh.at(number)

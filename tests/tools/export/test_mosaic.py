@@ -23,7 +23,7 @@ from flexroad.tools.export.formats import FORMATS
 from flexroad.tools.export.source import Options, select
 from tests import validators
 
-NAMES = ("height", "normal", "road", "support")
+NAMES = ("height", "normal", "road", "height_source")
 FINE_M = 0.2
 
 
@@ -50,7 +50,7 @@ def centres(raster):
 
 
 def test_rasters_have_the_cells_of_the_tiles_of_the_run(town, written):
-    for name in ("height", "road", "support"):
+    for name in ("height", "road", "height_source"):
         with (
             rasterio.open(written / f"{name}.tif") as whole,
             rasterio.open(town.path / f"{name}.vrt") as tiles,
@@ -175,7 +175,7 @@ def test_files_of_an_export_that_was_killed_are_removed(town, tmp_path):
     (of_killed / LOCK).touch()
     export(select(town.path), tmp_path, ["mosaic"], Options(), SerialExecutor())
     found = {file.name for file in (tmp_path / "mosaic").iterdir()}
-    assert found == {f"{name}.tif" for name in NAMES} | {"height.qml", "road.qml", "support.qml"}
+    assert found == {f"{name}.tif" for name in NAMES} | {"height.qml", "road.qml", "height_source.qml"}
 
 
 def sumo_heights(folder, raster, x, y):
@@ -233,6 +233,10 @@ def test_sumo_gives_the_nodes_of_a_network_the_heights_of_the_mosaic(town, tmp_p
 
 
 def test_rasters_have_styles_for_qgis_beside_them(written):
-    assert sorted(path.name for path in written.glob("*.qml")) == ["height.qml", "road.qml", "support.qml"]
+    assert sorted(path.name for path in written.glob("*.qml")) == [
+        "height.qml",
+        "height_source.qml",
+        "road.qml",
+    ]
     assert b'type="hillshade"' in (written / "height.qml").read_bytes()
-    assert b'label="Hidden ground' in (written / "support.qml").read_bytes()
+    assert b'label="Hidden ground' in (written / "height_source.qml").read_bytes()

@@ -18,9 +18,11 @@ def road(number: int, segments: int, lanes: int | None = None) -> RoadLine:
     x = np.arange(segments + 1.0)
     points = np.column_stack([500_000 + x, np.full_like(x, 5_600_000 + number), 100 + x / 8])
     error = np.where(np.arange(segments) % 2, 0.05, np.nan)
-    support = np.arange(segments, dtype=np.uint8) % 4
+    height_source = np.arange(segments, dtype=np.uint8) % 4
     columns = {"id": number, "name": f"Road {number}", "lanes": lanes}
-    return RoadLine(columns, points, {"grade_percent": np.full(segments, 12.5), "error_m": error}, support)
+    return RoadLine(
+        columns, points, {"grade_percent": np.full(segments, 12.5), "error_m": error}, height_source
+    )
 
 
 @pytest.mark.parametrize("batch", [1, 50_000])
@@ -38,7 +40,7 @@ def test_write_lines_and_segments_have_heights_and_columns(tmp_path, monkeypatch
     )
     segments = geopandas.read_file(path, layer="segments")
     assert segments.road_id.tolist() == [1] * 4 + [2] * 5
-    assert segments.support.fillna("").tolist()[:4] == ["", "measured", "dtm", "inferred"]
+    assert segments.height_source.fillna("").tolist()[:4] == ["", "measured", "dtm", "inferred"]
     np.testing.assert_array_equal(
         shapely.get_coordinates(segments.geometry[8], include_z=True), road(2, 5).points[-2:]
     )

@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from flexroad.pipeline.store.tables import metrics_frame
-from flexroad.tools.report.content import MESH_COLUMNS, decks_and_tubes, mesh_checks
+from flexroad.tools.report.content import MESH_COLUMNS, decks_and_tunnels, mesh_checks
 
 FAULT = "evaluate: MeshFault: the mesh has 2 inverted faces (the first at 1.000, 2.000)"
 
@@ -37,7 +37,7 @@ def test_mesh_checks_count_meshes_faces_and_faults(rows, expected):
 def test_table_of_decks_has_flagged_ones_first():
     figures = {
         "area_m2": 160.0,
-        "joints": 2,
+        "abutments": 2,
         "clearance_m": 6.5,
         "error_estimate_m": None,
         "measured_road": 0.9,
@@ -46,9 +46,9 @@ def test_table_of_decks_has_flagged_ones_first():
         {"tile_id": name, "variant": variant, "level": level, **figures, "flags": flags}
         for name, variant, level, flags in [("t", "a", 1, ""), ("t", "b", 1, ""), ("u", "a", -1, "no-rise")]
     ]
-    table = decks_and_tubes(rows, "a")
-    assert table.columns[:5].tolist() == ["tile", "level", "area (m²)", "joints", "clearance (m)"]
+    table = decks_and_tunnels(rows, "a")
+    assert table.columns[:5].tolist() == ["tile", "level", "area (m²)", "abutments", "clearance (m)"]
     assert table.columns[5:].tolist() == ["error estimate (m)", "measured (%)", "flags"]
     assert table[["tile", "level", "flags"]].to_numpy().tolist() == [["u", -1, "no-rise"], ["t", 1, "–"]]
     assert table["measured (%)"].tolist() == [90, 90]
-    assert decks_and_tubes(rows, "c").empty
+    assert decks_and_tunnels(rows, "c").empty

@@ -1,4 +1,4 @@
-"""The report's tables of error estimates, support and flags."""
+"""The report's tables of error estimates, height source and flags."""
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import COLUMNS, metrics_frame, read_metrics
-from flexroad.tasks.quality.support import Support
+from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tools.report.content import gather, held_out, highest_error_estimates, over_tiles
 
 
@@ -90,6 +90,6 @@ def test_gather_ranks_tiles_by_error_estimate(survey, quick_config, tmp_path):
     # The exported map has the classes that the shares are counted on.
     tile = worst.tile[worst.index[0]]
     folder = run.folder(tile).path
-    with rasterio.open(folder / f"{tile}_flexroad_support.tif") as raster:
-        assert raster.nodata == Support.NONE
-        assert set(np.unique(raster.read(1))) <= set(Support)
+    with rasterio.open(folder / f"{tile}_flexroad_height_source.tif") as raster:
+        assert raster.nodata == HeightSource.NONE
+        assert set(np.unique(raster.read(1))) <= set(HeightSource)

@@ -72,9 +72,9 @@ def test_filter_picture_colours_kept_and_dropped_cells():
     assert np.ptp(neutral) < 20
 
 
-def test_support_picture_colours_three_classes_on_road_only():
+def test_height_source_picture_colours_three_classes_on_road_only():
     road = np.abs(COL - 60) < 12
-    png = render.support_picture(RELIEF, (1 + ROW // 84).astype(np.uint8), road, GRID)
+    png = render.height_source_picture(RELIEF, (1 + ROW // 84).astype(np.uint8), road, GRID)
     for row, colour in ((40, render.KEPT), (125, render.BY_DTM), (210, render.DROPPED)):
         assert near(on_map(png, row, 60), colour, 75)
     assert np.ptp(on_map(png, 125, 180)) < 20

@@ -19,7 +19,7 @@ from flexroad.tools.synthetic.crossings import (
 )
 
 CLEAN = CrossingOptions(density=0, dsm_noise_m=0, dtm_noise_m=0)
-DECKS, TUBES = CrossingOptions(tubes=0), CrossingOptions(tubes=1)
+DECKS, TUNNELS = CrossingOptions(tunnels=0), CrossingOptions(tunnels=1)
 RAGGED = (Kind.CROWN, Kind.RAIL)
 AROUND = (499_900, 5_599_900, 500_400, 5_600_400)
 GRID = Grid("EPSG:25832", 500_000, 5_600_120, 1.0, 120, 120)
@@ -40,7 +40,7 @@ def on(line, along, across=0.0):
     return x + along * u[0] - across * u[1], y + along * u[1] + across * u[0]
 
 
-@pytest.mark.parametrize(("options", "level"), [(DECKS, 1), (TUBES, -1)])
+@pytest.mark.parametrize(("options", "level"), [(DECKS, 1), (TUNNELS, -1)])
 @pytest.mark.parametrize("seed", range(0, 50, 7))
 def test_clearance_is_that_of_the_options_where_the_roads_cross(seed, options, level):
     world = Crossings(seed, options.model_copy(update={"clearance_m": (6.5, 6.5)}))
@@ -50,9 +50,9 @@ def test_clearance_is_that_of_the_options_where_the_roads_cross(seed, options, l
     assert between == pytest.approx(level * 6.5, abs=1e-9)
 
 
-@pytest.mark.parametrize(("options", "level"), [(DECKS, 1), (TUBES, -1)])
+@pytest.mark.parametrize(("options", "level"), [(DECKS, 1), (TUNNELS, -1)])
 @pytest.mark.parametrize("seed", range(0, 50, 5))
-def test_levels_meet_at_the_ends_of_decks_and_tubes(seed, options, level):
+def test_levels_meet_at_the_ends_of_decks_and_tunnels(seed, options, level):
     world = Crossings(seed, options)
     line = axis(world, level)
     across = np.linspace(-MAIN_M, MAIN_M, 33) * 0.999
@@ -70,7 +70,7 @@ def test_levels_meet_at_the_ends_of_decks_and_tubes(seed, options, level):
 
 @pytest.mark.parametrize("seed", range(0, 50, 5))
 def test_road_below_a_deck_is_free_of_banks_and_walls(seed):
-    world = Crossings(seed, CrossingOptions(tubes=0, wall_m=(2, 2), slopes=float(seed % 4 > 0)))
+    world = Crossings(seed, CrossingOptions(tunnels=0, wall_m=(2, 2), slopes=float(seed % 4 > 0)))
     line = axis(world, 1)
     crossing = next(
         road
@@ -105,7 +105,7 @@ def test_deck_is_flat_rectangle_of_its_area():
 
 
 def test_roads_join_and_have_the_level_of_their_place():
-    world = Crossings(5, CrossingOptions(tubes=0.5))
+    world = Crossings(5, CrossingOptions(tunnels=0.5))
     main = [road for road in world.roads(AROUND) if road.width_m == 2 * MAIN_M]
     assert [road.level for road in main[1::3]][:3] in ([1, -1, 1], [-1, 1, -1])
     for before, after in pairwise(main):
@@ -145,15 +145,15 @@ def test_terrain_model_below_a_deck_is_linear_between_its_sides():
     np.testing.assert_array_equal(world.terrain_model(*beside), world.height(0, *beside))
 
 
-def test_scene_over_a_tube_shows_the_ground_above_it():
-    scene = make_crossings(GRID, 2, CLEAN.model_copy(update={"tubes": 1.0}))
-    tube = np.isfinite(scene.levels[-1])
-    assert tube.sum() > 50
+def test_scene_over_a_tunnel_shows_the_ground_above_it():
+    scene = make_crossings(GRID, 2, CLEAN.model_copy(update={"tunnels": 1.0}))
+    tunnel = np.isfinite(scene.levels[-1])
+    assert tunnel.sum() > 50
     assert 1 not in scene.levels
     np.testing.assert_array_equal(scene.dsm, scene.levels[0])
-    assert (scene.levels[0] - scene.levels[-1])[tube].min() > 3.5
+    assert (scene.levels[0] - scene.levels[-1])[tunnel].min() > 3.5
     # Only the crossing road is visible on it.
-    assert 0.2 < scene.reference_road[tube].mean() < 1
+    assert 0.2 < scene.reference_road[tunnel].mean() < 1
 
 
 def test_scenes_of_neighbouring_tiles_join():

@@ -24,8 +24,8 @@ GRID = Grid("EPSG:25832", 500000.0, 5600000.0, 1.0, 40, 30)
 
 
 def scene(grid=GRID, **values):
-    support = np.ones(grid.shape, np.uint8)
-    return TileScene("a", b"glTF", grid, np.zeros((4, 2)), support, **values)
+    height_source = np.ones(grid.shape, np.uint8)
+    return TileScene("a", b"glTF", grid, np.zeros((4, 2)), height_source, **values)
 
 
 def content(script):

@@ -142,7 +142,7 @@ def test_link_restores_camera_and_layers(run, page):
         {"wait": SETTLED},
         {"drag": [400, 350, 460, 310]},
         {"press": "input[name=terrain]"},
-        {"press": "[data-key=support]"},
+        {"press": "[data-key=height source]"},
         {"wait": "() => location.hash.includes('hide=terrain')"},
         {"shot": MIDDLE},
         {"eval": "location.hash"},
@@ -158,7 +158,7 @@ def test_link_restores_camera_and_layers(run, page):
 def test_each_setting_changes_the_picture(run, page):
     switches = [
         "[data-key=class]",
-        "[data-key=support]",
+        "[data-key=height source]",
         "[data-key=estimate]",
         "[data-key=photo]",
         "input[name=wire]",
@@ -529,7 +529,7 @@ def test_decks_are_hidden_by_a_key_and_a_drive_stays_on_its_level(tmp_path):
         {"eval": shown},
         fragment=f"#tile={tile.id}{camera}",
     )
-    assert "Decks and tubes" in names
+    assert "Decks and tunnels" in names
     heights = flexroad.open_run(run.path).height
     x, y, z = np.array(around).T
     off = np.abs(z - heights(x, y))

@@ -16,7 +16,7 @@ from flexroad.catalog.text import count, printable
 from flexroad.tasks.io.height_offset import is_offset
 from flexroad.tasks.quality.assess import FLAGS, LIMITS, NO_ROAD
 from flexroad.tasks.quality.places import Place
-from flexroad.tasks.quality.structures import BELOW, LEAST_RISE_M, NO_JOINT, NO_RISE
+from flexroad.tasks.quality.structures import BELOW, LEAST_RISE_M, NO_ABUTMENT, NO_RISE
 from flexroad.tools.report.browser.tiles import STATES, TileTable, short
 from flexroad.tools.report.content import Content
 
@@ -85,14 +85,14 @@ MEANINGS = {
         percent=True,
     ),
     BELOW: _Meaning(
-        "a deck lies partly below the ground under it, or a tube above it",
-        "look at the table of decks and tubes, and at the heights and the outline of the deck",
+        "a deck lies partly below the ground under it, or a tunnel above it",
+        "look at the table of decks and tunnels, and at the heights and the outline of the deck",
     ),
     NO_RISE: _Meaning(
-        f"a deck hardly lies above the ground, or a tube below it (less than {LEAST_RISE_M:g} m)",
+        f"a deck hardly lies above the ground, or a tunnel below it (less than {LEAST_RISE_M:g} m)",
         "a culvert is right; otherwise check the level and the outline of this road",
     ),
-    NO_JOINT: _Meaning(
+    NO_ABUTMENT: _Meaning(
         "at a deck no road of level 0 goes on",
         "check the level of the roads at its ends, and gaps there; level 0 ends by itself",
     ),

@@ -12,8 +12,8 @@ from flexroad.catalog.storage.paths import listing
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run import garbage
-from flexroad.pipeline.run.garbage import delete, exclusive, find_garbage
+from flexroad.pipeline.run import cleanup
+from flexroad.pipeline.run.cleanup import delete, exclusive, find_garbage
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -156,7 +156,7 @@ def test_clean_keeps_what_is_written_to_the_store_meanwhile(made, tmp_path, monk
     name = f"{'ab' * 16}"
     old, new = (tmp_path / "run" / "store" / "fit" / name[:2] / f"{name[:-1]}{end}.npz" for end in "01")
     temporaries = [path.with_name(f".{path.name}.{'0' * 32}.tmp") for path in (old, new)]
-    needed = garbage._needed
+    needed = cleanup._needed
 
     def written(runs):
         for path in (new, temporaries[1]):
@@ -166,7 +166,7 @@ def test_clean_keeps_what_is_written_to_the_store_meanwhile(made, tmp_path, monk
     old.parent.mkdir(exist_ok=True)
     for path in (old, temporaries[0]):
         path.write_bytes(b"")
-    monkeypatch.setattr(garbage, "_needed", written)
+    monkeypatch.setattr(cleanup, "_needed", written)
     assert clean(run) == {
         "artefacts": {str(old.relative_to(tmp_path))},
         "temporary files": {str(temporaries[0].relative_to(tmp_path))},

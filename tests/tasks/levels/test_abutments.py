@@ -1,11 +1,11 @@
-"""Joints of decks and tubes, found from vectors and from heights near them."""
+"""Abutments of decks and tunnels, found from vectors and from heights near them."""
 
 import numpy as np
 import pytest
 import shapely
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.levels.joints import GAP_M, levels_of
+from flexroad.tasks.levels.abutments import GAP_M, levels_of
 from flexroad.tasks.types import TileData
 
 GRID = Grid("EPSG:25832", 500_000.0, 5_600_100.0, 1.0, 100, 100)
@@ -33,9 +33,9 @@ def found(*roads, dsm=FLAT, dtm=FLAT, grid=GRID):
     return levels_of(areas, areas, np.array(numbers), data)
 
 
-def joint_ends(level):
-    """Return west and east ends of joints along x, m from the west."""
-    lines = shapely.get_parts(level.joints)
+def abutment_ends(level):
+    """Return west and east ends of abutments along x, m from the west."""
+    lines = shapely.get_parts(level.abutments)
     return sorted(round(float(line.bounds[0] - GRID.west), 2) for line in lines)
 
 
@@ -44,10 +44,10 @@ WAYS = (0, strip(0, 40)), (0, strip(60, 100))
 BELOW = 0, across(50)
 
 
-def test_deck_between_two_roads_has_joints_at_both_ends():
+def test_deck_between_two_roads_has_abutments_at_both_ends():
     (level,), notes = found(DECK, *WAYS, BELOW)
-    assert (level.number, joint_ends(level), notes) == (1, [40, 60], ())
-    assert level.joints.length == pytest.approx(16)
+    assert (level.number, abutment_ends(level), notes) == (1, [40, 60], ())
+    assert level.abutments.length == pytest.approx(16)
     assert level.approach.bounds == pytest.approx(
         (GRID.west + 24, GRID.south + 46, GRID.west + 76, GRID.south + 54)
     )
@@ -55,56 +55,56 @@ def test_deck_between_two_roads_has_joints_at_both_ends():
 
 
 @pytest.mark.parametrize("gap", [-1.0, 0.0, 0.5, 1.0, 1.4])
-def test_joint_bridges_gaps_and_overlaps(gap):
+def test_abutment_bridges_gaps_and_overlaps(gap):
     (level,), _ = found(DECK, (0, strip(0, 40 - gap)), WAYS[1], BELOW)
-    assert joint_ends(level) == [40, 60]
+    assert abutment_ends(level) == [40, 60]
     # The gap belongs to the approach.
     assert level.weight(GRID.west + 39.5, GRID.south + 50) == 1
 
 
-def test_gap_that_is_too_wide_gives_no_joint():
+def test_gap_that_is_too_wide_gives_no_abutment():
     (level,), notes = found(DECK, (0, strip(0, 40 - GAP_M - 0.3)), BELOW)
-    assert level.joints.is_empty
-    assert "1 deck of level 1 without a joint" in notes[0]
+    assert level.abutments.is_empty
+    assert "1 deck of level 1 without an abutment" in notes[0]
     assert "gaps above 1.5 m" in notes[0]
 
 
 @pytest.mark.parametrize(("west", "east", "noted"), [(-60, 160, False), (-60, 99, False), (1, 99, True)])
-def test_deck_without_joint_is_noted_if_its_ends_are_known(west, east, noted):
-    """The middle tile of a long deck sees none of its joints."""
+def test_deck_without_abutment_is_noted_if_its_ends_are_known(west, east, noted):
+    """The middle tile of a long deck sees none of its abutments."""
     levels, notes = found((1, strip(west, east)), BELOW)
     assert (len(levels), len(notes)) == (1, noted)
 
 
-def test_street_below_is_no_joint_also_beside_an_abutment():
+def test_street_below_is_no_abutment_also_beside_an_abutment():
     # The street passes below the end of the deck.
     (level,), _ = found(DECK, *WAYS, (0, across(44.5)))
-    assert joint_ends(level) == [40, 60]
-    assert level.joints.length == pytest.approx(16)
+    assert abutment_ends(level) == [40, 60]
+    assert level.abutments.length == pytest.approx(16)
 
 
-def test_pavements_of_a_wider_deck_belong_to_the_joint():
+def test_pavements_of_a_wider_deck_belong_to_the_abutment():
     (level,), _ = found((1, strip(40, 60, width=11)), *WAYS)
-    assert level.joints.length == pytest.approx(22)
+    assert level.abutments.length == pytest.approx(22)
 
 
-def test_ramp_at_the_side_of_a_long_deck_has_a_joint_of_its_width():
+def test_ramp_at_the_side_of_a_long_deck_has_a_abutment_of_its_width():
     (level,), _ = found((1, strip(0, 100)), (0, across(50, low=54)))
-    assert level.joints.length == pytest.approx(7, abs=0.6)
+    assert level.abutments.length == pytest.approx(7, abs=0.6)
 
 
-@pytest.mark.parametrize(("rise", "joints"), [(0.5, [40, 60]), (4.0, [60])])
-def test_joint_is_refused_where_visible_roads_differ_in_height(rise, joints):
+@pytest.mark.parametrize(("rise", "abutments"), [(0.5, [40, 60]), (4.0, [60])])
+def test_abutment_is_refused_where_visible_roads_differ_in_height(rise, abutments):
     x = np.arange(100) + 0.5
     dsm = np.where((x < 40), 8.0 - rise, 8.0) + FLAT
     (level,), _ = found(DECK, *WAYS, BELOW, dsm=dsm, dtm=FLAT)
-    assert joint_ends(level) == joints
+    assert abutment_ends(level) == abutments
 
 
-def test_hidden_roads_do_not_refuse_a_joint():
+def test_hidden_roads_do_not_refuse_a_abutment():
     crowns = np.where(np.arange(100) < 40, 5 + np.random.default_rng(1).random(GRID.shape), 8.0)
     (level,), _ = found(DECK, *WAYS, BELOW, dsm=crowns, dtm=np.full(GRID.shape, np.nan))
-    assert joint_ends(level) == [40, 60]
+    assert abutment_ends(level) == [40, 60]
 
 
 def test_road_on_level_ground_alone_has_no_levels():
@@ -118,27 +118,27 @@ def test_deck_far_from_the_tile_is_left_out():
 
 
 @pytest.mark.parametrize(("high", "kept"), [(70, True), (95, False)])
-def test_long_tube_is_left_out_with_a_note(high, kept):
+def test_long_tunnel_is_left_out_with_a_note(high, kept):
     levels, notes = found((-1, strip(40, high)), (0, strip(0, 40)), (0, strip(high, 100)))
     assert bool(levels) == kept
     if not kept:
         assert notes == (
-            "segment: the tube at E 500068 N 5600050 (level -1) is longer than 50 m, so it is left out",
+            "segment: the tunnel at E 500068 N 5600050 (level -1) is longer than 50 m, so it is left out",
         )
 
 
-def test_tube_without_second_portal_is_left_out_with_a_note():
+def test_tunnel_without_second_portal_is_left_out_with_a_note():
     levels, notes = found((-1, strip(40, 70)), (0, strip(0, 40)))
     assert not levels
     assert "has no two portals" in notes[0]
 
 
-def test_decks_of_two_levels_have_their_own_joints():
+def test_decks_of_two_levels_have_their_own_abutments():
     levels, _ = found(
         DECK, *WAYS, (2, across(50, low=30, high=70)), (0, across(50, high=30)), (0, across(50, low=70))
     )
     assert [level.number for level in levels] == [1, 2]
-    assert [len(level.joints.geoms) for level in levels] == [2, 2]
+    assert [len(level.abutments.geoms) for level in levels] == [2, 2]
 
 
 @pytest.mark.parametrize("numbers", [(2,), (4,), (1, 3)])
@@ -147,28 +147,28 @@ def test_levels_with_nothing_below_them_are_levels(numbers):
         *((number, strip(40, 60, y=20 * number)) for number in numbers), (0, strip(0, 40, y=40))
     )
     assert tuple(level.number for level in levels) == numbers
-    assert joint_ends(levels[0]) == ([40] if numbers == (2,) else [])
+    assert abutment_ends(levels[0]) == ([40] if numbers == (2,) else [])
 
 
 @pytest.mark.parametrize("rise", [8.0, 0.0])
-def test_lower_street_beside_a_deck_has_no_joint_and_no_approach(rise):
+def test_lower_street_beside_a_deck_has_no_abutment_and_no_approach(rise):
     """It lies 1 m beside the deck, and its approaches."""
     row = GRID.south + 50 - GRID.northings[:, None]
     dsm = np.where(np.abs(row) < 4, rise, 0.0) + FLAT
     (level,), _ = found(DECK, *WAYS, BELOW, (0, strip(0, 100, width=6, y=58)), dsm=dsm)
     places = GRID.west + np.array([35, 35, 50]), GRID.south + np.array([50, 58, 58])
     if rise:
-        assert joint_ends(level) == [40, 60]
+        assert abutment_ends(level) == [40, 60]
         np.testing.assert_array_equal(level.weight(*places), [1, 0, 0])
     else:
         # Streets of one height are a place on the deck.
-        assert joint_ends(level) == [40, 40, 60]
+        assert abutment_ends(level) == [40, 40, 60]
 
 
 def test_hole_in_a_deck_is_an_outline():
     deck = shapely.difference(strip(20, 80, width=40), strip(45, 55, width=10))
     (level,), _ = found((1, deck), (0, strip(0, 20)), (0, strip(45, 55)))
-    assert joint_ends(level) == [20, 45, 45, 45, 55]
+    assert abutment_ends(level) == [20, 45, 45, 45, 55]
     assert not level.covers(GRID.west + 50, GRID.south + 50)
 
 

@@ -1,4 +1,4 @@
-"""Support of the fitted surface in each cell: a measurement, the terrain model, or neither.
+"""Height source of the fitted surface in each cell: a measurement, the terrain model, or neither.
 
 The fit uses the DSM on road cells that the filter kept and the DTM on all others; a cell without that height
 is left out of the loss, and the surface is extrapolated across it. Where an object hides the road, the DTM is
@@ -18,7 +18,7 @@ from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M, valid_dtm
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
 
-class Support(IntEnum):
+class HeightSource(IntEnum):
     """Source of the surface's height in a cell."""
 
     NONE = 0
@@ -31,10 +31,10 @@ class Support(IntEnum):
     """No height entered the fit; the surface is extrapolated from the cells around."""
 
 
-def support(
+def height_source(
     data: TileData, road: RoadMask, clusters: RoadClusters, dsm_dtm_tolerance_m: float = DSM_DTM_TOLERANCE_M
 ) -> NDArray[np.uint8]:
-    """Return the `Support` of each cell, ``(H, W)``, for a fit to the DSM on roads and the DTM elsewhere.
+    """Return the `HeightSource` of each cell, ``(H, W)``, fitted to the DSM on roads and the DTM elsewhere.
 
     - `data`: DSM and DTM, m.
     - `road`: gives the cells beyond the survey.
@@ -43,16 +43,16 @@ def support(
     """
     has_dtm = np.isfinite(valid_dtm(data, clusters))
     agreed = has_dtm & (np.abs(data.dsm - data.dtm) <= dsm_dtm_tolerance_m)
-    classes = np.where(has_dtm & ~clusters.mask, Support.DTM, Support.INFERRED).astype(np.uint8)
-    classes[np.where(clusters.mask, np.isfinite(data.dsm), agreed)] = Support.MEASURED
-    classes[road.outside] = Support.NONE
+    classes = np.where(has_dtm & ~clusters.mask, HeightSource.DTM, HeightSource.INFERRED).astype(np.uint8)
+    classes[np.where(clusters.mask, np.isfinite(data.dsm), agreed)] = HeightSource.MEASURED
+    classes[road.outside] = HeightSource.NONE
     return classes
 
 
 def of_faces(
     classes: NDArray[np.uint8], road: RoadMask, mesh: Mesh, others: Sequence[tuple[int, Quality]] = ()
 ) -> NDArray[np.uint8]:
-    """Return the `Support` of the core cell under the centroid of each face, ``(F,)``.
+    """Return the `HeightSource` of the core cell under the centroid of each face, ``(F,)``.
 
     Faces at the limit of the survey, and at the outline of a deck, are inferred where the cell lies beyond.
 
@@ -63,18 +63,18 @@ def of_faces(
     kinds = classes[cells]
     if mesh.level is not None:
         for number, of_level in others:
-            kinds = np.where(mesh.level == number, of_level.support[cells], kinds)
-    return np.where(kinds == Support.NONE, np.uint8(Support.INFERRED), kinds)
+            kinds = np.where(mesh.level == number, of_level.height_source[cells], kinds)
+    return np.where(kinds == HeightSource.NONE, np.uint8(HeightSource.INFERRED), kinds)
 
 
-def top_support(quality: Quality, top: NDArray[np.int8]) -> NDArray[np.uint8]:
-    """Return the `Support` of the highest level in each cell of the core, ``(H, W)``.
+def top_height_source(quality: Quality, top: NDArray[np.int8]) -> NDArray[np.uint8]:
+    """Return the `HeightSource` of the highest level in each cell of the core, ``(H, W)``.
 
     - `quality`: that of level 0, with the other levels.
     - `top` ``(H, W)``: number of the highest level in each cell.
     """
-    classes = quality.support.copy()
+    classes = quality.height_source.copy()
     for number, of_level in quality.levels:
         here = (top == number) & (number > 0)
-        classes[here] = of_level.support[here]
+        classes[here] = of_level.height_source[here]
     return classes

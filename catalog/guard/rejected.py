@@ -12,7 +12,7 @@ ARCHIVES = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"BZh", b"\xf
 """First bytes of files of archives."""
 
 
-class Refused(OSError):
+class InputRejected(OSError):
     """A file that is not opened; the message continues a sentence that begins with its name."""
 
 
@@ -41,11 +41,11 @@ def read_through(path: Path) -> None:
 def require_beside(side: Path, path: Path) -> None:
     """Raise an error if a file that a library opens with another one is not a regular file of its folder."""
     if side.is_symlink() and side.resolve().parent not in (path.resolve().parent, path.parent.resolve()):
-        raise Refused("is a link to another folder; replace it by the file")
+        raise InputRejected("is a link to another folder; replace it by the file")
     head(side)
 
 
 def require_regular(path: Path) -> None:
     """Raise an error if a path is not a regular file."""
     if not stat.S_ISREG(path.stat().st_mode):
-        raise Refused("is not a regular file; replace it by one")
+        raise InputRejected("is not a regular file; replace it by one")

@@ -1,6 +1,6 @@
-"""The outlines of decks and tubes as lines of meshes, and their joints with the ground.
+"""The outlines of decks and tunnels as lines of meshes, and their abutments with the ground.
 
-A joint is an edge of two meshes: of level 0, and of the level that begins there. Both have the same vertices
+An abutment is an edge of two meshes: of level 0, and of the level that begins. Both have the same vertices
 on it, with the heights of the other level. Below a deck, level 0 has a second line beside it, with heights of
 its own, at the foot of the abutment. So the wall there is steep, and level 0 stays below the deck.
 """
@@ -22,10 +22,10 @@ from flexroad.tasks.spline.mesh_border import SAME_M, on_border
 from flexroad.tasks.types import Bools, Floats, Level, Surface
 
 WALL_M = 0.25
-"""Distance of the foot of an abutment from the joint (m)."""
+"""Distance of the foot of an abutment from the abutment (m)."""
 CLEAR_M = 0.3
-"""Other lines of level 0 are left out within this distance of a joint (m): crossings would be vertices that
-the other level does not have."""
+"""Other lines of level 0 are left out within this distance of an abutment (m): the other level
+would lack the vertices of crossings."""
 LEAST_M2 = 1e-3
 """Smaller parts of a level on a tile have no mesh (m2)."""
 
@@ -36,33 +36,33 @@ class LevelOutline:
 
     number: int
     area: shapely.Geometry
-    """The decks or tubes on the tile."""
-    joints: NDArray[np.object_]
-    """The lines of their outline that are joints."""
+    """The decks or tunnels on the tile."""
+    abutments: NDArray[np.object_]
+    """The lines of their outline that are abutments."""
     rim: NDArray[np.object_]
     """The other lines."""
     feet: NDArray[np.object_]
     """Lines at the feet of the abutments."""
-    on_joints: shapely.MultiLineString
-    """The joints as in the level, on and around the tile."""
+    on_abutments: shapely.MultiLineString
+    """The abutments as in the level, on and around the tile."""
 
     @property
     def lines(self) -> NDArray[np.object_]:
         """All lines of the outline."""
-        return np.concatenate([self.joints, self.rim])
+        return np.concatenate([self.abutments, self.rim])
 
-    def has_joint_at(self, points: Floats) -> Bools:
-        """Return which points, ``(n, 2 or more)``, lie on joints, ``(n,)``."""
-        return np.asarray(shapely.dwithin(self.on_joints, shapely.points(points[:, :2]), SAME_M))
+    def has_abutment_at(self, points: Floats) -> Bools:
+        """Return which points, ``(n, 2 or more)``, lie on abutments, ``(n,)``."""
+        return np.asarray(shapely.dwithin(self.on_abutments, shapely.points(points[:, :2]), SAME_M))
 
     def with_shared(self, border: Floats, ground: Floats, local: Bounds) -> Floats:
-        """Return the vertices of the level on the border of a tile, on joints those of level 0.
+        """Return the vertices of the level on the border of a tile, on abutments those of level 0.
 
         - `border` ``(n, 3)``: vertices along the complete border.
         - `ground` ``(m, 3)``: the vertices of level 0.
         """
-        shared = ground[on_border(ground, local) & self.has_joint_at(ground)]
-        every = np.concatenate([border[~self.has_joint_at(border)], shared])
+        shared = ground[on_border(ground, local) & self.has_abutment_at(ground)]
+        every = np.concatenate([border[~self.has_abutment_at(border)], shared])
         near = shapely.dwithin(self.area, shapely.points(every[:, :2]), GRID_M)
         return np.asarray(every[near])
 
@@ -88,40 +88,40 @@ def level_outline(level: Level, core: Grid, local: Bounds, spacing_m: float) -> 
     if areas is None:
         return None
     tile, united = shapely.box(*local), shapely.from_wkb(areas.tobytes())
-    joints = shapely.transform(level.joints, lambda points: points - core.origin)
+    abutments = shapely.transform(level.abutments, lambda points: points - core.origin)
     area = shapely.intersection(united, tile)
     reaches = area.area >= LEAST_M2
-    if not reaches and not shapely.dwithin(joints, tile, SAME_M):
+    if not reaches and not shapely.dwithin(abutments, tile, SAME_M):
         return None
     merged = shapely.line_merge(lines_of(shapely.intersection(shapely.boundary(united), tile)))
-    pieces = [piece for part in shapely.get_parts(merged) for piece in _pieces(part, joints)]
-    on_joint = np.array([is_joint for _, is_joint in pieces], np.bool_)
+    pieces = [piece for part in shapely.get_parts(merged) for piece in _pieces(part, abutments)]
+    on_abutment = np.array([is_abutment for _, is_abutment in pieces], np.bool_)
     lines = np.array([_divided(line, spacing_m, local) for line, _ in pieces], object)
-    feet = _feet(united, lines[on_joint], tile)
+    feet = _feet(united, lines[on_abutment], tile)
     return LevelOutline(
         number=level.number,
         area=area if reaches else shapely.Polygon(),
-        joints=lines[on_joint],
-        rim=lines[~on_joint],
+        abutments=lines[on_abutment],
+        rim=lines[~on_abutment],
         feet=np.array([_divided(line, spacing_m, local) for line in feet], object),
-        on_joints=joints,
+        on_abutments=abutments,
     )
 
 
-def _pieces(line: shapely.LineString, joints: shapely.Geometry) -> list[tuple[shapely.LineString, bool]]:
-    """Return a line in pieces that are joints or not, and which they are."""
+def _pieces(line: shapely.LineString, abutments: shapely.Geometry) -> list[tuple[shapely.LineString, bool]]:
+    """Return a line in pieces that are abutments or not, and which they are."""
     corners = shapely.get_coordinates(line)
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
-    ends = shapely.get_parts(shapely.boundary(joints))
+    ends = shapely.get_parts(shapely.boundary(abutments))
     ends = shapely.line_locate_point(line, ends[shapely.dwithin(ends, line, SAME_M)])
     ends = ends[np.abs(ends[:, None] - along).min(axis=1, initial=np.inf) >= SAME_M]
     added = shapely.get_coordinates(shapely.line_interpolate_point(line, ends))
     points = np.concatenate([corners, added])[np.argsort(np.concatenate([along, ends]), kind="stable")]
     middles = shapely.points((points[1:] + points[:-1]) / 2)
-    is_joint = np.asarray(shapely.dwithin(joints, middles, SAME_M))
-    bounds = [0, *(np.flatnonzero(is_joint[1:] != is_joint[:-1]) + 1), len(is_joint)]
+    is_abutment = np.asarray(shapely.dwithin(abutments, middles, SAME_M))
+    bounds = [0, *(np.flatnonzero(is_abutment[1:] != is_abutment[:-1]) + 1), len(is_abutment)]
     return [
-        (shapely.LineString(points[first : last + 1]), bool(is_joint[first]))
+        (shapely.LineString(points[first : last + 1]), bool(is_abutment[first]))
         for first, last in pairwise(bounds)
     ]
 
@@ -140,28 +140,30 @@ def _divided(line: shapely.LineString, spacing_m: float, local: Bounds) -> shape
     return shapely.LineString(points[kept])
 
 
-def _feet(areas: shapely.Geometry, joints: NDArray[np.object_], tile: shapely.Polygon) -> NDArray[np.object_]:
-    """Return the lines within areas that run beside joints."""
-    if not len(joints):
-        return joints
+def _feet(
+    areas: shapely.Geometry, abutments: NDArray[np.object_], tile: shapely.Polygon
+) -> NDArray[np.object_]:
+    """Return the lines within areas that run beside abutments."""
+    if not len(abutments):
+        return abutments
     inner = shapely.boundary(shapely.buffer(areas, -WALL_M, join_style="mitre"))
-    beside = shapely.buffer(shapely.multilinestrings(joints), WALL_M + SAME_M, cap_style="flat")
+    beside = shapely.buffer(shapely.multilinestrings(abutments), WALL_M + SAME_M, cap_style="flat")
     inside = shapely.intersection(inner, shapely.intersection(beside, tile))
     return parts_of(shapely.line_merge(lines_of(inside)))
 
 
-def without_joints(lines: NDArray[np.object_], outlines: Sequence[LevelOutline]) -> NDArray[np.object_]:
-    """Return the parts of lines that are not beside joints."""
-    joints = [outline.joints for outline in outlines if len(outline.joints)]
-    if not joints or not len(lines):
+def without_abutments(lines: NDArray[np.object_], outlines: Sequence[LevelOutline]) -> NDArray[np.object_]:
+    """Return the parts of lines that are not beside abutments."""
+    abutments = [outline.abutments for outline in outlines if len(outline.abutments)]
+    if not abutments or not len(lines):
         return lines
-    beside = shapely.buffer(shapely.multilinestrings(np.concatenate(joints)), CLEAR_M)
+    beside = shapely.buffer(shapely.multilinestrings(np.concatenate(abutments)), CLEAR_M)
     return parts_of(lines_of(shapely.difference(shapely.multilinestrings(lines), beside)))
 
 
 @dataclass(frozen=True, eq=False)
 class JoinedGround:
-    """The surface of level 0, of which points on joints have the heights of the level that begins there."""
+    """The surface of level 0, with the heights of the other level on abutments."""
 
     surface: Surface
     origin: tuple[float, float]
@@ -170,12 +172,12 @@ class JoinedGround:
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, ``(n,)``."""
-        return self.on_joints(easting, northing, self.surface.height(easting, northing))
+        return self.on_abutments(easting, northing, self.surface.height(easting, northing))
 
-    def on_joints(self, easting: Floats, northing: Floats, heights: Floats) -> Floats:
-        """Return heights of points, ``(n,)``, with those on joints replaced."""
+    def on_abutments(self, easting: Floats, northing: Floats, heights: Floats) -> Floats:
+        """Return heights of points, ``(n,)``, with those on abutments replaced."""
         points, result = np.column_stack([easting, northing]), heights.copy()
         for outline in self.outlines:
-            at = outline.has_joint_at(points - self.origin)
+            at = outline.has_abutment_at(points - self.origin)
             result[at] = self.surface.at(outline.number).height(*points[at].T)
         return result

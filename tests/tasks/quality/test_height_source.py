@@ -1,4 +1,4 @@
-"""Support of the surface and validity of the DTM under a road, on synthetic data with known result."""
+"""Height source of the surface and validity of the DTM under a road, on synthetic data with known result."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.quality.support import Support, of_faces, support
+from flexroad.tasks.quality.height_source import HeightSource, height_source, of_faces
 from flexroad.tasks.roads.dtm_validity import (
     NEAR_M,
     REACH_M,
@@ -39,43 +39,47 @@ def kept(mask, dtm_invalid=None) -> RoadClusters:
     return RoadClusters(GRID, mask.astype(np.int32), dtm_invalid)
 
 
-def test_support_equals_source_used_by_fit():
+def test_height_source_equals_source_used_by_fit():
     crown = STREET & (COL > 20) & (COL < 30)
     house, hole, sea = ROW < 8, (ROW > 40) & (COL < 10), COL > 55
     data = tile()
     data.dsm[crown | house] += 6
     data.dtm[hole] = np.nan
     data.dsm[:, 12], data.dtm[:, 13] = np.nan, np.nan
-    result = support(data, street(outside=sea), kept(STREET & ~crown))
-    truth = np.full(GRID.shape, Support.MEASURED)
-    truth[crown | house] = Support.DTM
-    truth[hole] = Support.INFERRED
+    result = height_source(data, street(outside=sea), kept(STREET & ~crown))
+    truth = np.full(GRID.shape, HeightSource.MEASURED)
+    truth[crown | house] = HeightSource.DTM
+    truth[hole] = HeightSource.INFERRED
     # A kept cell without DSM has no height in the fit; any other cell without DSM has the DTM's.
-    truth[:, 12] = np.where(STREET[:, 12], Support.INFERRED, truth[:, 12])
-    truth[~STREET & ~hole & (COL == 12)] = Support.DTM
-    truth[:, 13] = np.where(STREET[:, 13], Support.MEASURED, Support.INFERRED)
-    truth[sea] = Support.NONE
+    truth[:, 12] = np.where(STREET[:, 12], HeightSource.INFERRED, truth[:, 12])
+    truth[~STREET & ~hole & (COL == 12)] = HeightSource.DTM
+    truth[:, 13] = np.where(STREET[:, 13], HeightSource.MEASURED, HeightSource.INFERRED)
+    truth[sea] = HeightSource.NONE
     np.testing.assert_array_equal(result, truth)
 
 
-def test_support_invalid_dtm_is_inferred():
+def test_height_source_invalid_dtm_is_inferred():
     crown = STREET & (COL > 20) & (COL < 30)
     data, clusters = tile(dsm=RAMP + 6 * crown), kept(STREET & ~crown, crown)
-    assert (support(data, street(), clusters)[crown] == Support.INFERRED).all()
+    assert (height_source(data, street(), clusters)[crown] == HeightSource.INFERRED).all()
     np.testing.assert_array_equal(np.isnan(valid_dtm(data, clusters)), crown)
     assert valid_dtm(data, kept(STREET)).base is data.dtm
 
 
 def test_of_faces_uses_cell_under_centroid():
-    classes = np.where(COL < 30, Support.MEASURED, Support.DTM).astype(np.uint8)
+    classes = np.where(COL < 30, HeightSource.MEASURED, HeightSource.DTM).astype(np.uint8)
     west, east = [(28.5, 10, 0), (29.5, 10, 0), (28.5, 12, 0)], [(30.5, 10, 0), (33, 10, 0), (30.5, 12, 0)]
     vertices = np.array(west + east, float)
     mesh = Mesh(
         GRID.crs, (*GRID.origin, 0.0), vertices, np.arange(6, dtype=np.int32).reshape(2, 3), np.ones(2, bool)
     )
-    np.testing.assert_array_equal(of_faces(classes, street(), mesh), [Support.MEASURED, Support.DTM])
-    beyond = np.where(COL < 30, Support.MEASURED, Support.NONE).astype(np.uint8)
-    np.testing.assert_array_equal(of_faces(beyond, street(), mesh), [Support.MEASURED, Support.INFERRED])
+    np.testing.assert_array_equal(
+        of_faces(classes, street(), mesh), [HeightSource.MEASURED, HeightSource.DTM]
+    )
+    beyond = np.where(COL < 30, HeightSource.MEASURED, HeightSource.NONE).astype(np.uint8)
+    np.testing.assert_array_equal(
+        of_faces(beyond, street(), mesh), [HeightSource.MEASURED, HeightSource.INFERRED]
+    )
 
 
 def plane_field(heights, ground):
@@ -160,11 +164,13 @@ def test_of_faces_of_a_deck_uses_its_own_classes():
     mesh, _ = Crossing((40.0, 30.0)).mesh()
     grid = Grid(GRID.crs, WEST, SOUTH + 60, 1.0, 60, 60)
     road = RoadMask(grid, grid, np.zeros(grid.shape, bool), np.zeros(grid.shape, bool))
-    ground, deck = (np.full(grid.shape, kind, np.uint8) for kind in (Support.INFERRED, Support.MEASURED))
+    ground, deck = (
+        np.full(grid.shape, kind, np.uint8) for kind in (HeightSource.INFERRED, HeightSource.MEASURED)
+    )
     quality = Quality(
-        **dict.fromkeys(FIGURES, 0.0), flags=(), support=deck, flagged=np.zeros_like(deck, np.uint16)
+        **dict.fromkeys(FIGURES, 0.0), flags=(), height_source=deck, flagged=np.zeros_like(deck, np.uint16)
     )
     kinds = of_faces(ground, road, mesh, ((1, quality),))
-    np.testing.assert_array_equal(kinds == Support.MEASURED, mesh.level == 1)
+    np.testing.assert_array_equal(kinds == HeightSource.MEASURED, mesh.level == 1)
     assert quality.at(1) is quality
     assert replace(quality, levels=((2, quality),)).at(2) is quality

@@ -1,6 +1,6 @@
-"""Where the roads of other levels begin: the joints of decks and tubes with the ground, and their approaches.
+"""Where the roads of other levels begin: the abutments of decks and tunnels, and their approaches.
 
-Everything is decided from the vectors and from cells near each joint alone, so that a tile, its neighbour
+Everything is decided from the vectors and from cells near each abutment alone, so that a tile, its neighbour
 and their edge find the same levels.
 """
 
@@ -31,9 +31,9 @@ REACH_M = APPROACH_M + BLEND_M + 1.0
 GAP_M = 1.5
 """Widest gap between a deck and its approach (m)."""
 SHORTEST_M = 1.5
-"""Shortest joint (m)."""
+"""Shortest abutment (m)."""
 STEP_M = 0.25
-"""Distance of the places along an outline at which a joint is looked for (m)."""
+"""Distance of the places along an outline at which an abutment is looked for (m)."""
 BELOW_M = 2.5
 """A street of level 0 that reaches so far below a deck (m) passes below it."""
 PASSES_M2 = 1.0
@@ -43,19 +43,19 @@ INNER = 0.4
 TURN_DEG = 45.0
 """At sharper turns an outline has a corner (degrees)."""
 WIDEST_M = 40.0
-"""A straight side up to this length (m), of which half is a joint, is one completely: with its pavements."""
+"""A straight side up to this length (m), of which half is an abutment, is one with its pavements."""
 RISE_M = 0.75
-"""Visible roads on both sides of a joint differ at most by this in height (m)."""
+"""Visible roads on both sides of an abutment differ at most by this in height (m)."""
 BESIDE_M = 6.0
-"""Distance from the middle of a joint up to which they are compared (m)."""
+"""Distance from the middle of an abutment up to which they are compared (m)."""
 AROUND_M = 16.0
 """Distance from there up to which cells decide whether a road is visible (m)."""
 ROUGHNESS_M, BEND = 0.15, 0.1
 """A visible road has flat patches of at most these residuals (m) and differences of slope."""
 APART_M = 0.02
 """Roads of level 0 are kept apart by this from decks (m)."""
-TUBE_M = 50.0
-"""Longest tube (m): heights of a longer one would be guessed."""
+TUNNEL_M = 50.0
+"""Longest tunnel (m): heights of a longer one would be guessed."""
 
 Lines = NDArray[np.object_]
 
@@ -67,7 +67,7 @@ def levels_of(
 
     - `areas`, `shapes`, `numbers` ``(n,)``: the roads on and around the tile's grid as polygons, what these
       were made of (`rasterise.Roads`), and their levels.
-    - `data`: its heights refuse joints between roads that differ in height.
+    - `data`: its heights refuse abutments between roads that differ in height.
     """
     if not numbers.any():
         return (), ()
@@ -86,7 +86,7 @@ def levels_of(
         if not shapely.intersects(shapely.union(level.areas, level.approach), near):
             continue
         if number > 0:
-            notes += _without_joint(level, data)
+            notes += _without_abutment(level, data)
         cut = _polygons(shapely.intersection(level.areas, window))
         levels.append(replace(level, areas=cut))
     return tuple(levels), tuple(notes)
@@ -115,17 +115,19 @@ def _level(number: int, areas: shapely.MultiPolygon, streets: Lines, data: TileD
         deck = cells(np.array([areas]), data.grid)
         street = cells(touching, data.grid) & ~deck
         lines = [line for line in lines if _is_level(line, deck, street, data)]
-    joints = shapely.MultiLineString(lines)
+    abutments = shapely.MultiLineString(lines)
     ground = shapely.difference(shapely.union_all(near[~passes]), shapely.buffer(areas, APART_M))
-    road = _touching(_polygons(shapely.intersection(ground, shapely.buffer(joints, APPROACH_M))), joints)
-    gaps = shapely.difference(shapely.buffer(joints, GAP_M, cap_style="flat"), areas)
+    road = _touching(
+        _polygons(shapely.intersection(ground, shapely.buffer(abutments, APPROACH_M))), abutments
+    )
+    gaps = shapely.difference(shapely.buffer(abutments, GAP_M, cap_style="flat"), areas)
     approach = _polygons(shapely.union(road, gaps))
-    beside = shapely.intersection(shapely.union_all(near[passes]), shapely.buffer(joints, REACH_M))
-    return Level(number, areas, joints, approach, _polygons(shapely.difference(beside, approach)))
+    beside = shapely.intersection(shapely.union_all(near[passes]), shapely.buffer(abutments, REACH_M))
+    return Level(number, areas, abutments, approach, _polygons(shapely.difference(beside, approach)))
 
 
 def _passes(streets: Lines, areas: shapely.MultiPolygon) -> Bools:
-    """Return which streets pass below a deck, or above a tube: they have a part well within its outline."""
+    """Return which streets pass below a deck, or above a tunnel: they have a part well within its outline."""
     parts = shapely.get_parts(areas)
     width = 2 * shapely.area(parts) / shapely.length(parts)
     inner = shapely.union_all(shapely.buffer(parts, -np.minimum(BELOW_M, INNER * width)))
@@ -154,7 +156,7 @@ def _sides(ring: shapely.LinearRing) -> list[shapely.LineString]:
 
 
 def _fronts(side: shapely.LineString, streets: Lines) -> Iterator[shapely.LineString]:
-    """Yield the joints on one side of an outline that has the area on its left."""
+    """Yield the abutments on one side of an outline that has the area on its left."""
     places = shapely.get_coordinates(shapely.segmentize(side, STEP_M))
     steps = np.diff(places, axis=0)
     outward = np.column_stack([steps[:, 1], -steps[:, 0]]) / np.hypot(*steps.T)[:, None]
@@ -177,9 +179,9 @@ def _is_at(area: shapely.Geometry, places: Floats) -> Bools:
     return np.asarray(shapely.intersects_xy(area, *places.T))
 
 
-def _is_level(joint: shapely.LineString, deck: Bools, street: Bools, data: TileData) -> bool:
-    """Return whether deck and street have one height at a joint, or one of them is not visible there."""
-    x, y = shapely.get_coordinates(joint.interpolate(0.5, normalized=True))[0]
+def _is_level(abutment: shapely.LineString, deck: Bools, street: Bools, data: TileData) -> bool:
+    """Return whether deck and street have one height at an abutment, or one of them is not visible there."""
+    x, y = shapely.get_coordinates(abutment.interpolate(0.5, normalized=True))[0]
     grid = data.grid
     row, col = (int(value) for value in grid.cells(np.array(x), np.array(y)))
     n = int(AROUND_M / grid.cell) + 1
@@ -205,48 +207,49 @@ def _median(values: Floats) -> float:
     return float(np.median(known)) if known.size else float("nan")
 
 
-def _touching(areas: shapely.MultiPolygon, joints: shapely.MultiLineString) -> shapely.MultiPolygon:
-    """Return the polygons that begin at a joint."""
+def _touching(areas: shapely.MultiPolygon, abutments: shapely.MultiLineString) -> shapely.MultiPolygon:
+    """Return the polygons that begin at an abutment."""
     parts = shapely.get_parts(areas)
-    shared = shapely.length(shapely.intersection(shapely.buffer(parts, GAP_M), joints))
+    shared = shapely.length(shapely.intersection(shapely.buffer(parts, GAP_M), abutments))
     return shapely.MultiPolygon(list(parts[shared >= SHORTEST_M]))
 
 
 def _with_portals(level: Level, core: Grid) -> tuple[Level, list[str]]:
-    """Return the tubes that begin and end within reach, and a note about the others on the tile."""
+    """Return the tunnels that begin and end within reach, and a note about the others on the tile."""
     parts, kept, notes = shapely.get_parts(level.areas), list[shapely.Polygon](), list[str]()
-    joints = shapely.get_parts(level.joints)
+    abutments = shapely.get_parts(level.abutments)
     for part in parts:
-        portals = shapely.dwithin(joints, part, APART_M)
+        portals = shapely.dwithin(abutments, part, APART_M)
         corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(part))
         length = float(np.hypot(*np.diff(corners, axis=0).T).max())
-        if np.count_nonzero(portals) >= 2 and length <= TUBE_M:
+        if np.count_nonzero(portals) >= 2 and length <= TUNNEL_M:
             kept.append(part)
         elif shapely.intersects(part, _grown(core, 0.0)):
-            why = f"is longer than {TUBE_M:g} m" if length > TUBE_M else "has no two portals"
+            why = f"is longer than {TUNNEL_M:g} m" if length > TUNNEL_M else "has no two portals"
             notes.append(
-                f"segment: the tube at {place(part)} (level {level.number}) {why}, so it is left out"
+                f"segment: the tunnel at {place(part)} (level {level.number}) {why}, so it is left out"
             )
     areas = shapely.MultiPolygon(kept)
-    joints = joints[shapely.dwithin(joints, areas, APART_M)] if kept else joints[:0]
-    lines = shapely.MultiLineString(list(joints))
+    abutments = abutments[shapely.dwithin(abutments, areas, APART_M)] if kept else abutments[:0]
+    lines = shapely.MultiLineString(list(abutments))
     approach = _touching(level.approach, lines)
-    return replace(level, areas=areas, joints=lines, approach=approach), notes
+    return replace(level, areas=areas, abutments=lines, approach=approach), notes
 
 
-def lack_joint(parts: Lines, joints: shapely.MultiLineString, grid: Grid, core: Grid) -> Bools:
-    """Return which decks on a tile have no joint, ``(n,)``; one that leaves its grid may have some beyond."""
+def lack_abutment(parts: Lines, abutments: shapely.MultiLineString, grid: Grid, core: Grid) -> Bools:
+    """Return which decks on a tile have no abutment, ``(n,)``; one beyond its grid may have some there."""
     known = shapely.contains_properly(_grown(grid, 0.0), parts) & shapely.intersects(parts, _grown(core, 0.0))
-    return np.asarray(known & ~shapely.dwithin(parts, joints, APART_M))
+    return np.asarray(known & ~shapely.dwithin(parts, abutments, APART_M))
 
 
-def _without_joint(level: Level, data: TileData) -> list[str]:
+def _without_abutment(level: Level, data: TileData) -> list[str]:
     """Return a note about the decks on a tile at which no road of level 0 begins."""
     parts = shapely.get_parts(level.areas)
-    alone = parts[lack_joint(parts, level.joints, data.grid, data.core)]
+    alone = parts[lack_abutment(parts, level.abutments, data.grid, data.core)]
     if not len(alone):
         return []
     return [
-        f"segment: {count(len(alone), 'deck')} of level {level.number} without a joint to a road of level 0, "
-        f"such as at {place(alone[0])}; check the level of the roads at its ends, and gaps above {GAP_M:g} m"
+        f"segment: {count(len(alone), 'deck')} of level {level.number} without an abutment at a road of "
+        f"level 0, such as at {place(alone[0])}; check the level of the roads at its ends, and gaps above "
+        f"{GAP_M:g} m"
     ]
