@@ -54,19 +54,17 @@ SAME_CELL = 1e-6
 class _Layer:
     """One file of the mosaic."""
 
+    name: str
+    """Name of the file, without suffix."""
     bands: tuple[cog.Band, ...]
     overviews: str
     """How cells of an overview follow from finer ones."""
 
-    @property
-    def name(self) -> str:
-        """Name of the file, without suffix."""
-        return self.bands[0].name.partition("_")[0]
-
 
 LAYERS = (
-    _Layer((cog.HEIGHT,), "average"),
+    _Layer("height", (cog.HEIGHT,), "average"),
     _Layer(
+        "normal",
         tuple(
             cog.Band(
                 f"normal_{axis}", f"Component of the upward unit normal to the {way}", "int16", "", NO_NORMAL
@@ -75,8 +73,8 @@ LAYERS = (
         ),
         "average",
     ),
-    _Layer((replace(cog.ROAD, nodata=NO_ROAD),), "mode"),
-    _Layer((cog.HEIGHT_SOURCE,), "mode"),
+    _Layer("road", (replace(cog.ROAD, nodata=NO_ROAD),), "mode"),
+    _Layer("height_source", (cog.HEIGHT_SOURCE,), "mode"),
 )
 
 
