@@ -59,11 +59,11 @@ def configuration_keys() -> int:
     return len(sections) + sum(map(len, inner))
 
 
-def parameters(command: Any) -> int:
-    """Return the number of options and arguments of a command and its subcommands, without ``--help``."""
-    own = sum(parameter.name != "help" for parameter in command.params)
+def parameters(command: Any) -> list[str]:
+    """Return the names of the options and arguments of a command and its subcommands, without ``--help``."""
+    own = [parameter.name for parameter in command.params if parameter.name != "help"]
     names = command.list_commands(None) if hasattr(command, "list_commands") else ()
-    return own + sum(parameters(command.get_command(None, name)) for name in names)
+    return [*own, *(name for inner in names for name in parameters(command.get_command(None, inner)))]
 
 
 def main() -> None:
@@ -76,6 +76,7 @@ def main() -> None:
     classes = [node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)]
     pages = [file for file in tracked("docs") if file.suffix == ".md"]
     live = [file for file in pages if "results" not in file.parts]
+    names = parameters(typer.main.get_command(app))
     figures = {
         "core: lines of Python": lines(core),
         "tools: lines of Python": lines(tools),
@@ -86,7 +87,8 @@ def main() -> None:
         "tests, bench: files": len(tests),
         "README: lines": lines([ROOT / "README.md"]),
         "configuration keys": configuration_keys(),
-        "parameters of commands": parameters(typer.main.get_command(app)),
+        "parameters of commands": len(names),
+        "parameters: different names": len(set(names)),
         "docs: words": words(live),
         "docs: words of results": words(pages) - words(live),
     }
