@@ -66,7 +66,7 @@ def test_map_job_of_two_workers_ended_by_time_limit_is_submitted_again(slurm, tm
     # The wait for the next job is that for the first one.
     monkeypatch.setattr(clusters, "WORKER_LOST_TIMEOUT_S", 0)
     night = Cluster(**TWO)
-    executor = DaskExecutor(cluster=night, say=said.append, logs=tmp_path / "logs")
+    executor = DaskExecutor(cluster=night, notify=said.append, logs=tmp_path / "logs")
 
     def jobs():
         yield from range(4)
@@ -109,7 +109,7 @@ def test_run_job_of_two_workers_cancelled_equals_serial_run(slurm, tmp_path, fle
 def mistaken(tmp_path, **options) -> tuple[str, list[str]]:
     """Return the message of the error of a cluster with wrong options, and the lines before."""
     said = []
-    executor = DaskExecutor(cluster=Cluster(**TWO, **options), say=said.append, logs=tmp_path / "logs")
+    executor = DaskExecutor(cluster=Cluster(**TWO, **options), notify=said.append, logs=tmp_path / "logs")
     with pytest.raises(ConfigError) as caught:
         list(executor.map(nap, [1, 2], lost))
     assert not jobs_of_slurm()
