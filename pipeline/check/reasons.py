@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from flexroad.catalog.text import count, some
+from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
-from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus
 from flexroad.pipeline.store.records import TileRecord

@@ -12,7 +12,6 @@ import numpy as np
 
 from flexroad.catalog import LAYERS, Tile
 from flexroad.catalog.text import some
-from flexroad.pipeline.check.finding import Finding, evenly
 from flexroad.pipeline.config.models import Config
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
@@ -25,6 +24,25 @@ MOST_TILES = 48
 """Number of tiles that are read: those with a doubtful file first, then one of each set of files."""
 MOST_ERRORS = 5
 """Number of errors that are told."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line about a catalog."""
+
+    text: str
+    fault: bool = False
+    """Whether this should be corrected before a run."""
+    warning: bool = False
+    """Whether this is said as a warning though it may be right; a fault always is."""
+    failing: frozenset[str] = frozenset()
+    """Ids of the tiles that would fail in a run."""
+
+
+def evenly(tiles: Sequence[Tile], most: int) -> list[Tile]:
+    """Return so many of the tiles at most, spread evenly over them."""
+    number = min(most, len(tiles))
+    return [tiles[k * len(tiles) // number] for k in range(number)]
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +12,7 @@ import typer
 from rich.console import Console
 
 from flexroad.catalog import Catalog, CatalogError, layouts
+from flexroad.catalog.allowlist import needed
 from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.sources import nrw, rasters, templates
 from flexroad.catalog.storage.unpack import unpack
@@ -17,11 +20,13 @@ from flexroad.catalog.text import count
 from flexroad.catalog.tiling import Conversion, TilingResult
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, LazyGroup, group
-from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, MIN_COVER_HELP, OUTPUTS, TILES
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.layers import fitting_config
 from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.record import check_inputs
 
 TOOLS = {
     "synthetic": ("tools.synthetic.command", "Make synthetic scenes with known truth, and their catalog."),
@@ -273,3 +278,27 @@ def catalog_show(path: options.CatalogFile) -> None:
         echo(f"{tile.id}  {size}  {date}  {tile.stratum or '-'}  {layers}")
     systems = sorted({tile.grid.crs for tile in catalog.usable})
     echo(f"{count(len(catalog.tiles), 'tile')}, {', '.join(crs[:60] for crs in systems)}")
+
+
+def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] = ()) -> str:
+    """Return the command that runs a catalog, ready to be pasted, or what a run lacks.
+
+    - `path`: the catalog's file.
+    - `config`: the configuration; default: the one for production that fits the catalog's layers.
+    - `changes`: values of ``--set``.
+    """
+    catalog = Catalog.read(path)
+    name = config or fitting_config(catalog)
+    settings = load_config(name, changes)
+    try:
+        check_inputs(settings, catalog)
+    except ConfigError as error:
+        return f"before a run: {error}"
+    # Many catalogs are called catalog.parquet: their folder tells them apart.
+    title = path.stem if path.stem != "catalog" else path.absolute().parent.name or "run"
+    words = ["flexroad", "run", "--config", name, *(word for change in changes for word in ("--set", change))]
+    words += ["--catalog", str(path), "--out", f"runs/{title}"]
+    # Of all layers, so that the same options suit `catalog check` and `train`.
+    for folder in needed(catalog, path.parent):
+        words += ["--allow", folder]
+    return f"next: {shlex.join(words)}"

@@ -12,10 +12,10 @@ from flexroad.catalog.skipped import lines
 from flexroad.catalog.text import count
 from flexroad.pipeline.check.failures import expected_failures
 from flexroad.pipeline.check.reasons import Kind, reason
-from flexroad.pipeline.execute.adaptive import decision, workers_of
+from flexroad.pipeline.config.stages import STAGE_NAMES
+from flexroad.pipeline.execute.executor import decision, workers_of
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import Node, layers_read, own_files_missing
-from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import refuse_incomplete

@@ -31,8 +31,8 @@ from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.dask import check_address
 from flexroad.pipeline.run.api import Prepared, Selection, Workers, created, process, reopened
 from flexroad.pipeline.run.collection import write_states
+from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.lock import describe_owner, exit_reason, owner
-from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.progress import FIRST_S, ProgressDisplay, said_repeatedly
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, pending_tiles, progress, summary

@@ -16,10 +16,9 @@ from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config import document
 from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.levels import check_levels
-from flexroad.pipeline.config.methods import DEFAULTS
 from flexroad.pipeline.config.models import ROOT, TAG, Config, Export, stage_models
 from flexroad.pipeline.config.settings import Setting, applied, merge, texts
+from flexroad.pipeline.config.stages import DEFAULTS
 from flexroad.pipeline.errors import ConfigError
 
 SECTIONS = ("dataset", "export", "cluster", "variants", "extends")
@@ -38,6 +37,8 @@ MAX_NAME = 500
 """Longest name of a file in a message that it does not exist."""
 MAX_ERRORS = 10
 """Most errors of one stage that are listed."""
+HALO_M = 40.0
+"""Smallest halo (m) with levels: farther away nothing decides on those at the border of a tile."""
 
 
 def shipped() -> dict[str, Path]:
@@ -92,7 +93,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
             )
             for stage in stages
         }
-        check_levels(chains[str(variant)], f"{name}: {where}" if overrides else name)
+        _check_levels(chains[str(variant)], f"{name}: {where}" if overrides else name)
     given = _mapping(raw.get("export") or {}, name, "export")
     export = _validate(TypeAdapter(Export), {"variants": _main_variant(chains)} | given, f"{name}: export")
     for variant in export.variants:
@@ -294,3 +295,22 @@ def _keys(model: TypeAdapter[Any]) -> dict[str, list[str]]:
 def _main_variant(chains: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the variant that is exported by default: ``flexroad``, or else the last one."""
     return ("flexroad",) if "flexroad" in chains else tuple(chains)[-1:]
+
+
+def _check_levels(chain: Mapping[str, Any], where: str) -> None:
+    """Check that the stages of a variant can compute levels, if its segmentation has them."""
+    if not getattr(chain["segment"], "levels", False):
+        return
+    load, sample = chain["load"], chain["sample"]
+    needs = [
+        (chain["ecsrc"].method == "planar", f"ecsrc: planar, not {chain['ecsrc'].method}"),
+        (chain["fit"].method == "smoothing_spline", f"fit: smoothing_spline, not {chain['fit'].method}"),
+        (load.halo_m >= HALO_M, f"load.halo_m of {HALO_M:g} or more, not {load.halo_m:g}"),
+        (sample.method == "dynamic", f"sample.method dynamic, not {sample.method}"),
+        (sample.mask == "raw", f"sample.mask raw, not {sample.mask}"),
+    ]
+    for fine, needed in needs:
+        if not fine:
+            raise ConfigError(
+                f"{where}: segment.levels needs {needed}; set it, or set segment.levels to false"
+            )

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Union
 from pydantic import BaseModel, Field, TypeAdapter, model_validator
 
 from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.methods import HOMES, methods
+from flexroad.pipeline.config.stages import HOMES, methods
 from flexroad.tasks.options import Options
 
 TAG = {"segment": "method", "ecsrc": "method", "fit": "method", "sample": "method", "cluster": "kind"}

@@ -22,9 +22,9 @@ from flexroad.catalog.borders import Border, Kind, border_at, places_of
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.tile import REACH_M, files_around
 from flexroad.pipeline.config.models import Chain, Config
+from flexroad.pipeline.config.stages import model_files, stage_head
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.sources import border_json, to_json
-from flexroad.pipeline.graph.stages import model_files, stage_head
 from flexroad.tasks.border import BorderStages, BorderTask
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options, stage_module

@@ -30,6 +30,7 @@ from flexroad.catalog import Layer, Tile
 from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.storage.paths import FileStat, Location
 from flexroad.pipeline.config.models import Chain, Config, Export
+from flexroad.pipeline.config.stages import STAGE_NAMES, STAGES, model_files, stage_head
 from flexroad.pipeline.graph.borders import STAGE, BorderPattern, has_borders
 from flexroad.pipeline.graph.sources import (
     Recorded,
@@ -40,7 +41,6 @@ from flexroad.pipeline.graph.sources import (
     names_json,
     to_json,
 )
-from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, model_files, stage_head
 from flexroad.tasks.border import ENDS, BorderTask
 from flexroad.tasks.options import Options, stage_function, stage_module
 from flexroad.tasks.products import cog, glb, npz, ply

@@ -27,14 +27,14 @@ from flexroad.catalog.text import printable
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.config.settings import Setting, applied
+from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Executor, SerialExecutor
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import layers_read
-from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.collection import MAP, write_states
+from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.record import Run, check_folder, check_links
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import Folders, open_database, recorded

@@ -27,7 +27,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, Jobs
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.run.collection import write_collection
-from flexroad.pipeline.run.event_log import EventLog
+from flexroad.pipeline.run.events import EventLog
 from flexroad.pipeline.run.record import Run, check_inputs
 from flexroad.pipeline.run.status import (
     Folders,

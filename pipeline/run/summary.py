@@ -13,9 +13,8 @@ from typing import Any
 from flexroad.catalog import Catalog
 from flexroad.catalog.skipped import lines
 from flexroad.catalog.storage.paths import Location, read, write
-from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.database import Line
-from flexroad.pipeline.store.records import Failure, TileState
+from flexroad.pipeline.store.records import Failure, TileState, dump_checked, load_checked
 
 NAME = "summary.json"
 MAX_FAILURES = 1000
@@ -119,11 +118,11 @@ def write_summary(run: Location, summary: Summary, flushed: bool = False, **abou
         **about,
         "flexroad": importlib.metadata.version("flexroad"),
     }
-    write(run / NAME, checked_json.dumps(content), flushed)
+    write(run / NAME, dump_checked(content), flushed)
 
 
 def read_summary(run: Location) -> dict[str, Any]:
     """Return the content of summary.json, empty if it is missing or damaged."""
     with contextlib.suppress(OSError, ValueError):
-        return checked_json.loads(read(run / NAME))
+        return load_checked(read(run / NAME))
     return {}

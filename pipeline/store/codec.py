@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 
 from flexroad.catalog import Grid
-from flexroad.pipeline.config.methods import methods
+from flexroad.pipeline.config.stages import methods
 from flexroad.tasks.io.archive import npz
 from flexroad.tasks.spline.frame import Corner, Edge
 from flexroad.tasks.spline.levelled import LevelledSurface

@@ -15,19 +15,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.catalog import Grid
+from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.scan.rasters import quiet
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store.products import file_entry
+from flexroad.pipeline.worker.evaluator import check_unchanged
+from flexroad.tasks.errors import LayerMissing
+from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.levels.seen import top_mask
+from flexroad.tasks.load import layer_source
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import cog, glb, npz, ply
 from flexroad.tasks.quality.height_source import of_faces, top_height_source
 from flexroad.tasks.roads.level_numbers import HIGHEST
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Bools, Floats, Quality, Surface
+from flexroad.tasks.types import Bools, Floats, Orthophoto, Quality, Surface
 
 CLASSIFICATION = "https://stac-extensions.github.io/classification/v2.0.0/schema.json"
 FILE = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
@@ -35,6 +39,9 @@ RASTER = "https://stac-extensions.github.io/raster/v2.0.0/schema.json"
 EXTENSIONS = (FILE, RASTER, CLASSIFICATION)
 """Extensions of the assets, besides the projection extension of the catalog's items."""
 COLLECTION = "collection.json"
+NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"
+QUALITY = 85
+"""Quality of the texture's JPEG (percent): blocks are hardly visible."""
 JSON, GEOJSON = "application/json", "application/geo+json"
 
 
@@ -272,3 +279,42 @@ def _band(band: cog.Band, cell: float | None) -> dict[str, Any]:
     }
     known = {name: value for name, value in optional.items() if value is not None}
     return {"name": band.name, "description": band.meaning, "data_type": band.dtype} | known
+
+
+def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
+    """Return the texture of a tile's meshes: its orthophoto, at its own resolution up to `export.texture_px`.
+
+    - `texture`: none if the configuration wants none, or the tile has no photo.
+    - `note`: what the photo lacks, or empty.
+    """
+    export, tile = graph.export, graph.tile
+    if not export.texture:
+        return None, ""
+    if not graph.product_sources:
+        return None, NO_PHOTO
+    (layer,) = graph.product_sources
+    try:
+        photo = tile_photo(tile, layer, export.texture_px)
+    finally:
+        check_unchanged(graph, tile.paths(layer))
+    if photo is None:
+        return None, NO_PHOTO
+    unknown = 1 - photo.known.mean()
+    note = f"dop: {unknown:.1%} of the texture has no orthophoto and takes its mean colour" if unknown else ""
+    return glb.texture(photo, QUALITY), note
+
+
+def tile_photo(tile: Tile, layer: Layer, largest_px: int) -> Orthophoto | None:
+    """Return the orthophoto of a tile, None if no pixel of it is known.
+
+    - `layer`: the tile's orthophoto.
+    - `largest_px`: largest width and height (pixels); a finer photo is averaged.
+    """
+    source = layer_source(replace(tile, layers=(layer,)), layer.name)
+    assert source is not None
+    west, south, east, north = tile.grid.bounds
+    try:
+        photo = read_photo(source, tile.grid, finest_m=max(east - west, north - south) / largest_px)
+    except LayerMissing:
+        return None
+    return photo if photo.known.any() else None

@@ -14,8 +14,8 @@ from typing import Any
 
 from flexroad.catalog.index import item
 from flexroad.catalog.storage.paths import parse_location, stat
+from flexroad.pipeline.config.stages import STAGE_NAMES, stage_version
 from flexroad.pipeline.graph.graph import TileGraph
-from flexroad.pipeline.graph.stages import STAGE_NAMES, stage_version
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import (
@@ -32,8 +32,15 @@ from flexroad.pipeline.store.records import (
     utc_now,
 )
 from flexroad.pipeline.worker.evaluator import Evaluator, StageCost, StageError, failure_of
-from flexroad.pipeline.worker.exports import EXTENSIONS, Product, assets, links, product_names, products
-from flexroad.pipeline.worker.texture import tile_texture
+from flexroad.pipeline.worker.exports import (
+    EXTENSIONS,
+    Product,
+    assets,
+    links,
+    product_names,
+    products,
+    tile_texture,
+)
 from flexroad.tasks.io.left_out import recorded
 from flexroad.tasks.types import Metrics, Quality
 

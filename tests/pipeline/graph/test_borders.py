@@ -19,10 +19,10 @@ from flexroad.catalog.sources import prepared, rasters
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.tile import REACH_M
 from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.config.stages import model_files
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE, check_tiles
 from flexroad.pipeline.graph.graph import Pattern, files_read, tile_graph
-from flexroad.pipeline.graph.stages import model_files
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks import load
 from flexroad.tasks.border import ENDS, BorderStages

@@ -13,6 +13,7 @@ import pytest
 from flexroad.catalog import Catalog, Layer
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.config.stages import STAGE_NAMES, STAGES, stage_head, stage_version
 from flexroad.pipeline.graph.graph import (
     Pattern,
     any_file_missing,
@@ -21,7 +22,6 @@ from flexroad.pipeline.graph.graph import (
     tile_graph,
 )
 from flexroad.pipeline.graph.sources import SourceFiles
-from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_head, stage_version
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.options import stage_module
 from flexroad.tasks.segment import mask, vector

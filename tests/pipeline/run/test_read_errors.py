@@ -33,7 +33,8 @@ from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import open_database, tile_states
-from flexroad.pipeline.store import checked_json, codec
+from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.records import load_checked
 from flexroad.tasks.io import vectors
 from flexroad.tasks.products import npz
 from flexroad.tools.synthetic.scenes import write_scenes
@@ -415,7 +416,7 @@ def test_blocks_damaged_for_some_nights_leave_no_trace(survey, tmp_path):
             damage(sheet, *cell)
         os.utime(sheet, ns=(stat.st_atime_ns, stat.st_mtime_ns))
         assert night(out, catalog)[0].failed == len(cells[:1])
-        item = checked_json.loads((out / "tiles" / "500040_5600040" / "item.json").read_bytes())
+        item = load_checked((out / "tiles" / "500040_5600040" / "item.json").read_bytes())
         loads.append(item["properties"]["flexroad:nodes"]["flexroad"]["load"])
     assert loads[0] == loads[1]
     assert len(set(loads)) == 3
