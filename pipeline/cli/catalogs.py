@@ -45,19 +45,15 @@ app = group("catalog", "Make, show and check catalogs of tiles.", _Catalogs)
 
 Output = Annotated[
     Path,
-    typer.Option(
-        "-o",
-        "--output",
-        metavar="FILE",
-        help="Catalog to write: .parquet, .json or .geojson.",
-        rich_help_panel=OUTPUTS,
+    options.under(
+        OUTPUTS, "Catalog to write: .parquet, .json or .geojson.", "-o", "--output", metavar="FILE"
     ),
 ]
 
 
 def _files(meaning: str, metavar: str = "PATTERN") -> Any:
     """Return an option that names input files."""
-    return typer.Option(metavar=metavar, help=meaning, rich_help_panel=INPUTS)
+    return options.under(INPUTS, meaning, metavar=metavar)
 
 
 RoadMask = Annotated[str | None, _files("Files of the road mask or land cover.")]
@@ -68,40 +64,20 @@ Roads = Annotated[str | None, _files("Vector files of roads: a file, or a patter
 RoadsLayer = Annotated[str | None, _files("Layer of the roads, if --roads has several.", "NAME")]
 Crs = Annotated[str | None, _files("CRS of files without one: EPSG:25832.", "CRS")]
 Reproject = Annotated[
-    bool,
-    typer.Option(
-        "--reproject",
-        help="Warp rasters in another CRS or in feet when they are read.",
-        rich_help_panel=INPUTS,
-    ),
+    bool, options.under(INPUTS, "Warp rasters in another CRS or in feet when they are read.", "--reproject")
 ]
 Date = Annotated[
     datetime | None,
-    typer.Option(
-        metavar="YYYY-MM-DD",
-        help="Date of the survey; default: that of the files.",
-        rich_help_panel=INPUTS,
-    ),
+    options.under(INPUTS, "Date of the survey; default: that of the files.", metavar="YYYY-MM-DD"),
 ]
-TileSize = Annotated[
-    float, typer.Option(metavar="METRES", help="Size of a tile in m.", rich_help_panel=TILES)
-]
-MinCover = Annotated[
-    float,
-    typer.Option(
-        min=0,
-        max=1,
-        metavar="SHARE",
-        help=MIN_COVER_HELP,
-        rich_help_panel=TILES,
-    ),
-]
+TileSize = Annotated[float, options.under(TILES, "Size of a tile in m.", metavar="METRES")]
+MinCover = Annotated[float, options.under(TILES, MIN_COVER_HELP, min=0, max=1, metavar="SHARE")]
 Strict = Annotated[
     bool,
-    typer.Option(
+    options.under(
+        OUTPUTS,
+        "Write no catalog if a file cannot be used; default: leave it out, with exit code 1.",
         "--strict",
-        help="Write no catalog if a file cannot be used; default: leave it out, with exit code 1.",
-        rich_help_panel=OUTPUTS,
     ),
 ]
 Layout = Annotated[str, _files("Configuration whose `dataset` gives the file names.", "NAME|FILE")]
@@ -125,18 +101,11 @@ def catalog_rasters(
     reproject: Reproject = False,
     to_crs: Annotated[
         str | None,
-        typer.Option(
-            metavar="CRS",
-            help="CRS of the tiles, with --reproject; default: the DSM's.",
-            rich_help_panel=TILES,
-        ),
+        options.under(TILES, "CRS of the tiles, with --reproject; default: the DSM's.", metavar="CRS"),
     ] = None,
     height_unit: Annotated[
         Literal["metre", "foot", "us-foot"] | None,
-        typer.Option(
-            help="Unit of heights if a file has none; default: metre, or that of the plan.",
-            rich_help_panel=INPUTS,
-        ),
+        options.under(INPUTS, "Unit of heights if a file has none; default: metre, or that of the plan."),
     ] = None,
     date: Date = None,
     tile_size: TileSize = 250,

@@ -34,9 +34,7 @@ class Export(Options):
     """The products written for the user, besides the metrics."""
 
     variants: tuple[str, ...] = Field(
-        ("flexroad",),
-        min_length=1,
-        description="variants whose meshes are kept; query uses the first",
+        ("flexroad",), min_length=1, description="variants whose meshes are kept; query uses the first"
     )
     formats: tuple[Format, ...] = Field(
         ("glb", "ply", "cog", "npz"),

@@ -33,7 +33,7 @@ class Setting:
         if not equals or not all(keys):
             raise ConfigError(f"--set {shown(text)}: give KEY=VALUE, like --set fit.spacing_m=5")
         option = f"--set {printable(key)}"
-        return cls(keys, document.parse(value.encode(errors="surrogateescape"), option).value)
+        return cls(keys, document.parse(value.encode(errors="surrogateescape"), option)[0])
 
     @property
     def selects_method(self) -> bool:
@@ -58,11 +58,8 @@ def texts(settings: Sequence[str] | Mapping[str, Any]) -> list[str]:
 
 def _flow(value: Any) -> str:
     """Return a value as one line of YAML."""
-    return (
-        yaml.safe_dump(value, default_flow_style=True, width=1e9, sort_keys=False)
-        .removesuffix("...\n")
-        .strip()
-    )
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=1e9, sort_keys=False)
+    return text.removesuffix("...\n").strip()
 
 
 def applied(raw: Mapping[str, Any], settings: Sequence[Setting]) -> dict[str, Any]:

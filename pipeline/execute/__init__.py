@@ -9,10 +9,4 @@ processes (``docs/decisions.md`` has the measurement against one task per stage)
 from flexroad.pipeline.execute.dask import DaskExecutor
 from flexroad.pipeline.execute.executor import AdaptiveExecutor, Executor, Jobs, SerialExecutor
 
-__all__ = [
-    "AdaptiveExecutor",
-    "DaskExecutor",
-    "Executor",
-    "Jobs",
-    "SerialExecutor",
-]
+__all__ = ["AdaptiveExecutor", "DaskExecutor", "Executor", "Jobs", "SerialExecutor"]

@@ -29,41 +29,23 @@ def check_address(address: str) -> None:
         )
 
 
+@dataclass(frozen=True)
 class DaskExecutor:
-    """Runs jobs on local worker processes of one thread each, or on another Dask cluster.
+    """Runs jobs on local worker processes of one thread each, or on another Dask cluster."""
 
-    Parameters
-    ----------
-    workers : int, optional
-        Number of processes; by default that of ``cluster``.
-    scheduler : str, optional
-        Address of a running Dask scheduler, which is used instead of ``cluster``.
-    cluster : Cluster
-        The kind and size of the cluster, and how long to wait for workers.
-    dashboard : bool
-        Serve Dask's dashboard; its address is passed to ``notify``.
-    notify : callable
-        Prints one line for the user: the address of the dashboard, a wait for workers.
-    logs : Path, optional
-        Folder for the output of SLURM jobs, on a disk that all machines share; by default one in the home
-        folder, which is removed at the end.
-    """
-
-    def __init__(
-        self,
-        workers: int | None = None,
-        scheduler: str | None = None,
-        cluster: Cluster = LOCAL,
-        dashboard: bool = False,
-        notify: Notify = lambda line: None,
-        logs: Path | None = None,
-    ) -> None:
-        self.workers = workers
-        self.scheduler = scheduler
-        self.cluster = cluster
-        self.dashboard = dashboard
-        self.notify = notify
-        self.logs = logs
+    workers: int | None = None
+    """Number of processes; by default that of ``cluster``."""
+    scheduler: str | None = None
+    """Address of a running Dask scheduler, which is used instead of ``cluster``."""
+    cluster: Cluster = LOCAL
+    """The kind and size of the cluster, and how long to wait for workers."""
+    dashboard: bool = False
+    """Whether Dask's dashboard is served; its address is passed to ``notify``."""
+    notify: Notify = lambda line: None
+    """Prints one line for the user: the address of the dashboard, a wait for workers."""
+    logs: Path | None = None
+    """Folder for the output of SLURM jobs, on a disk that all machines share; by default one in the home
+    folder, which is removed at the end."""
 
     def map(
         self,

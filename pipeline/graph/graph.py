@@ -316,19 +316,14 @@ def _border_nodes(tile: Tile, step: Step, sources: SourceFiles, grid: str) -> li
     assert step.borders
     pattern, nodes = step.borders, list[Node]()
     models = sources.models(pattern.files)
-    for number, part in enumerate(pattern.parts(tile)):
+    for number, (task, place, layers) in enumerate(pattern.parts(tile)):
         ends = tuple(nodes[end].fingerprint for end in ENDS[number - 4]) if number >= 4 else ()
         # Files of unknown position may have none of their own: it is then that of the tile.
-        core = "null" if all(layer.extents for layer, _ in part.layers) else grid
-        text = ",".join([sources.text(layer, numbers) for layer, numbers in part.layers])
-        name = hashed(f"[{pattern.head},{part.place},{core}],{names_json(ends)},[{text}],{models}]")
-        nodes.append(Node(name, STAGE, step.options, ends, stored=True, border=part.task))
+        core = "null" if all(layer.extents for layer, _ in layers) else grid
+        text = ",".join([sources.text(layer, numbers) for layer, numbers in layers])
+        name = hashed(f"[{pattern.head},{place},{core}],{names_json(ends)},[{text}],{models}]")
+        nodes.append(Node(name, STAGE, step.options, ends, stored=True, border=task))
     return nodes
-
-
-def tile_graph(tile: Tile, config: Config, checksum: bool = False) -> TileGraph:
-    """Return the graph of one tile; for many tiles `Pattern.graph` is faster."""
-    return Pattern.of(config).graph(tile, checksum)
 
 
 def files_read(graph: TileGraph, node: Node) -> list[Location]:

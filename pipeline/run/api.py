@@ -181,7 +181,10 @@ def process(prepared: Prepared, verify: bool = False) -> Summary:
     try:
         summary = run_tiles(run, prepared.executor, prepared.only, prepared.force, observer.tile, verify)
     finally:
-        _write_map(run, observer)
+        try:
+            write_states(run, run.path / MAP)
+        except OSError as error:
+            observer.warning(f"cannot write the map of the tiles: {error}")
     observer.end(summary)
     return summary
 
@@ -322,10 +325,3 @@ def _executor(run: Run, workers: Workers, died: bool, observer: Observer) -> Exe
     if workers.executor == "dask" or died or needed:
         return parallel
     return AdaptiveExecutor(workers.number or cluster.workers, parallel, observer.line)
-
-
-def _write_map(run: Run, observer: Observer) -> None:
-    try:
-        write_states(run, run.path / MAP)
-    except OSError as error:
-        observer.warning(f"cannot write the map of the tiles: {error}")

@@ -181,12 +181,7 @@ def vrt_name(kind: Kind) -> str:
 
 
 def _write_vrt(
-    run: Run,
-    grid: Grid,
-    kind: Kind,
-    band: Band,
-    tiles: Sequence[Tile],
-    own: Mapping[str, str] | None = None,
+    run: Run, grid: Grid, kind: Kind, band: Band, tiles: Sequence[Tile], own: Mapping[str, str] | None = None
 ) -> None:
     """Write a mosaic of one kind of raster, and on disk its style: in a bucket QGIS would not look for it.
 

@@ -38,16 +38,7 @@ from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.flagged import Bits
 from flexroad.tasks.quality.places import Place, places
-from flexroad.tasks.types import (
-    Floats,
-    Mesh,
-    Metrics,
-    Quality,
-    RoadClusters,
-    RoadMask,
-    Surface,
-    TileData,
-)
+from flexroad.tasks.types import Floats, Mesh, Metrics, Quality, RoadClusters, RoadMask, Surface, TileData
 
 ESTIMATES = 32
 """Number of tiles of which a process keeps the error estimates (0.6 MB each)."""

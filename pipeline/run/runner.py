@@ -255,9 +255,7 @@ def _close(
     interrupted = isinstance(error, KeyboardInterrupt)
     distances = MeshDistances()
     summary = replace(
-        _final_summary(run, database, start, plan, interrupted),
-        interrupted=interrupted,
-        refused=refused,
+        _final_summary(run, database, start, plan, interrupted), interrupted=interrupted, refused=refused
     )
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)

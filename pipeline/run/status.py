@@ -86,10 +86,6 @@ class TileStatus:
         return not self.done and self.last_record is not None and self.last_record.has_products
 
 
-def ignored(status: TileStatus, state: TileState) -> None:
-    """Do nothing with a tile that was checked."""
-
-
 @dataclass(frozen=True)
 class Folders:
     """The files of a run's tiles: one listing per tile on disk, one listing for all tiles in a bucket."""
@@ -247,7 +243,7 @@ def pending_tiles(run: Run) -> Iterator[TileStatus]:
 
 
 def summary(
-    run: Run, track: Track = untracked, each: Callable[[TileStatus, TileState], object] = ignored
+    run: Run, track: Track = untracked, each: Callable[[TileStatus, TileState], object] = lambda *_: None
 ) -> Summary:
     """Return the current summary of a run; checks every tile, its sources and its products.
 

@@ -13,6 +13,7 @@ from typing import Any
 from flexroad.catalog import Catalog
 from flexroad.catalog.skipped import lines
 from flexroad.catalog.storage.paths import Location, read, write
+from flexroad.catalog.text import count
 from flexroad.pipeline.store.database import Line
 from flexroad.pipeline.store.records import Failure, TileState, dump_checked, load_checked
 
@@ -62,6 +63,11 @@ class Summary:
     def to_look_at(self) -> str:
         """``; 4 to look at`` for the end of a line about the tiles; empty if none has flags."""
         return f"; {len(self.flagged)} to look at" if self.flagged else ""
+
+    @property
+    def files_skipped(self) -> str:
+        """``; 2 files skipped by the catalog`` for such a line; empty if there are none."""
+        return f"; {count(self.skipped, 'file')} skipped by the catalog" if self.skipped else ""
 
     @property
     def exit_code(self) -> int:

@@ -107,12 +107,7 @@ class TileProducts:
 
 def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:
     """Return a STAC asset with size and checksum (a sha256 multihash, as the file extension requires)."""
-    return {
-        "href": name,
-        "type": media_type,
-        "file:size": len(data),
-        "file:checksum": _checksum(data),
-    }
+    return {"href": name, "type": media_type, "file:size": len(data), "file:checksum": _checksum(data)}
 
 
 def _checksum(data: bytes) -> str:

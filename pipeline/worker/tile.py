@@ -108,16 +108,6 @@ class TileResult:
         """Stage -> number of nodes computed in this run."""
         return {stage: span.computed for stage, span in self.spans.items() if span.computed}
 
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Stage -> computing time in this run (s)."""
-        return {stage: span.seconds for stage, span in self.spans.items() if span.computed}
-
-    @property
-    def peak_mb(self) -> float:
-        """Peak memory of the worker while it processed the tile (MB)."""
-        return max((span.peak_mb for span in self.spans.values()), default=0.0)
-
 
 def process_tile(job: TileJob) -> TileResult:
     """Bring one tile up to date with its graph; errors of the tile are returned as failures, not raised."""
@@ -281,11 +271,7 @@ def _item(
         "flexroad:sources": graph.sources,
         "flexroad:left_out": list(evaluator.left_out),
         "flexroad:renamed": evaluator.renamed,
-        "flexroad:versions": _versions(graph),
+        "flexroad:versions": dict(stage_version(node.stage, node.options) for node in graph.nodes.values()),
         "flexroad:seconds": seconds,
     }
     return content
-
-
-def _versions(graph: TileGraph) -> dict[str, int]:
-    return dict(stage_version(node.stage, node.options) for node in graph.nodes.values())
