@@ -46,7 +46,7 @@ __all__ = [
 _HOME = {
     "CatalogError": "catalog.errors",
     "ConfigError": "pipeline.errors",
-    "Observer": "pipeline.run.observer",
+    "Observer": "pipeline.run.events",
     "RunView": "tools.results.run",
     "Surface": "tools.results.surface",
     "TaskError": "tasks.errors",

@@ -17,7 +17,7 @@ from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config import document
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.models import ROOT, TAG, Config, Export, stage_models
-from flexroad.pipeline.config.settings import Setting, applied, merge, texts
+from flexroad.pipeline.config.settings import applied, merge, parsed, texts
 from flexroad.pipeline.config.stages import DEFAULTS
 from flexroad.pipeline.errors import ConfigError
 
@@ -61,7 +61,7 @@ def load_config(
     if not settings:
         return config
     given = texts(settings)
-    changed = applied(config.raw, [Setting.parse(text) for text in given])
+    changed = applied(config.raw, map(parsed, given))
     return compose(changed, " ".join([str(name), *(f"--set {printable(text)}" for text in given)]))
 
 

@@ -263,14 +263,6 @@ def summary(
     return replace(current, **{name: last[name] for name in names if name in last})
 
 
-def recorded_summary(run: Run, database: RunDatabase, since: str) -> Summary:
-    """Return the summary of a run that started at a time (ISO 8601, UTC), from the database.
-
-    Only if the database is damaged or has other tiles, every tile is checked.
-    """
-    return summarise(run.catalog, recorded(run, database, since), run.config.export.variants[0])
-
-
 def progress(run: Run, owner: Owner) -> tuple[Summary, str]:
     """Return the summary of an active run and its rate as text, ``""`` if no tile is finished yet.
 

@@ -145,7 +145,9 @@ def products(
             elif name == "cog":
                 encoded = _cog(graph.tile.grid, nodes, evaluate, vertical)
             else:
-                encoded = _npz(nodes, evaluate)
+                surface = evaluate(nodes["fit"])
+                # Planes and rasters have no NURBS form, and their npz would only repeat the input.
+                encoded = {NPZ: npz.encode(surface)} if isinstance(surface, NurbsSurface) else {}
             for kind, data in encoded.items():
                 known = vertical if kind.band is cog.HEIGHT else None
                 files[file_name(graph.tile.id, variant, kind)] = Product(kind, variant, data, known)
@@ -199,12 +201,6 @@ def _of_levels(
             quality.at(number).height_source, core
         )
     return top_height_source(quality, top), files
-
-
-def _npz(nodes: dict[str, str], evaluate: Callable[[str], Any]) -> dict[Kind, bytes]:
-    surface = evaluate(nodes["fit"])
-    # Planes and rasters have no NURBS form, and their npz would only repeat the input.
-    return {NPZ: npz.encode(surface)} if isinstance(surface, NurbsSurface) else {}
 
 
 def assets(files: Mapping[str, Product], variants: tuple[str, ...], grid: Grid) -> dict[str, Any]:
