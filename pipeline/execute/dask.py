@@ -13,7 +13,7 @@ from typing import Any
 from flexroad.catalog.text import Notify, without_credentials
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute.executor import Executor, J, Probe, R
+from flexroad.pipeline.execute.executor import Executor, J, Lost, Probe, R
 
 LOCAL = Cluster()
 ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?([^\s:/@\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}")
@@ -48,11 +48,7 @@ class DaskExecutor:
     folder, which is removed at the end."""
 
     def map(
-        self,
-        function: Callable[[J], R],
-        jobs: Iterable[J],
-        lost: Callable[[J, str], R],
-        probe: Probe | None = None,
+        self, function: Callable[[J], R], jobs: Iterable[J], lost: Lost[J, R], probe: Probe | None = None
     ) -> Generator[R, None, None]:
         """Yield results as tiles finish."""
         queue = iter(jobs)
@@ -83,7 +79,7 @@ class DaskExecutor:
 
 
 @dataclass(frozen=True)
-class _ConnectedExecutor:
+class _ConnectedExecutor(Executor):
     """Runs jobs on the workers of a cluster that is connected."""
 
     client: Any
@@ -92,11 +88,7 @@ class _ConnectedExecutor:
     notify: Notify
 
     def map(
-        self,
-        function: Callable[[J], R],
-        jobs: Iterable[J],
-        lost: Callable[[J, str], R],
-        probe: Probe | None = None,
+        self, function: Callable[[J], R], jobs: Iterable[J], lost: Lost[J, R], probe: Probe | None = None
     ) -> Generator[R, None, None]:
         """Yield results as tiles finish; the caller has entered ``probe``."""
         # A run with nothing to do, which comes no further, starts without Dask.
@@ -115,7 +107,3 @@ class _ConnectedExecutor:
             probe,
         )
         yield from jobs_on_cluster.results()
-
-    def held(self) -> contextlib.AbstractContextManager[Executor]:
-        """Return a context manager of this executor."""
-        return contextlib.nullcontext(self)

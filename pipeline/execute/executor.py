@@ -25,6 +25,8 @@ from flexroad.catalog.text import Notify, count
 
 J = TypeVar("J")
 R = TypeVar("R")
+Lost = Callable[[J, str], R]
+"""Takes a job and the reason, returns the result of a job whose worker process died twice."""
 START_S = 12.0
 """CPU time per core of the start of workers (s): processes, imports, compiled code. Measured: runs of 48
 tiles took 25 s more with two workers than with none."""
@@ -73,11 +75,7 @@ class Executor(Protocol):
     """Applies a function to jobs."""
 
     def map(
-        self,
-        function: Callable[[J], R],
-        jobs: Iterable[J],
-        lost: Callable[[J, str], R],
-        probe: Probe | None = None,
+        self, function: Callable[[J], R], jobs: Iterable[J], lost: Lost[J, R], probe: Probe | None = None
     ) -> Generator[R, None, None]:
         """Yield results in the order of completion, with a bounded number of jobs in flight.
 
@@ -88,7 +86,7 @@ class Executor(Protocol):
         jobs : iterable
             The jobs; taken one by one as workers become free.
         lost : callable
-            Takes a job and the reason, returns the result of a job whose worker process died twice.
+            Gives the result of a job that is lost (`Lost`).
         probe : Probe, optional
             Check of each worker process before its first job. A worker that fails gets no job.
 
@@ -101,26 +99,19 @@ class Executor(Protocol):
         """
 
     def held(self) -> AbstractContextManager[Executor]:
-        """Return a context manager of an executor whose calls of `map` use the same workers."""
+        """Return a context manager of an executor whose calls of `map` use the same workers, if any."""
+        return nullcontext(self)
 
 
-class SerialExecutor:
+class SerialExecutor(Executor):
     """Runs one job after the other in this process."""
 
     def map(
-        self,
-        function: Callable[[J], R],
-        jobs: Iterable[J],
-        lost: Callable[[J, str], R],
-        probe: Probe | None = None,
+        self, function: Callable[[J], R], jobs: Iterable[J], lost: Lost[J, R], probe: Probe | None = None
     ) -> Generator[R, None, None]:
         """Yield results in the order of the jobs; ``probe`` is not needed: there is no worker."""
         for job in jobs:
             yield function(job)
-
-    def held(self) -> AbstractContextManager[Executor]:
-        """Return a context manager of this executor: there are no workers."""
-        return nullcontext(self)
 
 
 @dataclass(frozen=True)
@@ -179,17 +170,12 @@ def decision(number: int, workers: int, job_s: float | None, sure: bool = False)
     return f"no worker processes: {what}, less work than the start of {workers}"
 
 
-class AdaptiveExecutor:
+class AdaptiveExecutor(Executor):
     """Runs jobs in this process until workers pay for their start; the rest on workers.
 
-    Parameters
-    ----------
-    workers : int, optional
-        Largest number of worker processes; by default one per core.
-    parallel : Executor
-        Runs the jobs on the workers.
-    notify : callable
-        Prints each decision, one line.
+    - `workers`: largest number of worker processes; by default one per core.
+    - `parallel`: runs the jobs on the workers.
+    - `notify`: prints each decision, one line.
     """
 
     def __init__(self, workers: int | None, parallel: Executor, notify: Notify) -> None:
@@ -198,11 +184,7 @@ class AdaptiveExecutor:
         self.notify = notify
 
     def map(
-        self,
-        function: Callable[[J], R],
-        jobs: Iterable[J],
-        lost: Callable[[J, str], R],
-        probe: Probe | None = None,
+        self, function: Callable[[J], R], jobs: Iterable[J], lost: Lost[J, R], probe: Probe | None = None
     ) -> Generator[R, None, None]:
         """Yield results: first of the jobs done here, in their order, then of those done by workers."""
         if not isinstance(jobs, Jobs):
@@ -223,10 +205,6 @@ class AdaptiveExecutor:
         if left < jobs.number:
             self._tell(jobs, left, times)
         yield from self.parallel.map(function, rest, lost, probe)
-
-    def held(self) -> AbstractContextManager[Executor]:
-        """Return a context manager of this executor; each call of `map` may start workers of its own."""
-        return nullcontext(self)
 
     def _tell(self, jobs: Jobs[J], left: int, times: Sequence[float]) -> None:
         line = decision(left, self.workers, *estimate(times, jobs.job_s))

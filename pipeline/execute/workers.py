@@ -51,12 +51,8 @@ _thread = local()
 class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
     """Limits a worker to one thread; before its first job, compares versions and takes the client's probe.
 
-    Parameters
-    ----------
-    versions : mapping
-        Versions of the client, from `versions`.
-    probe : Probe, optional
-        Check of what the jobs need.
+    - `versions`: those of the client, from `versions`.
+    - `probe`: check of what the jobs need.
     """
 
     def __init__(self, versions: Mapping[str, str], probe: Probe | None = None) -> None:

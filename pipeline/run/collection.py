@@ -97,7 +97,10 @@ def collection(run: Run, done: Sequence[Tile], mosaics: Sequence[Kind]) -> dict[
         "assets": {"metrics": METRICS} | {kind.key: _mosaic(kind) for kind in mosaics},
         "links": [
             {"rel": "root", "href": f"./{COLLECTION}", "type": JSON, "title": run.collection},
-            *(_item_link(tile) for tile in done),
+            *(
+                {"rel": "item", "href": f"./tiles/{safe_name(t.id)}/{DONE}", "type": GEOJSON, "title": t.id}
+                for t in done
+            ),
         ],
     }
 
@@ -109,10 +112,6 @@ def _mosaic(kind: Kind) -> dict[str, Any]:
         "title": f"{kind.title}, all tiles, as GDAL VRT",
         "roles": ["data"],
     }
-
-
-def _item_link(tile: Tile) -> dict[str, str]:
-    return {"rel": "item", "href": f"./tiles/{safe_name(tile.id)}/{DONE}", "type": GEOJSON, "title": tile.id}
 
 
 def _degrees(tiles: Sequence[Tile]) -> Bounds:

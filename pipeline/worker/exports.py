@@ -31,7 +31,7 @@ from flexroad.tasks.products import cog, glb, npz, ply
 from flexroad.tasks.quality.height_source import of_faces, top_height_source
 from flexroad.tasks.roads.level_numbers import HIGHEST
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Bools, Floats, Orthophoto, Quality, Surface
+from flexroad.tasks.types import Bools, Orthophoto, Quality, Surface
 
 CLASSIFICATION = "https://stac-extensions.github.io/classification/v2.0.0/schema.json"
 FILE = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
@@ -141,7 +141,9 @@ def products(
                 mesh = evaluate(nodes["sample"])
                 encoded = {GLB: glb.encode(mesh, (*origin, 0.0), texture, normals, graph.tile.id)}
             elif name == "ply":
-                encoded = _ply(nodes, evaluate, normals)
+                mesh, quality = evaluate(nodes["sample"]), evaluate(nodes["assess"])
+                sources = of_faces(quality.height_source, evaluate(nodes["segment"]), mesh, quality.levels)
+                encoded = {PLY: ply.encode(mesh, sources, normals)}
             elif name == "cog":
                 encoded = _cog(graph.tile.grid, nodes, evaluate, vertical)
             else:
@@ -152,13 +154,6 @@ def products(
                 known = vertical if kind.band is cog.HEIGHT else None
                 files[file_name(graph.tile.id, variant, kind)] = Product(kind, variant, data, known)
     return files
-
-
-def _ply(nodes: dict[str, str], evaluate: Callable[[str], Any], normals: Floats | None) -> dict[Kind, bytes]:
-    mesh = evaluate(nodes["sample"])
-    quality = evaluate(nodes["assess"])
-    height_source = of_faces(quality.height_source, evaluate(nodes["segment"]), mesh, quality.levels)
-    return {PLY: ply.encode(mesh, height_source, normals)}
 
 
 def _cog(
@@ -237,15 +232,6 @@ def item_assets(variants: tuple[str, ...], formats: Iterable[str], cells: set[fl
 def asset_key(kind: Kind, variant: str, variants: tuple[str, ...]) -> str:
     """Return the key of the asset of a variant; ``variants`` are all that are exported."""
     return kind.key if variant == variants[0] else f"{kind.key}_{variant}"
-
-
-def links(collection: str) -> list[dict[str, str]]:
-    """Return the links of an item from its folder to the collection of its run."""
-    up = f"../../{COLLECTION}"
-    return [
-        {"rel": rel, "href": up, "type": JSON, "title": collection}
-        for rel in ("root", "parent", "collection")
-    ]
 
 
 def _described(kind: Kind, variant: str, variants: tuple[str, ...], cell: float | None) -> dict[str, Any]:

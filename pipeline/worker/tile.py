@@ -33,10 +33,11 @@ from flexroad.pipeline.store.records import (
 )
 from flexroad.pipeline.worker.evaluator import Evaluator, StageCost, StageError, failure_of
 from flexroad.pipeline.worker.exports import (
+    COLLECTION,
     EXTENSIONS,
+    JSON,
     Product,
     assets,
-    links,
     product_names,
     products,
     tile_texture,
@@ -258,7 +259,8 @@ def _item(
     graph = job.graph.renamed(evaluator.renamed)
     content = item(graph.tile)
     content["collection"] = job.collection
-    content["links"] = links(job.collection)
+    to_collection = {"href": f"../../{COLLECTION}", "type": JSON, "title": job.collection}
+    content["links"] = [{"rel": rel} | to_collection for rel in ("root", "parent", "collection")]
     content["stac_extensions"] += EXTENSIONS
     content["assets"] = assets(files, graph.export.variants, graph.tile.grid)
     content["properties"] |= {
