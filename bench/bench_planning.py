@@ -36,10 +36,9 @@ from flexroad.pipeline.execute.executor import Probe
 from flexroad.pipeline.graph.graph import Node
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.store.checked_json import loads
 from flexroad.pipeline.store.codec import HEADER
 from flexroad.pipeline.store.database import NAME as DATABASE
-from flexroad.pipeline.store.records import DONE, from_item
+from flexroad.pipeline.store.records import DONE, from_item, load_checked
 from flexroad.pipeline.worker.tile import TileJob, TileResult, marker_stat
 from flexroad.tasks.io.archive import npz
 from flexroad.tools.synthetic import SceneOptions, make_scene
@@ -149,7 +148,7 @@ class Copied:
     def __init__(self, run: Run, tile_id: str) -> None:
         graph = run.graph(next(tile for tile in run.catalog.tiles if tile.id == tile_id))
         self.grid, self.store = graph.tile.grid, run.store
-        self.item = loads((run.folder(tile_id).path / DONE).read_bytes())
+        self.item = load_checked((run.folder(tile_id).path / DONE).read_bytes())
         nodes = (graph.nodes[graph.variants["flexroad"][stage]] for stage in STORED)
         self.stored = {node.stage: separated(path(self.store, node).read_bytes()) for node in nodes}
 

@@ -33,7 +33,7 @@ from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.sources.rasters import index
 from flexroad.pipeline.cli.main import main as flexroad
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES
+from flexroad.pipeline.config.stages import STAGE_NAMES, STAGES
 from flexroad.tasks.options import stage_function
 from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
 from flexroad.tools.synthetic import gerod, make_scene

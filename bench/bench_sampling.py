@@ -22,8 +22,8 @@ import pandas as pd
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.config.stages import STAGES
 from flexroad.pipeline.graph.graph import Pattern
-from flexroad.pipeline.graph.stages import STAGES
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.dihedral import mean_angles

@@ -13,8 +13,8 @@ from typing import Any
 
 import typer
 
+from flexroad.pipeline.cli.configs import schema
 from flexroad.pipeline.cli.main import app
-from flexroad.pipeline.config.schema import schema
 
 ROOT = Path(__file__).parents[1]
 CORE = ("catalog", "tasks", "pipeline", "flexroad")

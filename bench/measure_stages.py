@@ -59,7 +59,10 @@ def measure(folder: Path, config: Config, catalog: Catalog) -> dict[str, Any]:
     total = time.process_time() - start
     if result.failures:
         raise SystemExit(f"tile {result.tile_id}: {result.failures[0].line}")
-    seconds = {**borders(run), **result.seconds}
+    seconds = {
+        **borders(run),
+        **{stage: span.seconds for stage, span in result.spans.items() if span.computed},
+    }
     if seconds.keys() >= {"corners", "edges"}:
         del seconds[BORDER]
     # Reading and writing of the store, the item, and the graph.
@@ -69,7 +72,7 @@ def measure(folder: Path, config: Config, catalog: Catalog) -> dict[str, Any]:
         "tile": result.tile_id,
         "seconds": seconds,
         "total": total,
-        "peak_mb": result.peak_mb,
+        "peak_mb": max(span.peak_mb for span in result.spans.values()),
         "row": {name: value for name, value in result.rows[0].items() if isinstance(value, int | float)},
         "products": {path.name: path.stat().st_size for path in products},
         "stored": sum(path.stat().st_size for path in (folder / "store").rglob("*.npz")),

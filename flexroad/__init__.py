@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from flexroad.catalog.errors import CatalogError
     from flexroad.pipeline.errors import ConfigError
-    from flexroad.pipeline.run.observer import Observer
+    from flexroad.pipeline.run.events import Observer
     from flexroad.tasks.errors import TaskError
     from flexroad.tools.results.process import catalog_from, run
     from flexroad.tools.results.run import RunView, open_run
@@ -46,7 +46,7 @@ __all__ = [
 _HOME = {
     "CatalogError": "catalog.errors",
     "ConfigError": "pipeline.errors",
-    "Observer": "pipeline.run.observer",
+    "Observer": "pipeline.run.events",
     "RunView": "tools.results.run",
     "Surface": "tools.results.surface",
     "TaskError": "tasks.errors",

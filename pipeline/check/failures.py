@@ -20,9 +20,8 @@ from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.tile import HEIGHTS
-from flexroad.pipeline.check.finding import Finding
 from flexroad.pipeline.check.heights import height_findings
-from flexroad.pipeline.check.trial import trials
+from flexroad.pipeline.check.trial import Finding, trials
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.layers import lacking, without_photo
 from flexroad.tasks import load
@@ -151,7 +150,8 @@ def _unfit(tiles: Sequence[Tile], config: Config) -> tuple[dict[str, list[str]],
     for tile in tiles:
         headers = _headers(tile, known)
         share = _share(tile)
-        if reason := _other_crs(tile, headers) or _few_heights(share, min_valid):
+        low = f"a DSM height in less than {min_valid:.0%} of the cells (load.min_valid)"
+        if reason := _other_crs(tile, headers) or (low if share and share < min_valid else ""):
             by_reason[reason].append(tile.id)
         units = {found.unit for layer, found in headers if layer.name in HEIGHTS}
         # Without any height the file may lie elsewhere, or be in another unit.
@@ -205,10 +205,3 @@ def _share(tile: Tile) -> float | None:
     """Return the share of a tile's cells that has a height in the DSM (0 to 1), None if it is not known."""
     dsm = next(_on_tile(tile, ("dsm",)), None)
     return height_share(tile.grid, dsm[1], dsm[0].crs) if dsm else None
-
-
-def _few_heights(share: float | None, min_valid: float) -> str:
-    """Return why a tile would fail if its DSM covers too little of it."""
-    if not share or share >= min_valid:
-        return ""
-    return f"a DSM height in less than {min_valid:.0%} of the cells (load.min_valid)"

@@ -8,8 +8,7 @@ from statistics import median
 from typing import Any
 
 from flexroad.catalog.text import count, some
-from flexroad.pipeline.check.finding import Finding
-from flexroad.pipeline.check.trial import Trial
+from flexroad.pipeline.check.trial import Finding, Trial
 from flexroad.tasks.io.height_offset import FAR_M, on_tiles
 
 STEP_M = 0.3

@@ -4,82 +4,64 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from flexroad.catalog.text import count, some
+from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
-from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus
 from flexroad.pipeline.store.records import TileRecord
 
-Kind = Literal[
-    "up to date",
-    "new",
-    "failed last time",
-    "file missing",
-    "file left out",
-    "product missing",
-    "source changed",
-    "settings or version changed",
-]
+UP_TO_DATE = "up to date"
 
 
-@dataclass(frozen=True)
-class Reason:
-    """Why a tile is computed."""
+def reason(run: Run, status: TileStatus) -> str:
+    """Return why the next run computes a tile: a kind, and after a colon the file, stage or error if known.
 
-    kind: Kind
-    detail: str = ""
-    """The file, the stage or the error; empty if there is nothing to add."""
-
-    @property
-    def line(self) -> str:
-        """Both in one line."""
-        return f"{self.kind}: {self.detail}" if self.detail else self.kind
-
-
-def reason(run: Run, status: TileStatus) -> Reason:
-    """Return why the next run computes a tile; the kind is ``up to date`` if it does not.
-
-    If sources and options have both changed, the sources are named. The marker is read only if neither a
-    source nor a product differs.
+    It is `UP_TO_DATE` if the run does not. If sources and options have both changed, the sources are named.
+    The marker is read only if neither a source nor a product differs.
     """
     record, graph = status.last_record, status.graph
     if record is None:
-        return Reason("new")
+        return "new"
     if record.state == "failed":
-        return Reason("failed last time", record.failures[0].line if record.failures else "")
+        return _line("failed last time", record.failures[0].line if record.failures else "")
     if status.done and status.sources_present:
-        return Reason("up to date")
+        return UP_TO_DATE
     if missing := own_files_missing(graph):
-        return Reason("file missing", _first(missing, ""))
+        return _line("file missing", _first(missing))
     # A file around the tile is left out, and the tile computed without it.
     if missing := [path for path, file in graph.file_stats.items() if file is None]:
-        return Reason("source changed", _first(missing, ", which is missing,").removesuffix(","))
+        return _line("source changed", _first(missing, ", which is missing"))
     if status.done:
-        return Reason("file left out", _first(record.left_out, " could not be used"))
+        return _line("file left out", _first(record.left_out, " could not be used"))
     if record.fingerprint == graph.fingerprint:
-        return Reason("product missing")
+        return "product missing"
     if _compared_otherwise(record, graph):
-        return Reason("settings or version changed", "--checksum")
+        return "settings or version changed: --checksum"
     if changed := _changed_sources(record, graph):
-        return Reason("source changed", changed)
-    return Reason("settings or version changed", _changed_stage(run, graph))
+        return _line("source changed", changed)
+    return _line("settings or version changed", _changed_stage(run, graph))
 
 
 def why_pending(run: Run, statuses: Iterable[TileStatus]) -> list[str]:
     """Return why tiles without a result of the present files and options are computed, a line per reason."""
     tiles: dict[str, list[str]] = defaultdict(list)
     for status in statuses:
-        tiles[reason(run, status).line].append(status.graph.tile.id)
+        tiles[reason(run, status)].append(status.graph.tile.id)
     return [f"{some(ids)}: {line}" for line, ids in tiles.items()]
 
 
-def _first(names: Sequence[str], what: str) -> str:
-    more = f" and {count(len(names) - 1, 'more file')}" if len(names) > 1 else ""
-    return f"{names[0]}{what}{more}"
+def _line(kind: str, detail: str) -> str:
+    return f"{kind}: {detail}" if detail else kind
+
+
+def _first(names: Sequence[str], what: str = "") -> str:
+    """Return the first of some files with what is to say of it, and the number of the others."""
+    if len(names) == 1:
+        return f"{names[0]}{what}"
+    return f"{names[0]}{what}{',' * what.startswith(',')} and {count(len(names) - 1, 'more file')}"
 
 
 def _compared_otherwise(record: TileRecord, graph: TileGraph) -> bool:
@@ -104,13 +86,13 @@ def _changed_sources(record: TileRecord, graph: TileGraph) -> str:
     before, now = _files(record.sources), _files(graph.sources)
     changed = [name for name in now if name in before and before[name] != now[name]]
     for names, what in (
-        ([name for name in changed if before[name][1] is None], ", which was missing,"),
+        ([name for name in changed if before[name][1] is None], ", which was missing"),
         (changed, ""),
-        ([name for name in now if name not in before], ", which was not read before,"),
-        ([name for name in before if name not in now], ", which is no longer read,"),
+        ([name for name in now if name not in before], ", which was not read before"),
+        ([name for name in before if name not in now], ", which is no longer read"),
     ):
         if names:
-            return _first([name for _, name in names], what).removesuffix(",")
+            return _first([name for _, name in names], what)
     # Their values of road and their CRS are from the catalog.
     described = {entry[0]: entry[2:] for entry in record.sources}
     layers = [entry[0] for entry in graph.sources if entry[2:] != described[entry[0]]]

@@ -12,7 +12,6 @@ import numpy as np
 
 from flexroad.catalog import LAYERS, Tile
 from flexroad.catalog.text import some
-from flexroad.pipeline.check.finding import Finding, evenly
 from flexroad.pipeline.config.models import Config
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
@@ -25,6 +24,25 @@ MOST_TILES = 48
 """Number of tiles that are read: those with a doubtful file first, then one of each set of files."""
 MOST_ERRORS = 5
 """Number of errors that are told."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line about a catalog."""
+
+    text: str
+    fault: bool = False
+    """Whether this should be corrected before a run."""
+    warning: bool = False
+    """Whether this is said as a warning though it may be right; a fault always is."""
+    failing: frozenset[str] = frozenset()
+    """Ids of the tiles that would fail in a run."""
+
+
+def evenly(tiles: Sequence[Tile], most: int) -> list[Tile]:
+    """Return so many of the tiles at most, spread evenly over them."""
+    number = min(most, len(tiles))
+    return [tiles[k * len(tiles) // number] for k in range(number)]
 
 
 @dataclass(frozen=True)
@@ -59,11 +77,14 @@ def trials(
     - `absent`: files that are missing or closed, which have been named.
     - `faults`: a line for each error, with the tiles that it would fail.
     """
-    chains = _chains(config)
+    # Chains that read the same with the same splines are one.
+    chains = {
+        repr([chain[name] for name in ("load", "segment", "fit")]): chain for chain in config.chains.values()
+    }
     read, errors = list[Trial](), defaultdict[str, list[str]](list)
     for tile in _sample([tile for tile in tiles if tile.id not in named], doubtful):
         try:
-            found = [_trial(tile, chain) for chain in chains]
+            found = [_trial(tile, chain) for chain in chains.values()]
         except TaskError as error:
             if error.file not in absent:
                 errors[str(error)].append(tile.id)
@@ -79,14 +100,6 @@ def trials(
     return read, findings
 
 
-def _chains(config: Config) -> list[Mapping[str, Any]]:
-    """Return the chains of a configuration, one of those that read the same with the same splines."""
-    chains = {
-        repr([chain[name] for name in ("load", "segment", "fit")]): chain for chain in config.chains.values()
-    }
-    return list(chains.values())
-
-
 def _trial(tile: Tile, chain: Mapping[str, Any]) -> Trial:
     """Return what the first stages read of a tile."""
     data = load.load(tile, chain["load"])
@@ -100,7 +113,7 @@ def _trial(tile: Tile, chain: Mapping[str, Any]) -> Trial:
     units = tuple(filter(is_conversion, data.notes))
     return Trial(
         tile.id,
-        _sheets(tile, load.NEEDS),
+        frozenset(f"{layer} {Path(f).name}" for layer, files in _files(tile, load.NEEDS) for f in files),
         open_offset(*models),
         offset_note(*models),
         units,
@@ -141,8 +154,3 @@ def _files(tile: Tile, names: Collection[str]) -> tuple[tuple[str, tuple[str, ..
     """Return the files of some layers that lie on a tile, with the name of the layer."""
     layers = (layer.reaching(tile.grid.bounds) for layer in tile.layers if layer.name in names)
     return tuple((layer.name, layer.files) for layer in layers if layer)
-
-
-def _sheets(tile: Tile, names: Collection[str]) -> frozenset[str]:
-    """Return the names of these files."""
-    return frozenset(f"{layer} {Path(file).name}" for layer, files in _files(tile, names) for file in files)

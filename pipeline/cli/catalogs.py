@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +12,7 @@ import typer
 from rich.console import Console
 
 from flexroad.catalog import Catalog, CatalogError, layouts
+from flexroad.catalog.allowlist import needed
 from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.sources import nrw, rasters, templates
 from flexroad.catalog.storage.unpack import unpack
@@ -17,11 +20,13 @@ from flexroad.catalog.text import count
 from flexroad.catalog.tiling import Conversion, TilingResult
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, LazyGroup, group
-from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, MIN_COVER_HELP, OUTPUTS, TILES
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.layers import fitting_config
 from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.record import check_inputs
 
 TOOLS = {
     "synthetic": ("tools.synthetic.command", "Make synthetic scenes with known truth, and their catalog."),
@@ -40,19 +45,15 @@ app = group("catalog", "Make, show and check catalogs of tiles.", _Catalogs)
 
 Output = Annotated[
     Path,
-    typer.Option(
-        "-o",
-        "--output",
-        metavar="FILE",
-        help="Catalog to write: .parquet, .json or .geojson.",
-        rich_help_panel=OUTPUTS,
+    options.under(
+        OUTPUTS, "Catalog to write: .parquet, .json or .geojson.", "-o", "--output", metavar="FILE"
     ),
 ]
 
 
 def _files(meaning: str, metavar: str = "PATTERN") -> Any:
     """Return an option that names input files."""
-    return typer.Option(metavar=metavar, help=meaning, rich_help_panel=INPUTS)
+    return options.under(INPUTS, meaning, metavar=metavar)
 
 
 RoadMask = Annotated[str | None, _files("Files of the road mask or land cover.")]
@@ -63,40 +64,20 @@ Roads = Annotated[str | None, _files("Vector files of roads: a file, or a patter
 RoadsLayer = Annotated[str | None, _files("Layer of the roads, if --roads has several.", "NAME")]
 Crs = Annotated[str | None, _files("CRS of files without one: EPSG:25832.", "CRS")]
 Reproject = Annotated[
-    bool,
-    typer.Option(
-        "--reproject",
-        help="Warp rasters in another CRS or in feet when they are read.",
-        rich_help_panel=INPUTS,
-    ),
+    bool, options.under(INPUTS, "Warp rasters in another CRS or in feet when they are read.", "--reproject")
 ]
 Date = Annotated[
     datetime | None,
-    typer.Option(
-        metavar="YYYY-MM-DD",
-        help="Date of the survey; default: that of the files.",
-        rich_help_panel=INPUTS,
-    ),
+    options.under(INPUTS, "Date of the survey; default: that of the files.", metavar="YYYY-MM-DD"),
 ]
-TileSize = Annotated[
-    float, typer.Option(metavar="METRES", help="Size of a tile in m.", rich_help_panel=TILES)
-]
-MinCover = Annotated[
-    float,
-    typer.Option(
-        min=0,
-        max=1,
-        metavar="SHARE",
-        help=MIN_COVER_HELP,
-        rich_help_panel=TILES,
-    ),
-]
+TileSize = Annotated[float, options.under(TILES, "Size of a tile in m.", metavar="METRES")]
+MinCover = Annotated[float, options.under(TILES, MIN_COVER_HELP, min=0, max=1, metavar="SHARE")]
 Strict = Annotated[
     bool,
-    typer.Option(
+    options.under(
+        OUTPUTS,
+        "Write no catalog if a file cannot be used; default: leave it out, with exit code 1.",
         "--strict",
-        help="Write no catalog if a file cannot be used; default: leave it out, with exit code 1.",
-        rich_help_panel=OUTPUTS,
     ),
 ]
 Layout = Annotated[str, _files("Configuration whose `dataset` gives the file names.", "NAME|FILE")]
@@ -120,18 +101,11 @@ def catalog_rasters(
     reproject: Reproject = False,
     to_crs: Annotated[
         str | None,
-        typer.Option(
-            metavar="CRS",
-            help="CRS of the tiles, with --reproject; default: the DSM's.",
-            rich_help_panel=TILES,
-        ),
+        options.under(TILES, "CRS of the tiles, with --reproject; default: the DSM's.", metavar="CRS"),
     ] = None,
     height_unit: Annotated[
         Literal["metre", "foot", "us-foot"] | None,
-        typer.Option(
-            help="Unit of heights if a file has none; default: metre, or that of the plan.",
-            rich_help_panel=INPUTS,
-        ),
+        options.under(INPUTS, "Unit of heights if a file has none; default: metre, or that of the plan."),
     ] = None,
     date: Date = None,
     tile_size: TileSize = 250,
@@ -273,3 +247,27 @@ def catalog_show(path: options.CatalogFile) -> None:
         echo(f"{tile.id}  {size}  {date}  {tile.stratum or '-'}  {layers}")
     systems = sorted({tile.grid.crs for tile in catalog.usable})
     echo(f"{count(len(catalog.tiles), 'tile')}, {', '.join(crs[:60] for crs in systems)}")
+
+
+def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] = ()) -> str:
+    """Return the command that runs a catalog, ready to be pasted, or what a run lacks.
+
+    - `path`: the catalog's file.
+    - `config`: the configuration; default: the one for production that fits the catalog's layers.
+    - `changes`: values of ``--set``.
+    """
+    catalog = Catalog.read(path)
+    name = config or fitting_config(catalog)
+    settings = load_config(name, changes)
+    try:
+        check_inputs(settings, catalog)
+    except ConfigError as error:
+        return f"before a run: {error}"
+    # Many catalogs are called catalog.parquet: their folder tells them apart.
+    title = path.stem if path.stem != "catalog" else path.absolute().parent.name or "run"
+    words = ["flexroad", "run", "--config", name, *(word for change in changes for word in ("--set", change))]
+    words += ["--catalog", str(path), "--out", f"runs/{title}"]
+    # Of all layers, so that the same options suit `catalog check` and `train`.
+    for folder in needed(catalog, path.parent):
+        words += ["--allow", folder]
+    return f"next: {shlex.join(words)}"

@@ -14,10 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 from flexroad.pipeline.config.options import HEADINGS
 
 OTHERS = "Options"
-RANGES = (
-    (re.compile(r"([\d.]+)<=x<=([\d.]+)"), r"\1 to \2"),
-    (re.compile(r"x>=([\d.]+)"), r"at least \1"),
-)
+RANGES = ((re.compile(r"([\d.]+)<=x<=([\d.]+)"), r"\1 to \2"), (re.compile(r"x>=([\d.]+)"), r"at least \1"))
 """How typer writes the ranges of numbers, and how a help page does."""
 MAX_NAME = 30
 """Longest name of an option, with its values, beside which a help page writes the meaning."""

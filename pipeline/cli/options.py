@@ -13,92 +13,58 @@ import typer
 
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES, WORK
 
+
+def under(heading: str, help: str, *names: str, **more: Any) -> Any:
+    """Return an option that stands below a heading of a help page."""
+    return typer.Option(*names, help=help, rich_help_panel=heading, **more)
+
+
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run, or its address (s3://...).")]
-OutputFolder = Annotated[
-    Path, typer.Option("-o", "--output", metavar="FOLDER", help="Output folder.", rich_help_panel=OUTPUTS)
-]
+OutputFolder = Annotated[Path, under(OUTPUTS, "Output folder.", "-o", "--output", metavar="FOLDER")]
 CatalogFile = Annotated[Path, typer.Argument(metavar="CATALOG", help="Catalog of tiles.")]
 Allow = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="FOLDER|URL",
-        help="Allow source files in this folder, too; repeatable.",
-        rich_help_panel=INPUTS,
-    ),
+    under(INPUTS, "Allow source files in this folder, too; repeatable.", metavar="FOLDER|URL"),
 ]
 TileIds = Annotated[
-    list[str] | None,
-    typer.Option("--tile", metavar="ID", help="Only these tiles: --tile ID ID ...", rich_help_panel=TILES),
+    list[str] | None, under(TILES, "Only these tiles: --tile ID ID ...", "--tile", metavar="ID")
 ]
 Box = Annotated[
     tuple[float, float, float, float] | None,
-    typer.Option("--bbox", metavar="W S E N", help="Only tiles in these bounds (m).", rich_help_panel=TILES),
+    under(TILES, "Only tiles in these bounds (m).", "--bbox", metavar="W S E N"),
 ]
 Area = Annotated[
     Path | None,
-    typer.Option(
-        "--area",
-        metavar="FILE",
-        help="Only tiles that touch the polygons of this file, in any CRS.",
-        rich_help_panel=TILES,
-    ),
+    under(TILES, "Only tiles that touch the polygons of this file, in any CRS.", "--area", metavar="FILE"),
 ]
-AreaLayer = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Layer of --area, if it has several.", rich_help_panel=TILES),
-]
-Workers = Annotated[
-    int | None,
-    typer.Option(min=1, metavar="N", help="Worker processes; default: one per core.", rich_help_panel=WORK),
-]
+AreaLayer = Annotated[str | None, under(TILES, "Layer of --area, if it has several.", metavar="NAME")]
+Workers = Annotated[int | None, under(WORK, "Worker processes; default: one per core.", min=1, metavar="N")]
 MostWorkers = Annotated[
     int | None,
-    typer.Option(
-        "--workers",
-        min=1,
-        metavar="N",
-        help="At most N worker processes; default: one per core.",
-        rich_help_panel=WORK,
-    ),
+    under(WORK, "At most N worker processes; default: one per core.", "--workers", min=1, metavar="N"),
 ]
 Parallel = Annotated[
-    int,
-    typer.Option(
-        "--workers",
-        min=1,
-        metavar="N",
-        help="Worker processes; default: this process alone.",
-        rich_help_panel=WORK,
-    ),
+    int, under(WORK, "Worker processes; default: this process alone.", "--workers", min=1, metavar="N")
 ]
 Executor = Annotated[
     Literal["auto", "dask", "serial"],
-    typer.Option(
+    under(
+        WORK,
+        "auto: worker processes if they save more time than their start takes; dask: always; serial: never.",
         "--executor",
-        help="auto: worker processes if they save more time than their start takes; dask: always; "
-        "serial: never.",
-        rich_help_panel=WORK,
     ),
 ]
-Dashboard = Annotated[
-    bool,
-    typer.Option("--dashboard", help="Serve Dask's dashboard and print its address.", rich_help_panel=WORK),
-]
+Dashboard = Annotated[bool, under(WORK, "Serve Dask's dashboard and print its address.", "--dashboard")]
 Verify = Annotated[
-    bool,
-    typer.Option(
-        "--verify",
-        help="Compare the checksums of all products, not only their sizes.",
-        rich_help_panel=OUTPUTS,
-    ),
+    bool, under(OUTPUTS, "Compare the checksums of all products, not only their sizes.", "--verify")
 ]
 Settings = Annotated[
     list[str] | None,
-    typer.Option(
+    under(
+        INPUTS,
+        "Option that replaces the configuration's: fit.spacing_m=5; repeatable.",
         "--set",
         metavar="KEY=VALUE",
-        help="Option that replaces the configuration's: fit.spacing_m=5; repeatable.",
-        rich_help_panel=INPUTS,
     ),
 ]
 WorkerSettings = Annotated[

@@ -21,9 +21,9 @@ from flexroad.pipeline.check.heights import road_is_off, road_step
 from flexroad.pipeline.check.reasons import why_pending
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
-from flexroad.pipeline.cli.dry_run import Verdict, plan
-from flexroad.pipeline.cli.lifecycle import Outcome, format_summary, interruptible, warn
+from flexroad.pipeline.cli.dry_run import plan
 from flexroad.pipeline.cli.limits import remedy
+from flexroad.pipeline.cli.signals import INTERRUPTED, signals_interrupt
 from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES, WORK
@@ -31,8 +31,8 @@ from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.dask import check_address
 from flexroad.pipeline.run.api import Prepared, Selection, Workers, created, process, reopened
 from flexroad.pipeline.run.collection import write_states
+from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.lock import describe_owner, exit_reason, owner
-from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.progress import FIRST_S, ProgressDisplay, said_repeatedly
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, pending_tiles, progress, summary
@@ -59,10 +59,10 @@ def _address(value: str | None) -> str | None:
 
 Scheduler = Annotated[
     str | None,
-    typer.Option(
+    options.under(
+        WORK,
+        "A running Dask scheduler: tcp://host:8786, tls://host:8786.",
         metavar="ADDRESS",
-        help="A running Dask scheduler: tcp://host:8786, tls://host:8786.",
-        rich_help_panel=WORK,
         callback=_address,
     ),
 ]
@@ -75,42 +75,24 @@ StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "as
 @app.command(cls=Command)
 @ignore_write_errors()
 def run(
-    catalog: Annotated[
-        Path, typer.Option(metavar="CATALOG", help="Catalog of tiles.", rich_help_panel=INPUTS)
-    ],
+    catalog: Annotated[Path, options.under(INPUTS, "Catalog of tiles.", metavar="CATALOG")],
     out: Annotated[
-        Path,
-        typer.Option(
-            metavar="RUN",
-            help="Folder of the run; an existing run is resumed.",
-            rich_help_panel=OUTPUTS,
-        ),
+        Path, options.under(OUTPUTS, "Folder of the run; an existing run is resumed.", metavar="RUN")
     ],
     config: Annotated[
         str,
-        typer.Option(
-            metavar="NAME|FILE",
-            help="Configuration: a shipped name, such as production, or a YAML file.",
-            rich_help_panel=INPUTS,
+        options.under(
+            INPUTS, "Configuration: a shipped name, such as production, or a YAML file.", metavar="NAME|FILE"
         ),
     ] = "production",
     settings: options.Settings = None,
     allow: options.Allow = None,
     checksum: Annotated[
-        bool,
-        typer.Option(
-            "--checksum",
-            help="Detect changed sources by content, not by size and time.",
-            rich_help_panel=INPUTS,
-        ),
+        bool, options.under(INPUTS, "Detect changed sources by content, not by size and time.", "--checksum")
     ] = False,
     store: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Folder of stage results that several runs share.",
-            rich_help_panel=OUTPUTS,
-        ),
+        options.under(OUTPUTS, "Folder of stage results that several runs share.", metavar="FOLDER"),
     ] = None,
     verify: options.Verify = False,
     tile: options.TileIds = None,
@@ -122,8 +104,7 @@ def run(
     scheduler: Scheduler = None,
     dashboard: options.Dashboard = False,
     dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="Print why each tile would be computed, and what would fail."),
+        bool, typer.Option("--dry-run", help="Print why each tile would be computed, and what would fail.")
     ] = False,
 ) -> None:
     """Bring every tile of a run up to date.
@@ -136,14 +117,11 @@ def run(
         chosen = load_config(config, settings or ())
         selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
         tiles, selected = selection.of(path, source, allow or (), chosen)
-        planned, verdict = Run.planned(path, chosen, tiles, root, checksum), Verdict()
-        for line in plan(planned, selected.tiles, verdict, workers):
-            echo(line)
-        raise typer.Exit(verdict.exit_code)
-    with interruptible() as outcome:
+        planned = Run.planned(path, chosen, tiles, root, checksum)
+        raise typer.Exit(plan(planned, selected.tiles, echo, workers))
+    with _interruptible() as shown:
         chosen = load_config(config, settings or ())
         selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
-        shown = Shown(outcome)
         with created(
             path,
             source,
@@ -156,7 +134,7 @@ def run(
             observer=shown,
         ) as prepared:
             _process(prepared, verify, shown)
-    _exit(outcome)
+    _exit(shown)
 
 
 @app.command(cls=Command)
@@ -164,18 +142,13 @@ def run(
 def rerun(
     path: options.Run,
     tile: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ID", help="These tiles: --tile ID ID ...", rich_help_panel=TILES),
+        list[str] | None, options.under(TILES, "These tiles: --tile ID ID ...", metavar="ID")
     ] = None,
-    failed: Annotated[
-        bool, typer.Option("--failed", help="The tiles that failed.", rich_help_panel=TILES)
-    ] = False,
+    failed: Annotated[bool, options.under(TILES, "The tiles that failed.", "--failed")] = False,
     from_stage: Annotated[
         StageName | None,
-        typer.Option(
-            "--from",
-            help="Recompute this stage and all later ones; export: only write the products again.",
-            rich_help_panel=TILES,
+        options.under(
+            TILES, "Recompute this stage and all later ones; export: only write the products again.", "--from"
         ),
     ] = None,
     settings: options.WorkerSettings = None,
@@ -188,9 +161,9 @@ def rerun(
     For changes of source files or of RUN/config.yaml, and for failed tiles.
     """
     location = parse_location(path)
-    with interruptible() as outcome:
-        shown = Shown(outcome)
-        with reopened(
+    with (
+        _interruptible() as shown,
+        reopened(
             location,
             tile or (),
             failed=failed,
@@ -199,16 +172,21 @@ def rerun(
             allow=allow or (),
             workers=Workers(executor, scheduler=scheduler),
             observer=shown,
-        ) as prepared:
-            _process(prepared, False, shown)
-    _exit(outcome)
+        ) as prepared,
+    ):
+        _process(prepared, False, shown)
+    _exit(shown)
 
 
 class Shown(Observer):
-    """Shows the events of a run on standard error; a context manager."""
+    """Shows the events of a run on standard error, and has its end; a context manager."""
 
-    def __init__(self, outcome: Outcome) -> None:
-        self.outcome = outcome
+    def __init__(self) -> None:
+        self.exit_code = 0
+        self.text = ""
+        """The result of the command in one line."""
+        self.summary: Summary | None = None
+        """The state of the run; None if no tile was processed."""
         self.display: ProgressDisplay | None = None
         """Progress of the tiles, from the first one on until the block ends."""
         self.offsets: list[str] = []
@@ -235,11 +213,11 @@ class Shown(Observer):
 
     def note(self, text: str) -> None:
         """Print a note."""
-        warn(text, "note")
+        echo(f"note: {text}", err=True)
 
     def warning(self, text: str) -> None:
         """Print a warning."""
-        warn(text)
+        echo(f"warning: {text}", err=True)
 
     def start(self, tiles: int, selected: int) -> None:
         """Show the progress."""
@@ -258,36 +236,60 @@ class Shown(Observer):
             self.display(result)
 
 
+@contextlib.contextmanager
+def _interruptible() -> Iterator[Shown]:
+    """Give what shows the run of the block; an interruption is recorded in it and not raised again."""
+    shown = Shown()
+    try:
+        with signals_interrupt():
+            yield shown
+    except KeyboardInterrupt:
+        shown.exit_code, shown.text = INTERRUPTED, "interrupted; the same command goes on from here"
+
+
 def _process(prepared: Prepared, verify: bool, shown: Shown) -> None:
-    """Process the tiles and fill in the outcome."""
-    folder, outcome = shlex.quote(str(prepared.run.path)), shown.outcome
+    """Process the tiles and print the result."""
+    folder = shlex.quote(str(prepared.run.path))
     try:
         with shown:
-            summary = outcome.summary = process(prepared, verify)
+            summary = shown.summary = process(prepared, verify)
     except ClusterLost as error:
-        outcome.exit_code, outcome.text = 1, f"{error}; the same command goes on from here"
+        shown.exit_code, shown.text = 1, f"{error}; the same command goes on from here"
         return
     except OSError as error:
-        outcome.exit_code = 1
-        outcome.text = f"{error}; {remedy(error)}, then run `flexroad rerun {folder}`"
+        shown.exit_code = 1
+        shown.text = f"{error}; {remedy(error)}, then run `flexroad rerun {folder}`"
         return
-    outcome.exit_code, outcome.text = summary.exit_code, format_summary(summary)
-    echo(f"{outcome.text}; results in {prepared.run.path}")
+    shown.exit_code, shown.text = summary.exit_code, format_summary(summary)
+    echo(f"{shown.text}; results in {prepared.run.path}")
     if shown.display and set(shown.display.status) == {"cached"}:
         echo("nothing had changed; `flexroad rerun RUN --from load` recomputes everything")
     for line in summary.left_out:
-        warn(line)
+        shown.warning(line)
     for line in on_tiles(shown.offsets, summary.tiles):
-        warn(f"{line} `flexroad catalog check` compares them")
+        shown.warning(f"{line} `flexroad catalog check` compares them")
     main = prepared.run.config.export.variants[0]
     for line in road_step([row for row in shown.rows if row["variant"] == main], summary.tiles):
-        warn(f"{line} `flexroad catalog check` compares them", "note")
+        shown.note(f"{line} `flexroad catalog check` compares them")
     if summary.done and summary.without_roads == summary.done and not shown.offsets:
-        warn(
+        shown.warning(
             "no tile of this run has a road that the filter keeps; if there are roads, check the road source "
             "of the catalog and the options of segment and ecsrc"
         )
     _echo_next(summary, folder, prepared.run)
+
+
+def format_summary(summary: Summary) -> str:
+    """Return the state of a run in one line."""
+    without = f", {summary.without_roads} without roads" if summary.without_roads else ""
+    states = (
+        f"{summary.done} done ({summary.cached} cached{without}), {summary.failed} failed, "
+        f"{summary.pending} pending"
+    )
+    changes = f"{summary.new} new, {summary.changed} changed, {summary.vanished} vanished"
+    lost = f", {count(summary.lost, 'tile')} lost" if summary.skipped and summary.lost else ""
+    seconds = f"{summary.seconds:.0f} s{summary.to_look_at}"
+    return f"{count(summary.tiles, 'tile')}: {states}; {changes}{summary.files_skipped}{lost}; {seconds}"
 
 
 def _echo_next(summary: Summary, folder: str, run: Run) -> None:
@@ -305,11 +307,11 @@ def _echo_next(summary: Summary, folder: str, run: Run) -> None:
         echo(f"next: flexroad report {folder} --format html")
 
 
-def _exit(outcome: Outcome) -> None:
+def _exit(shown: Shown) -> None:
     """End the command with its exit code; print the reason if no summary was printed."""
-    if outcome.exit_code and outcome.summary is None:
-        echo(outcome.text if outcome.exit_code == 130 else f"error: {outcome.text}", err=True)
-    raise typer.Exit(outcome.exit_code)
+    if shown.exit_code and shown.summary is None:
+        echo(shown.text if shown.exit_code == INTERRUPTED else f"error: {shown.text}", err=True)
+    raise typer.Exit(shown.exit_code)
 
 
 @app.command(cls=Command)

@@ -7,7 +7,6 @@ one line with the line number. Messages have no text of the file, which may be a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import yaml
@@ -26,17 +25,8 @@ MAX_NUMBER = 100
 MAX_REASON = 200
 
 
-@dataclass(frozen=True)
-class Document:
-    """The content of a YAML file."""
-
-    value: Any
-    lines: dict[str, int]
-    """Line of each key of the outermost mapping, from 1; empty if the value is no mapping."""
-
-
-def parse(data: bytes, name: str) -> Document:
-    """Return the content of a YAML file.
+def parse(data: bytes, name: str) -> tuple[Any, dict[str, int]]:
+    """Return the content of a YAML file, and the line of each key of its outermost mapping, from 1.
 
     - `data`: the file's bytes, in UTF-8.
     - `name`: the file's name, for messages.
@@ -54,22 +44,18 @@ def parse(data: bytes, name: str) -> Document:
         raise ConfigError(f"{name}: not readable as YAML: {_reason(error, text)}") from None
 
 
-def _load(text: str) -> Document:
+def _load(text: str) -> tuple[Any, dict[str, int]]:
     loader = _Loader(text)
     try:
         root = loader.get_single_node()
         if root is None:
-            return Document(None, {})
+            return None, {}
         # Before the construction, which adds the entries of merge keys.
-        lines = _key_lines(root) if isinstance(root, yaml.MappingNode) else {}
-        return Document(loader.construct_document(root), lines)
+        keys = [key for key, _ in root.value] if isinstance(root, yaml.MappingNode) else []
+        lines = {key.value: key.start_mark.line + 1 for key in keys if isinstance(key, yaml.ScalarNode)}
+        return loader.construct_document(root), lines
     finally:
         loader.dispose()
-
-
-def _key_lines(root: yaml.MappingNode) -> dict[str, int]:
-    keys = (key for key, _ in root.value if isinstance(key, yaml.ScalarNode))
-    return {key.value: key.start_mark.line + 1 for key in keys}
 
 
 class _Loader(yaml.SafeLoader):

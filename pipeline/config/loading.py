@@ -16,10 +16,9 @@ from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config import document
 from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.levels import check_levels
-from flexroad.pipeline.config.methods import DEFAULTS
 from flexroad.pipeline.config.models import ROOT, TAG, Config, Export, stage_models
-from flexroad.pipeline.config.settings import Setting, applied, merge, texts
+from flexroad.pipeline.config.settings import applied, merge, parsed, texts
+from flexroad.pipeline.config.stages import DEFAULTS
 from flexroad.pipeline.errors import ConfigError
 
 SECTIONS = ("dataset", "export", "cluster", "variants", "extends")
@@ -38,6 +37,8 @@ MAX_NAME = 500
 """Longest name of a file in a message that it does not exist."""
 MAX_ERRORS = 10
 """Most errors of one stage that are listed."""
+HALO_M = 40.0
+"""Smallest halo (m) with levels: farther away nothing decides on those at the border of a tile."""
 
 
 def shipped() -> dict[str, Path]:
@@ -60,7 +61,7 @@ def load_config(
     if not settings:
         return config
     given = texts(settings)
-    changed = applied(config.raw, [Setting.parse(text) for text in given])
+    changed = applied(config.raw, map(parsed, given))
     return compose(changed, " ".join([str(name), *(f"--set {printable(text)}" for text in given)]))
 
 
@@ -92,9 +93,11 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
             )
             for stage in stages
         }
-        check_levels(chains[str(variant)], f"{name}: {where}" if overrides else name)
+        _check_levels(chains[str(variant)], f"{name}: {where}" if overrides else name)
     given = _mapping(raw.get("export") or {}, name, "export")
-    export = _validate(TypeAdapter(Export), {"variants": _main_variant(chains)} | given, f"{name}: export")
+    # By default ``flexroad`` is exported, or else the last variant.
+    main = ("flexroad",) if "flexroad" in chains else tuple(chains)[-1:]
+    export = _validate(TypeAdapter(Export), {"variants": main} | given, f"{name}: export")
     for variant in export.variants:
         if variant not in chains:
             raise ConfigError(
@@ -110,7 +113,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
 
 def read_mapping(data: bytes, name: str) -> dict[str, Any]:
     """Return the mapping in a configuration file's bytes, with ``extends`` as it is written."""
-    return _mapping_of(document.parse(data, name), name)
+    return _mapping_of(document.parse(data, name)[0], name)
 
 
 def _raw(name: str | Path, base: str) -> dict[str, Any]:
@@ -170,30 +173,29 @@ def _read(path: Path, own: bool = True) -> dict[str, Any]:
     """Return the mapping in a file; ``own`` is False for a file that another one extends."""
     try:
         with path.open("rb") as file:
-            content = document.parse(file.read(document.MAX_BYTES + 1), str(path))
+            value, lines = document.parse(file.read(document.MAX_BYTES + 1), str(path))
     except OSError as error:
         raise ConfigError(
             f"cannot read {path}: {error.strerror or error}; name a file that can be"
         ) from error
-    raw = _mapping_of(content, str(path))
+    raw = _mapping_of(value, str(path))
     for key in () if own else raw:
         if key not in (*SECTIONS, *stage_models()):
             # The file may be no configuration at all: its text is not shown.
-            line = content.lines.get(str(key), 1)
+            line = lines.get(str(key), 1)
             raise ConfigError(
                 f"{path}: line {line}: the key is none of a configuration; correct or remove it"
             )
     return raw
 
 
-def _mapping_of(content: document.Document, name: str) -> dict[str, Any]:
-    if content.value is None:
+def _mapping_of(value: Any, name: str) -> dict[str, Any]:
+    if value is None:
         return {}
-    if not isinstance(content.value, dict):
-        texts = isinstance(content.value, str)
-        kind = "a list" if isinstance(content.value, list) else "a text" if texts else "a single value"
+    if not isinstance(value, dict):
+        kind = {"list": "a list", "str": "a text"}.get(type(value).__name__, "a single value")
         raise ConfigError(f"{name}: expected a mapping of stages to options, but it is {kind}")
-    return dict(content.value)
+    return dict(value)
 
 
 def _extend(parent: dict[str, Any], child: dict[str, Any], name: str) -> dict[str, Any]:
@@ -291,6 +293,20 @@ def _keys(model: TypeAdapter[Any]) -> dict[str, list[str]]:
     return {tag: sorted(part.get("properties", {})) for tag, part in parts.items()}
 
 
-def _main_variant(chains: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the variant that is exported by default: ``flexroad``, or else the last one."""
-    return ("flexroad",) if "flexroad" in chains else tuple(chains)[-1:]
+def _check_levels(chain: Mapping[str, Any], where: str) -> None:
+    """Check that the stages of a variant can compute levels, if its segmentation has them."""
+    if not getattr(chain["segment"], "levels", False):
+        return
+    load, sample = chain["load"], chain["sample"]
+    needs = [
+        (chain["ecsrc"].method == "planar", f"ecsrc: planar, not {chain['ecsrc'].method}"),
+        (chain["fit"].method == "smoothing_spline", f"fit: smoothing_spline, not {chain['fit'].method}"),
+        (load.halo_m >= HALO_M, f"load.halo_m of {HALO_M:g} or more, not {load.halo_m:g}"),
+        (sample.method == "dynamic", f"sample.method dynamic, not {sample.method}"),
+        (sample.mask == "raw", f"sample.mask raw, not {sample.mask}"),
+    ]
+    for fine, needed in needs:
+        if not fine:
+            raise ConfigError(
+                f"{where}: segment.levels needs {needed}; set it, or set segment.levels to false"
+            )

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Union
 from pydantic import BaseModel, Field, TypeAdapter, model_validator
 
 from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.methods import HOMES, methods
+from flexroad.pipeline.config.stages import HOMES, methods
 from flexroad.tasks.options import Options
 
 TAG = {"segment": "method", "ecsrc": "method", "fit": "method", "sample": "method", "cluster": "kind"}
@@ -34,9 +34,7 @@ class Export(Options):
     """The products written for the user, besides the metrics."""
 
     variants: tuple[str, ...] = Field(
-        ("flexroad",),
-        min_length=1,
-        description="variants whose meshes are kept; query uses the first",
+        ("flexroad",), min_length=1, description="variants whose meshes are kept; query uses the first"
     )
     formats: tuple[Format, ...] = Field(
         ("glb", "ply", "cog", "npz"),

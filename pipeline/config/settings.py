@@ -5,8 +5,7 @@ A stage or section that is a single word is its method.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import yaml
@@ -16,30 +15,23 @@ from flexroad.pipeline.config import document
 from flexroad.pipeline.config.models import TAG
 from flexroad.pipeline.errors import ConfigError
 
+Keys = tuple[str, ...]
+"""The parts of a dotted key: ``("fit", "spacing_m")``."""
 
-@dataclass(frozen=True)
-class Setting:
-    """One option and its value."""
 
-    keys: tuple[str, ...]
-    """The parts of the dotted key: ``("fit", "spacing_m")``."""
-    value: Any
+def parsed(text: str) -> tuple[Keys, Any]:
+    """Return key and value of ``KEY=VALUE``; the value is YAML within the limits of `document`."""
+    key, equals, value = text.partition("=")
+    keys = tuple(key.split("."))
+    if not equals or not all(keys):
+        raise ConfigError(f"--set {shown(text)}: give KEY=VALUE, like --set fit.spacing_m=5")
+    return keys, document.parse(value.encode(errors="surrogateescape"), f"--set {printable(key)}")[0]
 
-    @classmethod
-    def parse(cls, text: str) -> Setting:
-        """Return the setting in ``KEY=VALUE``; the value is YAML within the limits of `document`."""
-        key, equals, value = text.partition("=")
-        keys = tuple(key.split("."))
-        if not equals or not all(keys):
-            raise ConfigError(f"--set {shown(text)}: give KEY=VALUE, like --set fit.spacing_m=5")
-        option = f"--set {printable(key)}"
-        return cls(keys, document.parse(value.encode(errors="surrogateescape"), option).value)
 
-    @property
-    def selects_method(self) -> bool:
-        """Whether it selects the method of a stage, of which the stage's other options depend."""
-        stage = self.keys[2:] if self.keys[0] == "variants" else self.keys
-        return len(stage) == 1 or (len(stage) == 2 and stage[1] == TAG.get(stage[0]))
+def _selects_method(keys: Keys) -> bool:
+    """Return whether a key is the method of a stage, on which the stage's other options depend."""
+    stage = keys[2:] if keys[0] == "variants" else keys
+    return len(stage) == 1 or (len(stage) == 2 and stage[1] == TAG.get(stage[0]))
 
 
 def texts(settings: Sequence[str] | Mapping[str, Any]) -> list[str]:
@@ -58,27 +50,22 @@ def texts(settings: Sequence[str] | Mapping[str, Any]) -> list[str]:
 
 def _flow(value: Any) -> str:
     """Return a value as one line of YAML."""
-    return (
-        yaml.safe_dump(value, default_flow_style=True, width=1e9, sort_keys=False)
-        .removesuffix("...\n")
-        .strip()
-    )
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=1e9, sort_keys=False)
+    return text.removesuffix("...\n").strip()
 
 
-def applied(raw: Mapping[str, Any], settings: Sequence[Setting]) -> dict[str, Any]:
+def applied(raw: Mapping[str, Any], settings: Iterable[tuple[Keys, Any]]) -> dict[str, Any]:
     """Return a configuration with changed options; equal keys take the last value.
 
     Methods are set first: another method starts from its own defaults, in whatever order they are given.
     """
     changed = dict(raw)
-    for setting in sorted(settings, key=lambda setting: not setting.selects_method):
-        changed = _assigned(changed, setting.keys, setting.value)
+    for keys, value in sorted(settings, key=lambda setting: not _selects_method(setting[0])):
+        changed = _assigned(changed, keys, value)
     return changed
 
 
-def _assigned(
-    options: Any, keys: tuple[str, ...], value: Any, parents: tuple[str, ...] = ()
-) -> dict[str, Any]:
+def _assigned(options: Any, keys: Keys, value: Any, parents: Keys = ()) -> dict[str, Any]:
     """Return the options below ``parents`` with another value at ``keys``."""
     tag = TAG.get(parents[-1]) if parents else None
     where = f"--set {printable('.'.join((*parents, *keys)))}"

@@ -6,14 +6,7 @@ One Dask task is one tile. Its graph is computed inside a single process, so tha
 processes (``docs/decisions.md`` has the measurement against one task per stage).
 """
 
-from flexroad.pipeline.execute.adaptive import AdaptiveExecutor, Jobs
 from flexroad.pipeline.execute.dask import DaskExecutor
-from flexroad.pipeline.execute.executor import Executor, SerialExecutor
+from flexroad.pipeline.execute.executor import AdaptiveExecutor, Executor, Jobs, SerialExecutor
 
-__all__ = [
-    "AdaptiveExecutor",
-    "DaskExecutor",
-    "Executor",
-    "Jobs",
-    "SerialExecutor",
-]
+__all__ = ["AdaptiveExecutor", "DaskExecutor", "Executor", "Jobs", "SerialExecutor"]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
+from dask.system import CPU_COUNT
 from distributed import Client, LocalCluster
 from distributed.security import Security
 from distributed.utils import silence_logging_cmgr
@@ -25,14 +26,13 @@ from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.slurm import slurm
 from flexroad.pipeline.execute.start import (
-    bytes_of_worker,
+    available_bytes,
     certificates,
     one_line,
     opened,
     settings,
     start_workers,
     web_address,
-    workers_here,
 )
 
 WORKER_LOST_TIMEOUT_S = 60.0
@@ -124,14 +124,14 @@ def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
 
     It listens on the loopback interface only.
     """
-    workers = workers_here(cluster)
+    workers = cluster.workers or CPU_COUNT
     with ScratchFolder() as scratch, contextlib.ExitStack() as stack:
         make = partial(
             LocalCluster,
             n_workers=0,
             threads_per_worker=1,
             processes=True,
-            memory_limit=bytes_of_worker(cluster),
+            memory_limit=int(cluster.memory or available_bytes() // workers),
             dashboard_address=web_address(dashboard),
             scheduler_kwargs={"dashboard": dashboard},
             worker_dashboard_address=None,
@@ -161,7 +161,9 @@ def connected(target: ClusterTarget, dashboard: bool, notify: Notify) -> Iterato
         except OSError as error:
             raise ConfigError(f"{target.name} does not answer: {error}") from error
         if dashboard:
-            notify(_dashboard(client))
+            has_bokeh = importlib.util.find_spec("bokeh") is not None
+            missing = "no dashboard: it needs bokeh (pip install 'flexroad[dashboard]')"
+            notify(f"dashboard: {client.dashboard_link}" if has_bokeh else missing)
         if not _any_worker(client, target):
             raise ConfigError(f"{target.name} has no workers; {target.remedy}")
         yield client
@@ -176,12 +178,6 @@ def _any_worker(client: Client, target: ClusterTarget) -> bool:
             time.sleep(0.2)
         return True
     return False
-
-
-def _dashboard(client: Client) -> str:
-    if importlib.util.find_spec("bokeh") is None:
-        return "no dashboard: it needs bokeh (pip install 'flexroad[dashboard]')"
-    return f"dashboard: {client.dashboard_link}"
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from typing import Any
 from flexroad.catalog.text import Notify, without_credentials
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute.executor import Executor, J, Probe, R
+from flexroad.pipeline.execute.executor import Executor, J, Lost, Probe, R
 
 LOCAL = Cluster()
 ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?([^\s:/@\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}")
@@ -29,48 +29,26 @@ def check_address(address: str) -> None:
         )
 
 
+@dataclass(frozen=True)
 class DaskExecutor:
-    """Runs jobs on local worker processes of one thread each, or on another Dask cluster.
+    """Runs jobs on local worker processes of one thread each, or on another Dask cluster."""
 
-    Parameters
-    ----------
-    workers : int, optional
-        Number of processes; by default that of ``cluster``.
-    scheduler : str, optional
-        Address of a running Dask scheduler, which is used instead of ``cluster``.
-    cluster : Cluster
-        The kind and size of the cluster, and how long to wait for workers.
-    dashboard : bool
-        Serve Dask's dashboard; its address is passed to ``notify``.
-    notify : callable
-        Prints one line for the user: the address of the dashboard, a wait for workers.
-    logs : Path, optional
-        Folder for the output of SLURM jobs, on a disk that all machines share; by default one in the home
-        folder, which is removed at the end.
-    """
-
-    def __init__(
-        self,
-        workers: int | None = None,
-        scheduler: str | None = None,
-        cluster: Cluster = LOCAL,
-        dashboard: bool = False,
-        notify: Notify = lambda line: None,
-        logs: Path | None = None,
-    ) -> None:
-        self.workers = workers
-        self.scheduler = scheduler
-        self.cluster = cluster
-        self.dashboard = dashboard
-        self.notify = notify
-        self.logs = logs
+    workers: int | None = None
+    """Number of processes; by default that of ``cluster``."""
+    scheduler: str | None = None
+    """Address of a running Dask scheduler, which is used instead of ``cluster``."""
+    cluster: Cluster = LOCAL
+    """The kind and size of the cluster, and how long to wait for workers."""
+    dashboard: bool = False
+    """Whether Dask's dashboard is served; its address is passed to ``notify``."""
+    notify: Notify = lambda line: None
+    """Prints one line for the user: the address of the dashboard, a wait for workers."""
+    logs: Path | None = None
+    """Folder for the output of SLURM jobs, on a disk that all machines share; by default one in the home
+    folder, which is removed at the end."""
 
     def map(
-        self,
-        function: Callable[[J], R],
-        jobs: Iterable[J],
-        lost: Callable[[J, str], R],
-        probe: Probe | None = None,
+        self, function: Callable[[J], R], jobs: Iterable[J], lost: Lost[J, R], probe: Probe | None = None
     ) -> Generator[R, None, None]:
         """Yield results as tiles finish."""
         queue = iter(jobs)
@@ -101,7 +79,7 @@ class DaskExecutor:
 
 
 @dataclass(frozen=True)
-class _ConnectedExecutor:
+class _ConnectedExecutor(Executor):
     """Runs jobs on the workers of a cluster that is connected."""
 
     client: Any
@@ -110,11 +88,7 @@ class _ConnectedExecutor:
     notify: Notify
 
     def map(
-        self,
-        function: Callable[[J], R],
-        jobs: Iterable[J],
-        lost: Callable[[J, str], R],
-        probe: Probe | None = None,
+        self, function: Callable[[J], R], jobs: Iterable[J], lost: Lost[J, R], probe: Probe | None = None
     ) -> Generator[R, None, None]:
         """Yield results as tiles finish; the caller has entered ``probe``."""
         # A run with nothing to do, which comes no further, starts without Dask.
@@ -133,7 +107,3 @@ class _ConnectedExecutor:
             probe,
         )
         yield from jobs_on_cluster.results()
-
-    def held(self) -> contextlib.AbstractContextManager[Executor]:
-        """Return a context manager of this executor."""
-        return contextlib.nullcontext(self)

@@ -62,26 +62,13 @@ class InFlight(Generic[J]):
 class Session(Generic[J, R]):
     """Submits jobs over one connection and collects their results.
 
-    Parameters
-    ----------
-    client : distributed.Client
-        Client with a `WorkerCheck` on every worker and a `retry_blocker` on the scheduler.
-    name : str
-        The scheduler's name in messages.
-    check : str
-        Name of the `WorkerCheck`; part of the task keys, so that they are unique to this session.
-    function : callable
-        Takes a job, returns its result.
-    jobs : iterator
-        The jobs; taken as there is room.
-    lost : callable
-        Takes a job and the reason, returns the result of a lost job.
-    worker_lost_timeout_s, tile_timeout_s : float
-        How long to wait for a worker when there is none, and longest time of a job (s).
-    notify : callable
-        Prints one line for the user.
-    probe : Probe, optional
-        The probe of the `WorkerCheck`.
+    - `client`: has a `WorkerCheck` on every worker and a `retry_blocker` on the scheduler.
+    - `name`: the scheduler's name in messages.
+    - `check`: name of the `WorkerCheck`; part of the task keys, so that they are unique to this session.
+    - `jobs`: taken as there is room.
+    - `worker_lost_timeout_s`, `tile_timeout_s`: how long to wait for a worker when there is none, and longest
+      time of a job (s).
+    - `probe`: that of the `WorkerCheck`.
     """
 
     def __init__(

@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -40,28 +41,21 @@ NAME = "flexroad"
 """Name of the jobs; the names of the files with their output begin with it."""
 
 
+@dataclass(eq=False)
 class SlurmJobs:
     """The jobs of a cluster. Those that SLURM no longer has are submitted again.
 
     Dask itself does so only for jobs of one worker (dask-jobqueue#611), and not for jobs that end while they
     wait. It takes a worker that is away for 15 s for a lost job, also if its nanny is about to replace it.
-
-    Parameters
-    ----------
-    cluster : dask_jobqueue.SLURMCluster
-        The cluster that the jobs belong to.
-    folder : Path
-        Folder of the output of the jobs, for messages.
-    notify : callable
-        Prints one line for the user.
     """
 
-    def __init__(self, cluster: Any, folder: Path, notify: Notify) -> None:
-        self.cluster = cluster
-        self.folder = folder
-        self.notify = notify
-        self.failures: Counter[str] = Counter()
-        """Number of jobs since one had a worker that connected, by name in Dask."""
+    cluster: Any
+    """The `dask_jobqueue.SLURMCluster` that the jobs belong to."""
+    folder: Path
+    """Folder of the output of the jobs, for messages."""
+    notify: Notify
+    failures: Counter[str] = field(default_factory=Counter)
+    """Number of jobs since one had a worker that connected, by name in Dask."""
 
     @property
     def given_up(self) -> bool:
@@ -98,23 +92,17 @@ class SlurmJobs:
         if listed is None:
             return
         for worker in self.cluster.scheduler_info["workers"].values():
-            self.failures.pop(self._job_of(worker["name"]), None)
+            # Of several workers in a job each has its number behind the name of the job.
+            name = worker["name"]
+            self.failures.pop(name if name in self.cluster.worker_spec else name.rpartition("-")[0], None)
         ended = [name for name, job in jobs.items() if job.job_id not in listed]
         for name in ended:
-            self._forget(name)
+            self.cluster.workers.pop(name).status = Status.closed
+            self.failures[name] += 1
+            if self.failures[name] >= TRIES:
+                self.cluster.worker_spec.pop(name, None)
         if ended:
             await self._replace(ended)
-
-    def _job_of(self, worker: str) -> str:
-        """Return the name of the job of a worker: the worker's, or that without its number within the job."""
-        return worker if worker in self.cluster.worker_spec else worker.rpartition("-")[0]
-
-    def _forget(self, name: str) -> None:
-        job = self.cluster.workers.pop(name)
-        job.status = Status.closed
-        self.failures[name] += 1
-        if self.failures[name] >= TRIES:
-            self.cluster.worker_spec.pop(name, None)
 
     async def _replace(self, ended: list[str]) -> None:
         left = [name for name in ended if name in self.cluster.worker_spec]
@@ -155,6 +143,7 @@ def slurm(cluster: Cluster, dashboard: bool, logs: Path | None, notify: Notify) 
 def slurm_options(cluster: Cluster, dashboard: bool, folder: Path) -> dict[str, Any]:
     """Return the options of ``SLURMCluster``: jobs of ``per_job`` workers, one thread and core each."""
     walltime = timedelta(hours=cluster.walltime_h)
+    hours, minutes = divmod(round(walltime.total_seconds() / 60), 60)
     # A worker that closes before SLURM kills it returns its tiles to the scheduler.
     lifetime = max(walltime - timedelta(minutes=5), walltime / 2)
     stagger = min(timedelta(minutes=1), lifetime / 2)
@@ -166,7 +155,7 @@ def slurm_options(cluster: Cluster, dashboard: bool, folder: Path) -> dict[str, 
         "cores": cluster.per_job,
         "processes": cluster.per_job,
         "memory": f"{(cluster.memory or DEFAULT_MEMORY_BYTES) * cluster.per_job} B",
-        "walltime": _clock(walltime),
+        "walltime": f"{hours:02}:{minutes:02}:00",
         "job_extra_directives": list(cluster.job_extra),
         "job_script_prologue": [*exports, *cluster.prologue],
         "worker_extra_args": [
@@ -256,8 +245,3 @@ async def _listed_jobs() -> set[str] | None:
 def _answer(error: RuntimeError) -> str:
     """Return what sbatch says, of an error of dask-jobqueue."""
     return " ".join(str(error).rpartition("stderr:")[2].split())
-
-
-def _clock(time: timedelta) -> str:
-    minutes = round(time.total_seconds() / 60)
-    return f"{minutes // 60:02}:{minutes % 60:02}:00"

@@ -13,7 +13,6 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
-from dask.system import CPU_COUNT
 from distributed.security import Security
 from distributed.system import MEMORY_LIMIT
 
@@ -67,16 +66,13 @@ def web_address(dashboard: bool) -> str:
 def environment(cluster: Cluster, dashboard: bool) -> dict[str, str]:
     """Return the environment of workers."""
     values = settings(cluster, dashboard).items()
-    return OF_WORKERS | {_variable(key): str(value) for key, value in values}
+    names = {key: key.replace(".", "__").replace("-", "_").upper() for key, _ in values}
+    return OF_WORKERS | {f"DASK_{names[key]}": str(value) for key, value in values}
 
 
 def certificates(cluster: Cluster) -> Any:
     """Return new certificates for the connections of a cluster, None with ``security: none``."""
     return Security.temporary() if cluster.security == "tls" else None
-
-
-def _variable(key: str) -> str:
-    return f"DASK_{key.replace('.', '__').replace('-', '_').upper()}"
 
 
 def available_bytes(mount: Path = MOUNT, own: Path = OWN) -> int:
@@ -86,16 +82,6 @@ def available_bytes(mount: Path = MOUNT, own: Path = OWN) -> int:
     limits of a systemd unit or of a SLURM job (`group_limits`, with the same parameters).
     """
     return min([int(MEMORY_LIMIT), *group_limits(mount, own)])
-
-
-def workers_here(cluster: Cluster) -> int:
-    """Return the number of processes on this machine: by default one for each core of the container."""
-    return cluster.workers or CPU_COUNT
-
-
-def bytes_of_worker(cluster: Cluster) -> int:
-    """Return the memory of a process on this machine (bytes): by default an equal share of what is there."""
-    return int(cluster.memory or available_bytes() // workers_here(cluster))
 
 
 def load_jobqueue() -> Any:

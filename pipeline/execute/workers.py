@@ -16,6 +16,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -30,6 +31,7 @@ from flexroad.catalog.text import Notify
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.executor import J, Probe, R
+from flexroad.pipeline.execute.start import one_line
 
 PICKLING = ("python", "dask", "distributed", "cloudpickle")
 """Packages whose versions must be equal for processes to exchange objects; also on the scheduler."""
@@ -49,12 +51,8 @@ _thread = local()
 class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
     """Limits a worker to one thread; before its first job, compares versions and takes the client's probe.
 
-    Parameters
-    ----------
-    versions : mapping
-        Versions of the client, from `versions`.
-    probe : Probe, optional
-        Check of what the jobs need.
+    - `versions`: those of the client, from `versions`.
+    - `probe`: check of what the jobs need.
     """
 
     def __init__(self, versions: Mapping[str, str], probe: Probe | None = None) -> None:
@@ -183,26 +181,19 @@ def _comparable(name: str, version: str) -> str:
     return ".".join(version.split(".")[:2]) if name == "python" else version.split("+")[0]
 
 
+@dataclass
 class Admission:
-    """Accepts the proofs of workers, and tells which workers are left out.
+    """Accepts the proofs of workers, and tells which workers are left out."""
 
-    Parameters
-    ----------
-    probe : Probe, optional
-        The probe of the `WorkerCheck`.
-    notify : callable
-        Prints one line for the user.
-    """
-
-    def __init__(self, probe: Probe | None, notify: Notify) -> None:
-        self.probe = probe
-        self.notify = notify
-        self.left_out: dict[str, str] = {}
-        """Why a worker gets no jobs, in one line, by its address."""
-        self._accepted: dict[str, Any] = {}
-        """Accepted proofs by worker address."""
-        self._told: set[tuple[str, str]] = set()
-        """Host and reason of the workers left out: one line for all workers of a host."""
+    probe: Probe | None
+    """The probe of the `WorkerCheck`."""
+    notify: Notify
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Why a worker gets no jobs, in one line, by its address."""
+    _accepted: dict[str, Any] = field(default_factory=dict)
+    """Accepted proofs by worker address."""
+    _told: set[tuple[str, str]] = field(default_factory=set)
+    """Host and reason of the workers left out: one line for all workers of a host."""
 
     def able(self, present: Mapping[str, int]) -> dict[str, int]:
         """Return those of the workers that are present, by address, that are not left out."""
@@ -244,9 +235,8 @@ def check_workers(client: Client, cluster: str, probe: Probe | None) -> str:
         raise ClusterLost(f"{cluster} went away before its first tile: {error}") from error
     except Exception as error:
         # Unpickling on the cluster may raise any type of error.
-        reason = " ".join(str(error).split()) or repr(error)
         raise ConfigError(
-            f"{cluster} cannot load flexroad ({reason}); install it for the workers, and let the "
+            f"{cluster} cannot load flexroad ({one_line(error)}); install it for the workers, and let the "
             "scheduler accept plugins (distributed.scheduler.pickle)"
         ) from error
     return name

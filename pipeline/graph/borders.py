@@ -22,9 +22,9 @@ from flexroad.catalog.borders import Border, Kind, border_at, places_of
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.tile import REACH_M, files_around
 from flexroad.pipeline.config.models import Chain, Config
+from flexroad.pipeline.config.stages import model_files, stage_head
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.sources import border_json, to_json
-from flexroad.pipeline.graph.stages import model_files, stage_head
 from flexroad.tasks.border import BorderStages, BorderTask
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options, stage_module
@@ -64,26 +64,19 @@ class BorderPattern:
         files = tuple(file for options in stages.by_name.values() for file in model_files(options))
         return cls(stages, head, stages.reach_m, stages.reads, files)
 
-    def parts(self, tile: Tile) -> Iterator[BorderPart]:
-        """Yield the corners and edges of a tile, in the order of `Frame`'s fields."""
+    def parts(self, tile: Tile) -> Iterator[tuple[BorderTask, str, list[tuple[Layer, Sequence[int]]]]]:
+        """Yield the corners and edges of a tile as they enter fingerprints, in the order of `Frame`'s fields.
+
+        Each has its position as JSON, without the closing bracket, and the layers of `BorderTask.ground` with
+        the numbers of their files.
+        """
         grid, layers = tile.grid, tile.layers_around(self.reads)
         size = grid.width, grid.height
         for kind, start in places_of(grid):
             border, place, bounds, reach = _described(
                 kind, repr(start), size, grid.crs, grid.cell, self.reach_m
             )
-            yield BorderPart(BorderTask(border, self.stages), place, files_around(layers, bounds, reach))
-
-
-@dataclass(frozen=True)
-class BorderPart:
-    """A corner or edge of a tile, as it enters fingerprints."""
-
-    task: BorderTask
-    place: str
-    """Its position as JSON, without the closing bracket."""
-    layers: list[tuple[Layer, Sequence[int]]]
-    """The layers of `BorderTask.ground`, and the numbers of their files."""
+            yield BorderTask(border, self.stages), place, files_around(layers, bounds, reach)
 
 
 # The text of a position tells -0.0 from 0.0, and the types of the sizes count: they do in fingerprints.

@@ -30,6 +30,7 @@ from flexroad.catalog import Layer, Tile
 from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.storage.paths import FileStat, Location
 from flexroad.pipeline.config.models import Chain, Config, Export
+from flexroad.pipeline.config.stages import STAGE_NAMES, STAGES, model_files, stage_head
 from flexroad.pipeline.graph.borders import STAGE, BorderPattern, has_borders
 from flexroad.pipeline.graph.sources import (
     Recorded,
@@ -40,7 +41,6 @@ from flexroad.pipeline.graph.sources import (
     names_json,
     to_json,
 )
-from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, model_files, stage_head
 from flexroad.tasks.border import ENDS, BorderTask
 from flexroad.tasks.options import Options, stage_function, stage_module
 from flexroad.tasks.products import cog, glb, npz, ply
@@ -316,19 +316,14 @@ def _border_nodes(tile: Tile, step: Step, sources: SourceFiles, grid: str) -> li
     assert step.borders
     pattern, nodes = step.borders, list[Node]()
     models = sources.models(pattern.files)
-    for number, part in enumerate(pattern.parts(tile)):
+    for number, (task, place, layers) in enumerate(pattern.parts(tile)):
         ends = tuple(nodes[end].fingerprint for end in ENDS[number - 4]) if number >= 4 else ()
         # Files of unknown position may have none of their own: it is then that of the tile.
-        core = "null" if all(layer.extents for layer, _ in part.layers) else grid
-        text = ",".join([sources.text(layer, numbers) for layer, numbers in part.layers])
-        name = hashed(f"[{pattern.head},{part.place},{core}],{names_json(ends)},[{text}],{models}]")
-        nodes.append(Node(name, STAGE, step.options, ends, stored=True, border=part.task))
+        core = "null" if all(layer.extents for layer, _ in layers) else grid
+        text = ",".join([sources.text(layer, numbers) for layer, numbers in layers])
+        name = hashed(f"[{pattern.head},{place},{core}],{names_json(ends)},[{text}],{models}]")
+        nodes.append(Node(name, STAGE, step.options, ends, stored=True, border=task))
     return nodes
-
-
-def tile_graph(tile: Tile, config: Config, checksum: bool = False) -> TileGraph:
-    """Return the graph of one tile; for many tiles `Pattern.graph` is faster."""
-    return Pattern.of(config).graph(tile, checksum)
 
 
 def files_read(graph: TileGraph, node: Node) -> list[Location]:

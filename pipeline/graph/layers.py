@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.config.stages import stage_version
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import product_layers
-from flexroad.pipeline.graph.stages import stage_version
 from flexroad.tasks.options import stage_module
 
 PRODUCTION = {"road_mask": "production", "roads": "production_vector"}

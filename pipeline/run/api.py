@@ -26,15 +26,15 @@ from flexroad.catalog.storage.paths import Location, exists
 from flexroad.catalog.text import printable
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.config.models import Config
-from flexroad.pipeline.config.settings import Setting, applied
+from flexroad.pipeline.config.settings import applied, parsed
+from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Executor, SerialExecutor
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import layers_read
-from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.collection import MAP, write_states
+from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.record import Run, check_folder, check_links
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import Folders, open_database, recorded
@@ -84,7 +84,12 @@ class Selection:
         if not selected.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
         some = self.tiles or self.bbox is not None or self.area
-        taken = _merged_catalog(path, whole, selected) if some else whole
+        taken, record = whole, path / "catalog.parquet"
+        if some:
+            # Earlier tiles of the run that are still in the catalog stay: their results stay in the tables.
+            earlier = {tile.id for tile in Catalog.read(record).tiles} if exists(record) else set()
+            ids = earlier | {tile.id for tile in selected.tiles}
+            taken = replace(whole, tiles=tuple(tile for tile in whole.tiles if tile.id in ids))
         return replace(taken, skipped=_with_lost(path, whole)), selected
 
 
@@ -181,7 +186,10 @@ def process(prepared: Prepared, verify: bool = False) -> Summary:
     try:
         summary = run_tiles(run, prepared.executor, prepared.only, prepared.force, observer.tile, verify)
     finally:
-        _write_map(run, observer)
+        try:
+            write_states(run, run.path / MAP)
+        except OSError as error:
+            observer.warning(f"cannot write the map of the tiles: {error}")
     observer.end(summary)
     return summary
 
@@ -216,18 +224,6 @@ def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile
     return selected
 
 
-def _merged_catalog(path: Location, whole: Catalog, wanted: Catalog) -> Catalog:
-    """Return the tiles of the run at ``path`` when the tiles ``wanted`` of a catalog are requested.
-
-    They are those tiles and the earlier tiles of the run that are still in the catalog, so that the results
-    of these stay in the tables.
-    """
-    record = path / "catalog.parquet"
-    earlier = {tile.id for tile in Catalog.read(record).tiles} if exists(record) else set()
-    ids = earlier | {tile.id for tile in wanted.tiles}
-    return replace(whole, tiles=tuple(tile for tile in whole.tiles if tile.id in ids))
-
-
 def _with_lost(path: Location, whole: Catalog) -> tuple[Skipped, ...]:
     """Return what a catalog skipped, with the tiles of the run at ``path`` that are missing without it.
 
@@ -257,18 +253,18 @@ def with_workers(run: Run, settings: Sequence[str]) -> Run:
 
     - `settings`: options of the command line: ``cluster.workers=8``.
     """
-    parsed = [Setting.parse(text) for text in settings]
-    for setting in parsed:
-        if setting.keys[0] != SECTION:
+    changes = [parsed(text) for text in settings]
+    for keys, _ in changes:
+        if keys[0] != SECTION:
             raise ConfigError(
-                f"--set {printable('.'.join(setting.keys))}: rerun takes options of {SECTION} only, like "
+                f"--set {printable('.'.join(keys))}: rerun takes options of {SECTION} only, like "
                 f"--set {SECTION}.workers=8; change others with `flexroad run`"
             )
     config = run.config
-    if parsed:
-        config = compose(applied(config.raw, parsed), config.name)
-    given = {name for setting in parsed for name in setting.keys[1:2]}
-    whole = any(len(setting.keys) == 1 for setting in parsed)
+    if changes:
+        config = compose(applied(config.raw, changes), config.name)
+    given = {name for keys, _ in changes for name in keys[1:2]}
+    whole = any(len(keys) == 1 for keys, _ in changes)
     unsealed = {name: value for name, value in config.cluster.programs.items() if name not in given}
     if unsealed and not whole and not run.programs_sealed:
         again = (f"--set {shlex.quote(f'{SECTION}.{n}={json.dumps(v)}')}" for n, v in unsealed.items())
@@ -322,10 +318,3 @@ def _executor(run: Run, workers: Workers, died: bool, observer: Observer) -> Exe
     if workers.executor == "dask" or died or needed:
         return parallel
     return AdaptiveExecutor(workers.number or cluster.workers, parallel, observer.line)
-
-
-def _write_map(run: Run, observer: Observer) -> None:
-    try:
-        write_states(run, run.path / MAP)
-    except OSError as error:
-        observer.warning(f"cannot write the map of the tiles: {error}")

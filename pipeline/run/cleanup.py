@@ -18,9 +18,9 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, absolute, entries, exists, hidden_files, listing, remove
 from flexroad.catalog.text import Notify
+from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
-from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import RECORD, Run, check_links, check_models
 from flexroad.pipeline.run.status import known_record, open_database, peek_statuses

@@ -97,7 +97,10 @@ def collection(run: Run, done: Sequence[Tile], mosaics: Sequence[Kind]) -> dict[
         "assets": {"metrics": METRICS} | {kind.key: _mosaic(kind) for kind in mosaics},
         "links": [
             {"rel": "root", "href": f"./{COLLECTION}", "type": JSON, "title": run.collection},
-            *(_item_link(tile) for tile in done),
+            *(
+                {"rel": "item", "href": f"./tiles/{safe_name(t.id)}/{DONE}", "type": GEOJSON, "title": t.id}
+                for t in done
+            ),
         ],
     }
 
@@ -109,10 +112,6 @@ def _mosaic(kind: Kind) -> dict[str, Any]:
         "title": f"{kind.title}, all tiles, as GDAL VRT",
         "roles": ["data"],
     }
-
-
-def _item_link(tile: Tile) -> dict[str, str]:
-    return {"rel": "item", "href": f"./tiles/{safe_name(tile.id)}/{DONE}", "type": GEOJSON, "title": tile.id}
 
 
 def _degrees(tiles: Sequence[Tile]) -> Bounds:
@@ -181,12 +180,7 @@ def vrt_name(kind: Kind) -> str:
 
 
 def _write_vrt(
-    run: Run,
-    grid: Grid,
-    kind: Kind,
-    band: Band,
-    tiles: Sequence[Tile],
-    own: Mapping[str, str] | None = None,
+    run: Run, grid: Grid, kind: Kind, band: Band, tiles: Sequence[Tile], own: Mapping[str, str] | None = None
 ) -> None:
     """Write a mosaic of one kind of raster, and on disk its style: in a bucket QGIS would not look for it.
 

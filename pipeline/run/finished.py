@@ -23,9 +23,9 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.storage.paths import Location, parse_location
 from flexroad.catalog.text import count, some
+from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing, product_layers
-from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Folders, TileStatus, last_record, peek_statuses
 from flexroad.pipeline.store.artefacts import ArtefactStore
@@ -38,16 +38,7 @@ from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.flagged import Bits
 from flexroad.tasks.quality.places import Place, places
-from flexroad.tasks.types import (
-    Floats,
-    Mesh,
-    Metrics,
-    Quality,
-    RoadClusters,
-    RoadMask,
-    Surface,
-    TileData,
-)
+from flexroad.tasks.types import Floats, Mesh, Metrics, Quality, RoadClusters, RoadMask, Surface, TileData
 
 ESTIMATES = 32
 """Number of tiles of which a process keeps the error estimates (0.6 MB each)."""

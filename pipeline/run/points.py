@@ -1,4 +1,4 @@
-"""What a sampler returns for points, and points in another CRS."""
+"""What a sampler returns for points, points in another CRS, and the steps of tiles without common borders."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from flexroad.catalog.crs import same, transformer
 from flexroad.tasks.quality.flagged import Bits
 from flexroad.tasks.types import Bools, Floats
 
+LARGEST_STEP_M = 0.05
+"""Step between neighbouring tiles up to which they carry a road; tiles with common borders meet."""
+STEP_REMEDY = "use a run of production, whose tiles have common borders"
 Places = slice | Bools | NDArray[np.intp]
 
 
@@ -86,3 +89,8 @@ def to_crs(x: Floats, y: Floats, source: str | None, target: str) -> tuple[Float
     east, north = transformer(source, target).transform(x, y)
     finite = np.isfinite(east) & np.isfinite(north)
     return np.where(finite, east, math.nan), np.where(finite, north, math.nan)
+
+
+def length_text(metres: float, digits: int = 0) -> str:
+    """Return a length for the user, in millimetres below one metre."""
+    return f"{1000 * metres:.{digits}f} mm" if metres < 1 else f"{metres:.2f} m"

@@ -50,20 +50,19 @@ from flexroad.catalog.storage.paths import (
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.loading import compose, load_config, read_mapping
 from flexroad.pipeline.config.models import ROOT, Config
+from flexroad.pipeline.config.stages import STAGE_NAMES, model_files
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import check_tiles
 from flexroad.pipeline.graph.graph import Pattern, TileGraph
 from flexroad.pipeline.graph.layers import check_layers
 from flexroad.pipeline.graph.sources import Recorded, Stat
-from flexroad.pipeline.graph.stages import STAGE_NAMES, model_files
-from flexroad.pipeline.run.event_log import NAME as LOG
+from flexroad.pipeline.run.events import LOG
 from flexroad.pipeline.run.lock import NAME as LOCK
 from flexroad.pipeline.run.seal import seal, sealed
 from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary
-from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.products import TileProducts
-from flexroad.pipeline.store.records import DONE, FAILED
+from flexroad.pipeline.store.records import DONE, FAILED, dump_checked, load_checked
 from flexroad.pipeline.worker.tile import TileJob
 
 PACKAGES = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "dask", "torch")
@@ -204,7 +203,7 @@ class Run:
     def _write(self) -> None:
         if not exists(self.path / RECORD):
             # An interrupted creation is known by this file, which says nothing yet (`check_folder`).
-            write(self.path / RECORD, checked_json.dumps({}), flushed=True)
+            write(self.path / RECORD, dump_checked({}), flushed=True)
             flush_names(self.path)
         config = yaml.safe_dump(self.config.raw, sort_keys=False).encode()
         write(self.path / "config.yaml", config, flushed=True)
@@ -223,7 +222,7 @@ class Run:
             "exported": list(self.exported),
             "collection": self.collection,
         }
-        write(self.path / RECORD, checked_json.dumps(record), flushed=True)
+        write(self.path / RECORD, dump_checked(record), flushed=True)
         # The run's folder may be new.
         flush_names(self.path, self.path.parent)
 
@@ -370,7 +369,7 @@ def _config(path: Location) -> Config:
 def _record(run: Location) -> dict[str, Any] | None:
     """Return the content of run.json, None if it is missing or damaged."""
     try:
-        record = checked_json.loads(read(run / RECORD))
+        record = load_checked(read(run / RECORD))
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
     except OSError as error:

@@ -27,13 +27,13 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, Jobs
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.run.collection import write_collection
-from flexroad.pipeline.run.event_log import EventLog
+from flexroad.pipeline.run.events import EventLog
 from flexroad.pipeline.run.record import Run, check_inputs
 from flexroad.pipeline.run.status import (
     Folders,
     has_marker,
     open_database,
-    recorded_summary,
+    recorded,
     tile_states,
     tile_statuses,
 )
@@ -160,13 +160,10 @@ def refuse_incomplete(run: Run, number: int, last: TileGraph | None) -> None:
     - `number`: number of tiles that lack a file.
     - `last`: the last of them.
     """
-    if last and number == len(run.catalog.usable) > 1:
-        raise ConfigError(_all_incomplete(run, last))
-
-
-def _all_incomplete(run: Run, graph: TileGraph) -> str:
-    """Return the error message of a run in which each tile lacks a file."""
-    path = own_files_missing(graph)[0]
+    tiles = len(run.catalog.usable)
+    if last is None or number != tiles or tiles < 2:
+        return
+    path = own_files_missing(last)[0]
     file = parse_location(path)
     try:
         if stat(file):
@@ -177,9 +174,8 @@ def _all_incomplete(run: Run, graph: TileGraph) -> str:
             remedy = "is the disk with the survey mounted?"
     except OSError as error:
         remedy = f"it {access_reason(error)}; make it readable"
-    return (
-        f"each of the {len(run.catalog.usable)} tiles lacks a file, "
-        f"for example tile {graph.tile.id}: {path}; {remedy}"
+    raise ConfigError(
+        f"each of the {tiles} tiles lacks a file, for example tile {last.tile.id}: {path}; {remedy}"
     )
 
 
@@ -254,11 +250,8 @@ def _close(
     refused = str(error) if isinstance(error, ConfigError) else ""
     interrupted = isinstance(error, KeyboardInterrupt)
     distances = MeshDistances()
-    summary = replace(
-        _final_summary(run, database, start, plan, interrupted),
-        interrupted=interrupted,
-        refused=refused,
-    )
+    summary = _final_summary(run, database, start, plan, interrupted)
+    summary = replace(summary, interrupted=interrupted, refused=refused)
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
         if plan.todo:
@@ -324,7 +317,7 @@ def _final_summary(
     elif interrupted and not database.lists(tile.id for tile in run.catalog.tiles):
         # The run is to end soon: checking the tiles would take as long as the start that was interrupted.
         return summarise(run.catalog, (), "")
-    return recorded_summary(run, database, start)
+    return summarise(run.catalog, recorded(run, database, start), run.config.export.variants[0])
 
 
 def _repair(run: Run, database: RunDatabase, start: str) -> None:

@@ -86,10 +86,6 @@ class TileStatus:
         return not self.done and self.last_record is not None and self.last_record.has_products
 
 
-def ignored(status: TileStatus, state: TileState) -> None:
-    """Do nothing with a tile that was checked."""
-
-
 @dataclass(frozen=True)
 class Folders:
     """The files of a run's tiles: one listing per tile on disk, one listing for all tiles in a bucket."""
@@ -247,7 +243,7 @@ def pending_tiles(run: Run) -> Iterator[TileStatus]:
 
 
 def summary(
-    run: Run, track: Track = untracked, each: Callable[[TileStatus, TileState], object] = ignored
+    run: Run, track: Track = untracked, each: Callable[[TileStatus, TileState], object] = lambda *_: None
 ) -> Summary:
     """Return the current summary of a run; checks every tile, its sources and its products.
 
@@ -265,14 +261,6 @@ def summary(
     last = read_summary(run.path)
     names = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
     return replace(current, **{name: last[name] for name in names if name in last})
-
-
-def recorded_summary(run: Run, database: RunDatabase, since: str) -> Summary:
-    """Return the summary of a run that started at a time (ISO 8601, UTC), from the database.
-
-    Only if the database is damaged or has other tiles, every tile is checked.
-    """
-    return summarise(run.catalog, recorded(run, database, since), run.config.export.variants[0])
 
 
 def progress(run: Run, owner: Owner) -> tuple[Summary, str]:

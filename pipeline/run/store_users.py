@@ -39,12 +39,9 @@ def runs_using(store: Location) -> Iterator[Location]:
             yield parse_location(json.loads(read(store / FOLDER / name))["run"])
 
 
-def unregister(store: Location, run: Location) -> bool:
-    """Remove a run from the runs of a store; return whether it was registered."""
-    path = _entry(store, run)
-    registered = exists(path)
-    remove(path)
-    return registered
+def unregister(store: Location, run: Location) -> None:
+    """Remove a run from the runs of a store."""
+    remove(_entry(store, run))
 
 
 def _entry(store: Location, run: Location) -> Location:

@@ -13,9 +13,9 @@ from typing import Any
 from flexroad.catalog import Catalog
 from flexroad.catalog.skipped import lines
 from flexroad.catalog.storage.paths import Location, read, write
-from flexroad.pipeline.store import checked_json
+from flexroad.catalog.text import count
 from flexroad.pipeline.store.database import Line
-from flexroad.pipeline.store.records import Failure, TileState
+from flexroad.pipeline.store.records import Failure, TileState, dump_checked, load_checked
 
 NAME = "summary.json"
 MAX_FAILURES = 1000
@@ -63,6 +63,11 @@ class Summary:
     def to_look_at(self) -> str:
         """``; 4 to look at`` for the end of a line about the tiles; empty if none has flags."""
         return f"; {len(self.flagged)} to look at" if self.flagged else ""
+
+    @property
+    def files_skipped(self) -> str:
+        """``; 2 files skipped by the catalog`` for such a line; empty if there are none."""
+        return f"; {count(self.skipped, 'file')} skipped by the catalog" if self.skipped else ""
 
     @property
     def exit_code(self) -> int:
@@ -119,11 +124,11 @@ def write_summary(run: Location, summary: Summary, flushed: bool = False, **abou
         **about,
         "flexroad": importlib.metadata.version("flexroad"),
     }
-    write(run / NAME, checked_json.dumps(content), flushed)
+    write(run / NAME, dump_checked(content), flushed)
 
 
 def read_summary(run: Location) -> dict[str, Any]:
     """Return the content of summary.json, empty if it is missing or damaged."""
     with contextlib.suppress(OSError, ValueError):
-        return checked_json.loads(read(run / NAME))
+        return load_checked(read(run / NAME))
     return {}

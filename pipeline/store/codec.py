@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 
 from flexroad.catalog import Grid
-from flexroad.pipeline.config.methods import methods
+from flexroad.pipeline.config.stages import methods
 from flexroad.tasks.io.archive import npz
 from flexroad.tasks.spline.frame import Corner, Edge
 from flexroad.tasks.spline.levelled import LevelledSurface
@@ -55,9 +55,7 @@ class Stored(NamedTuple):
     """Notes on the sources of all stages up to it."""
 
 
-def encode(
-    value: Any, seconds: Mapping[str, float], notes: Sequence[str] = (), fingerprint: str = ""
-) -> bytes:
+def encode(value: Any, seconds: Mapping[str, float], notes: Sequence[str], fingerprint: str) -> bytes:
     """Return the bytes of a result, of the seconds of each stage and of the notes up to it (`Stored`)."""
     arrays: dict[str, Any] = {}
     plain = _fields(value, "", arrays)
@@ -67,7 +65,7 @@ def encode(
     return payload + _checksum(payload, fingerprint)
 
 
-def decode(data: bytes, fingerprint: str = "") -> Stored:
+def decode(data: bytes, fingerprint: str) -> Stored:
     """Return the result, the seconds of each stage and the notes up to it."""
     payload, checksum = data[:-SHA256_BYTES], data[-SHA256_BYTES:]
     if _checksum(payload, fingerprint) != checksum:

@@ -12,8 +12,7 @@ from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import FileStat, Location
-from flexroad.pipeline.store import checked_json
-from flexroad.pipeline.store.records import DONE, FAILED
+from flexroad.pipeline.store.records import DONE, FAILED, dump_checked, load_checked
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
 """What reading a damaged marker raises."""
@@ -42,7 +41,7 @@ class TileProducts:
     def marker(self, name: str) -> dict[str, Any] | None:
         """Return the content of a marker; None if it is missing or damaged, or of another tile."""
         try:
-            content = checked_json.loads(paths.read(self.file(name)))
+            content = load_checked(paths.read(self.file(name)))
             own = safe_name(content["id" if name == DONE else "tile"]) == self.path.name
         except DAMAGED:
             return None
@@ -100,7 +99,7 @@ class TileProducts:
             paths.flush_names(self.path)
 
     def _mark(self, name: str, content: dict[str, Any], flushed: bool) -> None:
-        paths.write(self.file(name), checked_json.dumps(content), flushed)
+        paths.write(self.file(name), dump_checked(content), flushed)
         if flushed:
             # The tile's folder and the folder of all tiles may be new.
             paths.flush_names(self.path, self.path.parent, self.path.parent.parent)
@@ -108,12 +107,7 @@ class TileProducts:
 
 def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:
     """Return a STAC asset with size and checksum (a sha256 multihash, as the file extension requires)."""
-    return {
-        "href": name,
-        "type": media_type,
-        "file:size": len(data),
-        "file:checksum": _checksum(data),
-    }
+    return {"href": name, "type": media_type, "file:size": len(data), "file:checksum": _checksum(data)}
 
 
 def _checksum(data: bytes) -> str:

@@ -1,7 +1,9 @@
-"""The record of one tile of a run: the content of its marker that tables and resumed runs need."""
+"""The record of one tile of a run: what tables and resumed runs need of its marker; JSON with a checksum."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -22,6 +24,7 @@ TileState = Literal["cached", "done", "failed", "pending"]
 MarkerStat = tuple[str, int, int | str]
 """Name, size (bytes) and version (time or ETag) of a tile's marker file."""
 
+CHECKSUM = "flexroad:checksum"
 DONE, FAILED = "item.json", "failed.json"
 MARKERS: dict[TileState, str] = {"done": DONE, "failed": FAILED}
 """Name of the marker file of each state that has one."""
@@ -171,3 +174,28 @@ def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:
 def utc_now() -> str:
     """Return the current time in UTC, ISO 8601 with milliseconds."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def dump_checked(content: dict[str, Any]) -> bytes:
+    """Return an object as JSON with a checksum: a flipped bit in a figure leaves valid JSON.
+
+    What a damaged file held is computed or written again.
+    """
+    return json.dumps({**content, CHECKSUM: _checksum(content)}, indent=1, allow_nan=False).encode()
+
+
+def load_checked(data: bytes) -> dict[str, Any]:
+    """Return the object that `dump_checked` has written, without the checksum."""
+    try:
+        content = json.loads(data)
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
+    if not isinstance(content, dict) or content.pop(CHECKSUM, None) != _checksum(content):
+        raise ValueError("the checksum does not agree")
+    return content
+
+
+def _checksum(content: dict[str, Any]) -> str:
+    """Return the checksum of the values: spaces and the order of keys do not matter."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()

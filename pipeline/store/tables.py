@@ -29,54 +29,17 @@ OF_LEVELS = "levels.csv"
 CHUNK = 10_000
 """Rows held in memory at a time; also the row groups of metrics.parquet."""
 
-COLUMNS: dict[str, str] = {
-    "tile_id": "str",
-    "variant": "str",
-    "method": "str",
-    "stratum": "str",
-    "status": "str",
-    "l2_road_m": "float64",
-    "l2_terrain_m": "float64",
-    "rmse_road_m": "float64",
-    "rmse_terrain_m": "float64",
-    "nmad_road_m": "float64",
-    "p95_road_m": "float64",
-    "mad_road_deg": "float64",
-    "mad_terrain_deg": "float64",
-    "triangles": "Int64",
-    "road_fraction": "float64",
-    "completeness": "float64",
-    "seconds": "float64",
-    "error": "str",
-    "nearest_road_m": "float64",
-    "nearest_terrain_m": "float64",
-    "mesh_p95_road_m": "float64",
-    "mesh_max_road_m": "float64",
-    "mesh_p95_terrain_m": "float64",
-    "mesh_max_terrain_m": "float64",
-    "residual_median_m": "float64",
-    "residual_nmad_m": "float64",
-    "residual_p95_m": "float64",
-    "curvature_per_m": "float64",
-    "edge_step_m": "float64",
-    "measured_road": "float64",
-    "dtm_road": "float64",
-    "inferred_road": "float64",
-    "dropped_road": "float64",
-    "dsm_excess_m": "float64",
-    "off_dtm_m": "float64",
-    "off_dtm_road": "float64",
-    "bounded_weights": "float64",
-    "error_estimate_m": "float64",
-    "worst_error_estimate_m": "float64",
-    "worst_easting": "float64",
-    "worst_northing": "float64",
-    "max_unexplained_area_m2": "float64",
-    "holdout_squares": "float64",
-    "holdout_error_m": "float64",
-    "holdout_covered": "float64",
-    "flags": "str",
-}
+TEXTS = "tile_id variant method stratum status error flags".split()
+NAMES = """
+    tile_id variant method stratum status l2_road_m l2_terrain_m rmse_road_m rmse_terrain_m nmad_road_m
+    p95_road_m mad_road_deg mad_terrain_deg triangles road_fraction completeness seconds error
+    nearest_road_m nearest_terrain_m mesh_p95_road_m mesh_max_road_m mesh_p95_terrain_m
+    mesh_max_terrain_m residual_median_m residual_nmad_m residual_p95_m curvature_per_m edge_step_m
+    measured_road dtm_road inferred_road dropped_road dsm_excess_m off_dtm_m off_dtm_road
+    bounded_weights error_estimate_m worst_error_estimate_m worst_easting worst_northing
+    max_unexplained_area_m2 holdout_squares holdout_error_m holdout_covered flags
+""".split()
+COLUMNS = dict.fromkeys(NAMES, "float64") | dict.fromkeys(TEXTS, "str") | {"triangles": "Int64"}
 """Columns of metrics.parquet and their types in pandas, in the table's order."""
 IN_ARROW = {"str": "large_string", "float64": "float64", "Int64": "int64"}
 """Type in Arrow by type in pandas."""

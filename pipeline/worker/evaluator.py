@@ -163,7 +163,7 @@ class Evaluator:
         if node.fingerprint in self.renamed and self._restore(node):
             return
         span = self.spans[node.stage]
-        before = span.seconds
+        spent = span.seconds
         try:
             with span.measure(), recorded() as left_out:
                 result = self._run_stage(node, inputs, frame)
@@ -173,11 +173,12 @@ class Evaluator:
             raise failed from error
         span.computed += 1
         seconds = self._seconds_before(node)
-        seconds[node.stage] = span.seconds - before
+        seconds[node.stage] = span.seconds - spent
         self.results[node.fingerprint], self.chain_seconds[node.fingerprint] = result, seconds
         self.rename(node.fingerprint, left_out, (*node.inputs, *node.frame))
         own = (*(result.notes if node.stage in WITH_NOTES else ()), *left_out.values())
-        self.notes[node.fingerprint] = tuple(dict.fromkeys((*self._notes_before(node), *own)))
+        before = (note for name in node.inputs for note in self.notes[name])
+        self.notes[node.fingerprint] = tuple(dict.fromkeys((*before, *own)))
         if node.stored and self.keep:
             self._store(node, result, seconds)
 
@@ -189,10 +190,6 @@ class Evaluator:
         if node.frame:
             seconds[STAGE] = sum(self.chain_seconds[name][STAGE] for name in node.frame)
         return seconds
-
-    def _notes_before(self, node: Node) -> tuple[str, ...]:
-        """Return the notes of the nodes before a node, each once."""
-        return tuple(dict.fromkeys(note for name in node.inputs for note in self.notes[name]))
 
     def _run_stage(self, node: Node, inputs: list[Any], frame: list[Any]) -> Any:
         try:

@@ -15,19 +15,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.catalog import Grid
+from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.scan.rasters import quiet
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store.products import file_entry
+from flexroad.pipeline.worker.evaluator import check_unchanged
+from flexroad.tasks.errors import LayerMissing
+from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.levels.seen import top_mask
+from flexroad.tasks.load import layer_source
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import cog, glb, npz, ply
 from flexroad.tasks.quality.height_source import of_faces, top_height_source
 from flexroad.tasks.roads.level_numbers import HIGHEST
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Bools, Floats, Quality, Surface
+from flexroad.tasks.types import Bools, Orthophoto, Quality, Surface
 
 CLASSIFICATION = "https://stac-extensions.github.io/classification/v2.0.0/schema.json"
 FILE = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
@@ -35,6 +39,9 @@ RASTER = "https://stac-extensions.github.io/raster/v2.0.0/schema.json"
 EXTENSIONS = (FILE, RASTER, CLASSIFICATION)
 """Extensions of the assets, besides the projection extension of the catalog's items."""
 COLLECTION = "collection.json"
+NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"
+QUALITY = 85
+"""Quality of the texture's JPEG (percent): blocks are hardly visible."""
 JSON, GEOJSON = "application/json", "application/geo+json"
 
 
@@ -134,22 +141,19 @@ def products(
                 mesh = evaluate(nodes["sample"])
                 encoded = {GLB: glb.encode(mesh, (*origin, 0.0), texture, normals, graph.tile.id)}
             elif name == "ply":
-                encoded = _ply(nodes, evaluate, normals)
+                mesh, quality = evaluate(nodes["sample"]), evaluate(nodes["assess"])
+                sources = of_faces(quality.height_source, evaluate(nodes["segment"]), mesh, quality.levels)
+                encoded = {PLY: ply.encode(mesh, sources, normals)}
             elif name == "cog":
                 encoded = _cog(graph.tile.grid, nodes, evaluate, vertical)
             else:
-                encoded = _npz(nodes, evaluate)
+                surface = evaluate(nodes["fit"])
+                # Planes and rasters have no NURBS form, and their npz would only repeat the input.
+                encoded = {NPZ: npz.encode(surface)} if isinstance(surface, NurbsSurface) else {}
             for kind, data in encoded.items():
                 known = vertical if kind.band is cog.HEIGHT else None
                 files[file_name(graph.tile.id, variant, kind)] = Product(kind, variant, data, known)
     return files
-
-
-def _ply(nodes: dict[str, str], evaluate: Callable[[str], Any], normals: Floats | None) -> dict[Kind, bytes]:
-    mesh = evaluate(nodes["sample"])
-    quality = evaluate(nodes["assess"])
-    height_source = of_faces(quality.height_source, evaluate(nodes["segment"]), mesh, quality.levels)
-    return {PLY: ply.encode(mesh, height_source, normals)}
 
 
 def _cog(
@@ -194,12 +198,6 @@ def _of_levels(
     return top_height_source(quality, top), files
 
 
-def _npz(nodes: dict[str, str], evaluate: Callable[[str], Any]) -> dict[Kind, bytes]:
-    surface = evaluate(nodes["fit"])
-    # Planes and rasters have no NURBS form, and their npz would only repeat the input.
-    return {NPZ: npz.encode(surface)} if isinstance(surface, NurbsSurface) else {}
-
-
 def assets(files: Mapping[str, Product], variants: tuple[str, ...], grid: Grid) -> dict[str, Any]:
     """Return the assets of a tile's item from its files by name.
 
@@ -236,15 +234,6 @@ def asset_key(kind: Kind, variant: str, variants: tuple[str, ...]) -> str:
     return kind.key if variant == variants[0] else f"{kind.key}_{variant}"
 
 
-def links(collection: str) -> list[dict[str, str]]:
-    """Return the links of an item from its folder to the collection of its run."""
-    up = f"../../{COLLECTION}"
-    return [
-        {"rel": rel, "href": up, "type": JSON, "title": collection}
-        for rel in ("root", "parent", "collection")
-    ]
-
-
 def _described(kind: Kind, variant: str, variants: tuple[str, ...], cell: float | None) -> dict[str, Any]:
     """Return title, roles and bands of an asset."""
     title = kind.title if len(variants) == 1 else f"{kind.title} ({variant})"
@@ -272,3 +261,42 @@ def _band(band: cog.Band, cell: float | None) -> dict[str, Any]:
     }
     known = {name: value for name, value in optional.items() if value is not None}
     return {"name": band.name, "description": band.meaning, "data_type": band.dtype} | known
+
+
+def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
+    """Return the texture of a tile's meshes: its orthophoto, at its own resolution up to `export.texture_px`.
+
+    - `texture`: none if the configuration wants none, or the tile has no photo.
+    - `note`: what the photo lacks, or empty.
+    """
+    export, tile = graph.export, graph.tile
+    if not export.texture:
+        return None, ""
+    if not graph.product_sources:
+        return None, NO_PHOTO
+    (layer,) = graph.product_sources
+    try:
+        photo = tile_photo(tile, layer, export.texture_px)
+    finally:
+        check_unchanged(graph, tile.paths(layer))
+    if photo is None:
+        return None, NO_PHOTO
+    unknown = 1 - photo.known.mean()
+    note = f"dop: {unknown:.1%} of the texture has no orthophoto and takes its mean colour" if unknown else ""
+    return glb.texture(photo, QUALITY), note
+
+
+def tile_photo(tile: Tile, layer: Layer, largest_px: int) -> Orthophoto | None:
+    """Return the orthophoto of a tile, None if no pixel of it is known.
+
+    - `layer`: the tile's orthophoto.
+    - `largest_px`: largest width and height (pixels); a finer photo is averaged.
+    """
+    source = layer_source(replace(tile, layers=(layer,)), layer.name)
+    assert source is not None
+    west, south, east, north = tile.grid.bounds
+    try:
+        photo = read_photo(source, tile.grid, finest_m=max(east - west, north - south) / largest_px)
+    except LayerMissing:
+        return None
+    return photo if photo.known.any() else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import secrets
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import PurePath
 from types import TracebackType
@@ -108,9 +107,6 @@ def _arrived(folder: str, name: str) -> bool:
 def _different(job: TileJob) -> dict[str, FileStat | None]:
     """Return size and version of those source files that this process has otherwise: one of each folder."""
     known = {file: stat for file, stat in job.graph.file_stats.items() if stat is not None}
-    here = {file: source_stat(parse_location(file)) for file in _one_of_each_folder(known)}
+    one_of_each = {str(PurePath(file).parent): file for file in known}.values()
+    here = {file: source_stat(parse_location(file)) for file in one_of_each}
     return {file: stat for file, stat in here.items() if stat != known[file]}
-
-
-def _one_of_each_folder(files: Iterable[str]) -> Iterable[str]:
-    return {str(PurePath(file).parent): file for file in files}.values()

@@ -14,8 +14,8 @@ from typing import Any
 
 from flexroad.catalog.index import item
 from flexroad.catalog.storage.paths import parse_location, stat
+from flexroad.pipeline.config.stages import STAGE_NAMES, stage_version
 from flexroad.pipeline.graph.graph import TileGraph
-from flexroad.pipeline.graph.stages import STAGE_NAMES, stage_version
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import (
@@ -32,8 +32,16 @@ from flexroad.pipeline.store.records import (
     utc_now,
 )
 from flexroad.pipeline.worker.evaluator import Evaluator, StageCost, StageError, failure_of
-from flexroad.pipeline.worker.exports import EXTENSIONS, Product, assets, links, product_names, products
-from flexroad.pipeline.worker.texture import tile_texture
+from flexroad.pipeline.worker.exports import (
+    COLLECTION,
+    EXTENSIONS,
+    JSON,
+    Product,
+    assets,
+    product_names,
+    products,
+    tile_texture,
+)
 from flexroad.tasks.io.left_out import recorded
 from flexroad.tasks.types import Metrics, Quality
 
@@ -100,16 +108,6 @@ class TileResult:
     def computed(self) -> dict[str, int]:
         """Stage -> number of nodes computed in this run."""
         return {stage: span.computed for stage, span in self.spans.items() if span.computed}
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Stage -> computing time in this run (s)."""
-        return {stage: span.seconds for stage, span in self.spans.items() if span.computed}
-
-    @property
-    def peak_mb(self) -> float:
-        """Peak memory of the worker while it processed the tile (MB)."""
-        return max((span.peak_mb for span in self.spans.values()), default=0.0)
 
 
 def process_tile(job: TileJob) -> TileResult:
@@ -261,7 +259,8 @@ def _item(
     graph = job.graph.renamed(evaluator.renamed)
     content = item(graph.tile)
     content["collection"] = job.collection
-    content["links"] = links(job.collection)
+    to_collection = {"href": f"../../{COLLECTION}", "type": JSON, "title": job.collection}
+    content["links"] = [{"rel": rel} | to_collection for rel in ("root", "parent", "collection")]
     content["stac_extensions"] += EXTENSIONS
     content["assets"] = assets(files, graph.export.variants, graph.tile.grid)
     content["properties"] |= {
@@ -274,11 +273,7 @@ def _item(
         "flexroad:sources": graph.sources,
         "flexroad:left_out": list(evaluator.left_out),
         "flexroad:renamed": evaluator.renamed,
-        "flexroad:versions": _versions(graph),
+        "flexroad:versions": dict(stage_version(node.stage, node.options) for node in graph.nodes.values()),
         "flexroad:seconds": seconds,
     }
     return content
-
-
-def _versions(graph: TileGraph) -> dict[str, int]:
-    return dict(stage_version(node.stage, node.options) for node in graph.nodes.values())

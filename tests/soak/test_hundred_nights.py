@@ -22,7 +22,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.store import checked_json
+from flexroad.pipeline.store.records import load_checked
 from flexroad.tasks.segment import mask
 from tests import command_line
 from tests.faulty_files import FAULTS, Faulty, Observer, intercepted
@@ -254,7 +254,7 @@ def outcomes(out: Path, tiles: Collection[str]) -> dict[str, Outcome]:
         }
         if not lines:
             folder = out / "tiles" / tile
-            item = checked_json.loads((folder / "item.json").read_bytes())
+            item = load_checked((folder / "item.json").read_bytes())
             for part in (item["properties"], *item["properties"]["flexroad:rows"]):
                 for name in {"created", "flexroad:seconds", "seconds"} & part.keys():
                     del part[name]

@@ -25,7 +25,7 @@ from flexroad.catalog.storage.paths import Location, exists, read, remove, write
 from flexroad.catalog.text import count, write_reason
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.pipeline.check.failures import expected_failures
-from flexroad.pipeline.check.finding import Finding, evenly
+from flexroad.pipeline.check.trial import Finding, evenly
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.layers import check_layers

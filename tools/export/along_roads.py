@@ -20,8 +20,8 @@ from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile, GroundTile, passing
+from flexroad.pipeline.run.points import LARGEST_STEP_M, length_text
 from flexroad.pipeline.run.sampler import TileSampler
-from flexroad.pipeline.run.tile_steps import LARGEST_M, length_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
 from flexroad.tasks.quality.flagged import flag_names
@@ -393,7 +393,9 @@ def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
 def tile_faults(roads: list[Row]) -> list[str]:
     """Return a line that names the roads on tiles that do not meet; empty if all tiles do."""
     name = "tile_steps_max_mm"
-    apart = sorted((road for road in roads if road[name] > 1000 * LARGEST_M), key=lambda road: -road[name])
+    apart = sorted(
+        (road for road in roads if road[name] > 1000 * LARGEST_STEP_M), key=lambda road: -road[name]
+    )
     if not apart:
         return []
     named = [f"{road['id']} {road['name'] or ''}".strip() for road in apart]

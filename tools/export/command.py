@@ -19,8 +19,8 @@ from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.run.points import STEP_REMEDY
 from flexroad.pipeline.run.progress import StepProgress
-from flexroad.pipeline.run.tile_steps import REMEDY
 from flexroad.tools.export.driver import check_formats
 from flexroad.tools.export.driver import export as write
 from flexroad.tools.export.ellipsoidal import Datum
@@ -116,7 +116,7 @@ def export(
         _say(name, written[name], folder / name)
     faults = [f"{name}: {line}" for name in names for line in written[name].get("faults", ())]
     for line in faults:
-        echo(f"{'note' if allow_steps else 'error'}: {line}; {REMEDY}", err=True)
+        echo(f"{'note' if allow_steps else 'error'}: {line}; {STEP_REMEDY}", err=True)
     if faults and not allow_steps:
         echo("the files are written; --allow-steps takes them as they are", err=True)
         raise typer.Exit(1)

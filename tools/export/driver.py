@@ -31,9 +31,9 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.lock import run_lock
+from flexroad.pipeline.run.points import STEP_REMEDY
 from flexroad.pipeline.run.record import Run, check_own
 from flexroad.pipeline.run.status import Track, ended, untracked
-from flexroad.pipeline.run.tile_steps import REMEDY
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.export.formats import FORMATS, Format
 from flexroad.tools.export.source import Options, Source, check_photos
@@ -73,7 +73,7 @@ def export(
     apart = not has_borders(source.run.config.chains[source.variant]["fit"])
     others = ", ".join(name for name in chosen if not FORMATS[name].of_roads)
     if apart and others and len(source.tiles) > 1:
-        notify(f"{others}: the tiles of this run do not meet, and heights have steps there; {REMEDY}")
+        notify(f"{others}: the tiles of this run do not meet, and heights have steps there; {STEP_REMEDY}")
     with held(out, source.run, chosen, notify):
         written = _earlier(out, source, options, chosen, notify)
         for name, kind in chosen.items():

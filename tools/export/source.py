@@ -27,7 +27,7 @@ from flexroad.pipeline.run.finished import (
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.worker.evaluator import SourceChanged
-from flexroad.pipeline.worker.texture import tile_texture
+from flexroad.pipeline.worker.exports import tile_texture
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.products.glb import Texture

@@ -15,8 +15,8 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run.points import LARGEST_STEP_M, STEP_REMEDY, length_text
 from flexroad.pipeline.run.sampler import RunSampler
-from flexroad.pipeline.run.tile_steps import LARGEST_M, REMEDY, length_text
 from flexroad.tools.lift.driver import lift as lift_file
 from flexroad.tools.lift.types import Options
 
@@ -88,10 +88,10 @@ def lift(
         )
     for note in result.notes:
         echo(f"note: {note}", err=True)
-    if result.tile_step_m > LARGEST_M:
+    if result.tile_step_m > LARGEST_STEP_M:
         by = length_text(result.tile_step_m)
         kind = "note" if allow_steps else "error"
-        echo(f"{kind}: {file}: it lies on tiles that do not meet, by up to {by}; {REMEDY}", err=True)
-    if result.tile_step_m > LARGEST_M and not allow_steps:
+        echo(f"{kind}: {file}: it lies on tiles that do not meet, by up to {by}; {STEP_REMEDY}", err=True)
+    if result.tile_step_m > LARGEST_STEP_M and not allow_steps:
         echo("the file is written; --allow-steps takes it as it is", err=True)
         raise typer.Exit(1)

@@ -31,9 +31,8 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import passing
-from flexroad.pipeline.run.points import Heights, to_crs
+from flexroad.pipeline.run.points import Heights, length_text, to_crs
 from flexroad.pipeline.run.sampler import RunSampler, required_crs
-from flexroad.pipeline.run.tile_steps import length_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tasks.types import Floats

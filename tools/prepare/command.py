@@ -14,8 +14,8 @@ from flexroad.catalog.storage.outputs import made_folder
 from flexroad.catalog.storage.paths import check_writable
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.catalogs import after_catalog
 from flexroad.pipeline.cli.command import Command, group
-from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.signals import INTERRUPTED
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import GROUND, RECONSTRUCTION, option

@@ -199,9 +199,8 @@ def _rows(run: Run) -> pd.DataFrame:
 
 def _state(counts: Summary) -> str:
     without = f" ({counts.without_roads} of them without roads)" if counts.without_roads else ""
-    skipped = f"; {count(counts.skipped, 'file')} skipped by the catalog" if counts.skipped else ""
     states = f"{counts.done} done{without}, {counts.failed} failed, {counts.pending} pending"
-    return f"Tiles: {states}{skipped}{counts.to_look_at}"
+    return f"Tiles: {states}{counts.files_skipped}{counts.to_look_at}"
 
 
 def _over_tiles(

@@ -12,7 +12,7 @@ from flexroad.catalog.storage.paths import parse_location
 from flexroad.catalog.tiling import Conversion
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.run.api import Selection, Workers, created, process
-from flexroad.pipeline.run.observer import Observer
+from flexroad.pipeline.run.events import Observer
 from flexroad.tools.results.run import RunView, open_run
 
 

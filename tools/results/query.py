@@ -19,9 +19,8 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, reason
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import SEE_REPORT
-from flexroad.pipeline.run.points import Answer, to_crs
+from flexroad.pipeline.run.points import LARGEST_STEP_M, STEP_REMEDY, Answer, length_text, to_crs
 from flexroad.pipeline.run.sampler import RunSampler, crs_of, required_crs
-from flexroad.pipeline.run.tile_steps import LARGEST_M, REMEDY, length_text
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.quality.flagged import Bits, flag_names
 from flexroad.tasks.types import Floats
@@ -150,8 +149,8 @@ def along_lines(
     columns = _columns(answer, level)
     table = table.assign(height_m=columns.pop("height_m"), grade_percent=100 * slope, **columns)
     apart = sampler.largest_tile_step(easting, northing, 1.01 * step_m)
-    note = f"the line crosses tiles that do not meet, by up to {length_text(apart)}; {REMEDY}"
-    notes = (note,) if apart > LARGEST_M else ()
+    note = f"the line crosses tiles that do not meet, by up to {length_text(apart)}; {STEP_REMEDY}"
+    notes = (note,) if apart > LARGEST_STEP_M else ()
     return AnswerTable(table, easting[rows], northing[rows], crs_of(sampler), answer, notes, level=level)
 
 

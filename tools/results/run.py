@@ -21,8 +21,8 @@ from flexroad.catalog.text import access_reason, count, with_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.api import Workers, process, reopened
+from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.finished import FinishedTile, open_variant
-from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.points import Answer
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.sampler import RunSampler

@@ -9,8 +9,8 @@ import typer
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.text import count
+from flexroad.pipeline.cli.catalogs import after_catalog
 from flexroad.pipeline.cli.command import Command, group
-from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.tools.synthetic.scenes import write_scenes
 

@@ -99,7 +99,6 @@ def _settings(assignments: list[str]) -> dict[str, Any]:
         name, equals, value = assignment.partition("=")
         if not equals:
             raise ConfigError(f"--set {shown(assignment)}: give KEY=VALUE, like --set epochs=100")
-        parsed[name] = document.parse(
-            value.encode(errors="surrogateescape"), f"--set {printable(name)}"
-        ).value
+        given = value.encode(errors="surrogateescape")
+        parsed[name], _ = document.parse(given, f"--set {printable(name)}")
     return parsed

@@ -28,7 +28,7 @@ from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run, check_links, check_own
 from flexroad.pipeline.run.status import TileStatus, Track, ended, peek_statuses, untracked
 from flexroad.pipeline.store.records import LEVELS
-from flexroad.pipeline.worker.texture import tile_photo
+from flexroad.pipeline.worker.exports import tile_photo
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.load import layer_source

@@ -16,7 +16,7 @@ from flexroad.catalog.guard.source_files import files_of, source_stat
 from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.tile import Layer, Tile
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.graph.graph import tile_graph
+from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.worker.evaluator import SourceChanged, check_unchanged
 from flexroad.tasks.io.vectors import Query, read_near
 from tests.make_rasters import write
@@ -45,7 +45,7 @@ def fingerprint(layer, path, checksum=False):
     names = {"dsm": "other.tif", "dtm": "other.tif", "road_mask": "other.tif", layer: path.name}
     layers = tuple(Layer(name, (file,)) for name, file in names.items())
     tile = Tile("a", GRID, layers, str(path.parent), datetime(2025, 3, 1, tzinfo=UTC))
-    return tile_graph(tile, config, checksum)
+    return Pattern.of(config).graph(tile, checksum)
 
 
 def touched(path):

@@ -13,7 +13,7 @@ import typer
 from flexroad.pipeline.cli.catalogs import TOOLS
 from flexroad.pipeline.cli.main import COMMANDS as LISTED
 from flexroad.pipeline.cli.main import app
-from flexroad.pipeline.graph.stages import STAGE_NAMES
+from flexroad.pipeline.config.stages import STAGE_NAMES
 
 
 def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:

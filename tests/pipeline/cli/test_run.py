@@ -16,7 +16,7 @@ from flexroad.catalog.storage import paths
 from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.run import record
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.store import checked_json
+from flexroad.pipeline.store.records import dump_checked, load_checked
 from tests.command_line import same_signals
 
 QUICK = "extends: defaults\nfit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}\n"
@@ -203,9 +203,9 @@ def test_run_source_outside_catalog_folder_needs_allow(flexroad, nightly, survey
     flexroad(*nightly, *option.split())
     flexroad("rerun", tmp_path / "run", "--executor", "serial")
     path = tmp_path / "run" / "run.json"
-    record = checked_json.loads(path.read_bytes())
+    record = load_checked(path.read_bytes())
     record["allowed"] = [str(tmp_path / "other")]
-    path.write_bytes(checked_json.dumps(record))
+    path.write_bytes(dump_checked(record))
     assert f"--allow {tmp_path}\n" in flexroad("rerun", tmp_path / "run", "--executor", "serial", expect=2)
 
 

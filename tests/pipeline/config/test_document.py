@@ -21,16 +21,16 @@ def refusal(text: str | bytes) -> str:
 
 
 def test_parse_valid_file_returns_value_and_lines():
-    read = parse(
+    value, lines = parse(
         b"\xef\xbb\xbf# caf\xc3\xa9\nfit: &f {degree: 3}\n\nvariants: {a: {fit: *f}, b: {fit: {<<: *f}}}\n",
         "x",
     )
-    assert read.value == {
+    assert value == {
         "fit": {"degree": 3},
         "variants": {"a": {"fit": {"degree": 3}}, "b": {"fit": {"degree": 3}}},
     }
-    assert read.lines == {"fit": 2, "variants": 4}
-    assert parse(b"# nothing\n", "x").value is None
+    assert lines == {"fit": 2, "variants": 4}
+    assert parse(b"# nothing\n", "x")[0] is None
 
 
 @pytest.mark.parametrize(

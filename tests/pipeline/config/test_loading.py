@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.sources.templates import Layout
+from flexroad.pipeline.cli.configs import schema, template
 from flexroad.pipeline.config.loading import compose, load_config, read_mapping, shipped
-from flexroad.pipeline.config.schema import schema, template
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.filter import planar
 

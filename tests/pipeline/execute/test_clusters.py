@@ -434,7 +434,7 @@ def test_open_cluster_missing_program_raises(module, remedy, monkeypatch, tmp_pa
 
 def test_fingerprints_do_not_depend_on_cluster(made_survey, tmp_path):
     from flexroad.catalog import Catalog
-    from flexroad.pipeline.graph.graph import tile_graph
+    from flexroad.pipeline.graph.graph import Pattern
 
     text = "extends: paper\ncluster: {kind: slurm, queue: night}\n"
     (tmp_path / "night.yaml").write_text(text)
@@ -443,7 +443,7 @@ def test_fingerprints_do_not_depend_on_cluster(made_survey, tmp_path):
     assert (heir.cluster.queue, heir.cluster.workers) == ("night", 9)
     catalog = Catalog.read(made_survey / "catalog.parquet")
     plain, same = (
-        [tile_graph(tile, config).fingerprint for tile in catalog.tiles]
+        [Pattern.of(config).graph(tile).fingerprint for tile in catalog.tiles]
         for config in (load_config("paper"), heir)
     )
     assert same == plain

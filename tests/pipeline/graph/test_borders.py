@@ -19,10 +19,10 @@ from flexroad.catalog.sources import prepared, rasters
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.tile import REACH_M
 from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.config.stages import model_files
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE, check_tiles
-from flexroad.pipeline.graph.graph import Pattern, files_read, tile_graph
-from flexroad.pipeline.graph.stages import model_files
+from flexroad.pipeline.graph.graph import Pattern, files_read
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks import load
 from flexroad.tasks.border import ENDS, BorderStages
@@ -87,7 +87,7 @@ def test_neighbours_share_nodes_of_corners_and_edges(catalog_of, survey):
     _, parts = names(catalog_of(survey))
     assert len(parts) == 16 + 12 + 12
     assert all(len(fingerprints) == 1 for fingerprints in parts.values())
-    graph = tile_graph(catalog_of(survey).tiles[0], PRODUCTION)
+    graph = Pattern.of(PRODUCTION).graph(catalog_of(survey).tiles[0])
     fit = graph.nodes[graph.variants["flexroad"]["fit"]]
     assert [graph.nodes[name].border.border.kind for name in fit.frame] == [
         *["corner"] * 4, "east", "east", "north", "north",
@@ -256,7 +256,7 @@ def test_paper_has_no_borders(survey):
 
 
 def test_border_reads_only_files_around_it(survey):
-    graph = tile_graph(by_prepared(survey).tiles[0], PRODUCTION)
+    graph = Pattern.of(PRODUCTION).graph(by_prepared(survey).tiles[0])
     corner = borders(graph)[3]
     assert corner.border.border.start == (500250, 5600250)
     read = {path.relative_to(survey).as_posix() for path in files_read(graph, corner)}

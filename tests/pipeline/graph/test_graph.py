@@ -13,15 +13,14 @@ import pytest
 from flexroad.catalog import Catalog, Layer
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.config.stages import STAGE_NAMES, STAGES, stage_head, stage_version
 from flexroad.pipeline.graph.graph import (
     Pattern,
     any_file_missing,
     layers_read,
     own_files_missing,
-    tile_graph,
 )
 from flexroad.pipeline.graph.sources import SourceFiles
-from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_head, stage_version
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.options import stage_module
 from flexroad.tasks.segment import mask, vector
@@ -38,7 +37,7 @@ PAPER = {
 
 def names(catalog, raw=PAPER, variant="flexroad", **options) -> dict[str, str]:
     """Return stage -> fingerprint of the first tile."""
-    return tile_graph(Catalog.read(catalog).tiles[0], compose(raw, "x"), **options).variants[variant]
+    return Pattern.of(compose(raw, "x")).graph(Catalog.read(catalog).tiles[0], **options).variants[variant]
 
 
 def changed(before: dict[str, str], after: dict[str, str]) -> list[str]:
@@ -107,11 +106,11 @@ def test_changed_version_changes_its_stage_and_dependents(survey, monkeypatch):
 
 
 def test_stage_under_another_module_name_keeps_its_fingerprint(survey, monkeypatch):
-    before = tile_graph(Catalog.read(survey).tiles[0], compose(PAPER, "x"))
+    before = Pattern.of(compose(PAPER, "x")).graph(Catalog.read(survey).tiles[0])
     monkeypatch.setitem(sys.modules, "elsewhere", ecsrc)
     monkeypatch.setattr(ecsrc, "__name__", "elsewhere")
     monkeypatch.setattr(ecsrc.Options, "__module__", "elsewhere")
-    after = tile_graph(Catalog.read(survey).tiles[0], compose(PAPER, "x"))
+    after = Pattern.of(compose(PAPER, "x")).graph(Catalog.read(survey).tiles[0])
     moved = after.nodes[after.variants["flexroad"]["ecsrc"]]
     assert stage_module(moved.options).__name__ == "elsewhere"
     assert after == before
@@ -123,7 +122,7 @@ def versions_of(node) -> tuple[str, int]:
 
 
 def test_variants_share_equal_nodes(survey):
-    graph = tile_graph(Catalog.read(survey).tiles[0], compose(PAPER, "x"))
+    graph = Pattern.of(compose(PAPER, "x")).graph(Catalog.read(survey).tiles[0])
     assert len(graph.nodes) == 3 + 3 * 4
     stages = [node.stage for node in graph.nodes.values()]
     assert sorted(set(stages), key=stages.index) == list(STAGE_NAMES)
@@ -135,7 +134,7 @@ def test_variants_share_equal_nodes(survey):
 def test_fingerprint_differs_by_tile_and_not_by_folder(survey, tmp_path):
     tiles = Catalog.read(survey).tiles
     config = compose(PAPER, "x")
-    assert tile_graph(tiles[0], config).fingerprint != tile_graph(tiles[1], config).fingerprint
+    assert Pattern.of(config).graph(tiles[0]).fingerprint != Pattern.of(config).graph(tiles[1]).fingerprint
     before = names(survey)
     # copytree keeps the file times, and fingerprints hash relative paths.
     moved = shutil.copytree(survey.parent, tmp_path / "moved") / survey.name
@@ -164,7 +163,7 @@ def test_changed_layer_changes_only_stages_that_read_it(survey, monkeypatch):
     tile = replace(tile, layers=(*tile.layers, Layer("dop", (str(photo),))))
 
     def fingerprints():
-        return tile_graph(tile, compose(PAPER, "x")).variants["flexroad"]
+        return Pattern.of(compose(PAPER, "x")).graph(tile).variants["flexroad"]
 
     unread = fingerprints()
     photo.write_bytes(b"newer")
@@ -210,7 +209,7 @@ def test_neighbours_files_count_only_with_a_halo(survey):
 
 def test_graph_without_halo_holds_only_the_files_of_its_tile(survey):
     tile = Catalog.read(survey).tiles[0]
-    graph = tile_graph(tile, compose(PAPER, "x"))
+    graph = Pattern.of(compose(PAPER, "x")).graph(tile)
     # No stage reads the roads.
     read = [layer for layer in tile.layers if layer.name != "roads"]
     assert set(graph.file_stats) == {str(tile.paths(layer)[0]) for layer in read}
@@ -219,7 +218,7 @@ def test_graph_without_halo_holds_only_the_files_of_its_tile(survey):
     ]
 
     assert graph.tile == tile.within(tile.grid.bounds)
-    wide = tile_graph(tile, compose(HALO, "x"))
+    wide = Pattern.of(compose(HALO, "x")).graph(tile)
     assert wide.tile == tile
     assert len(wide.file_stats) > len(read)
 
@@ -227,7 +226,7 @@ def test_graph_without_halo_holds_only_the_files_of_its_tile(survey):
 def test_files_of_layers_that_no_stage_reads_may_lie_anywhere(survey):
     (tile, *_) = Catalog.read(survey).tiles
     tile = replace(tile, layers=(*tile.layers, Layer("dop", ("/elsewhere/dop.tif",))))
-    graph = tile_graph(tile, compose(PAPER, "x"))
+    graph = Pattern.of(compose(PAPER, "x")).graph(tile)
     assert "dop" not in {layer.name for layer in graph.readable.layers}
     assert own_files_missing(replace(graph, file_stats={"/missing": None})) == ["/missing"]
     node = graph.nodes[graph.variants["flexroad"]["load"]]
@@ -252,7 +251,7 @@ def test_photo_changes_fingerprint_of_tile_only_as_its_texture(survey, checksum)
     tile = with_photo(Catalog.read(survey).tiles[0], survey.parent, "own.tif", "beside.tif")
 
     def prints(raw):
-        graph = tile_graph(tile, compose(raw, "x"), checksum)
+        graph = Pattern.of(compose(raw, "x")).graph(tile, checksum)
         return graph.fingerprint, graph.variants
 
     plain, textured = prints(PAPER), prints(TEXTURED)
@@ -273,7 +272,7 @@ def test_options_of_texture_change_fingerprint_only_with_a_texture(survey):
     tile = Catalog.read(survey).tiles[0]
 
     def fingerprint(**export):
-        return tile_graph(tile, compose({**PAPER, "export": export}, "x")).fingerprint
+        return Pattern.of(compose({**PAPER, "export": export}, "x")).graph(tile).fingerprint
 
     assert fingerprint(texture_px=512) == fingerprint()
     assert fingerprint(texture=True, texture_px=512) != fingerprint(texture=True)
@@ -282,18 +281,18 @@ def test_options_of_texture_change_fingerprint_only_with_a_texture(survey):
 def test_photo_of_texture_is_read_for_products_and_by_no_stage(survey):
     tile = with_photo(Catalog.read(survey).tiles[0], survey.parent, "own.tif")
     config = compose(TEXTURED, "x")
-    graph = tile_graph(tile, config)
+    graph = Pattern.of(config).graph(tile)
     assert "dop" in graph.reads & layers_read(config)
     assert "dop" not in {layer.name for layer in graph.readable.layers}
     (survey.parent / "own.tif").unlink()
-    assert own_files_missing(tile_graph(tile, config)) == [str(survey.parent / "own.tif")]
-    assert own_files_missing(tile_graph(tile, compose(PAPER, "x"))) == []
+    assert own_files_missing(Pattern.of(config).graph(tile)) == [str(survey.parent / "own.tif")]
+    assert own_files_missing(Pattern.of(compose(PAPER, "x")).graph(tile)) == []
 
 
 def test_largest_halo_of_the_variants_counts(survey):
     tile = Catalog.read(survey).tiles[0]
     raw = {"variants": {"flexroad": {}, "wide": {"load": {"halo_m": 50}}}}
-    assert tile_graph(tile, compose(raw, "x")).tile == tile
+    assert Pattern.of(compose(raw, "x")).graph(tile).tile == tile
 
 
 def test_tile_of_a_raster_catalog_depends_on_files_that_reach_it(tmp_path):
@@ -302,9 +301,11 @@ def test_tile_of_a_raster_catalog_depends_on_files_that_reach_it(tmp_path):
             width = (200, 300, 250)[number]
             write(tmp_path / name / f"{number}.tif", np.ones((250, width), np.float32), west)
     tiles = rasters.index(tmp_path, {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif"}).tiles
-    read = [[file for file, *_ in tile_graph(tile, compose(PAPER, "x")).sources[0][1]] for tile in tiles]
+    read = [
+        [file for file, *_ in Pattern.of(compose(PAPER, "x")).graph(tile).sources[0][1]] for tile in tiles
+    ]
     assert read == [["dsm/0.tif", "dsm/1.tif"], ["dsm/1.tif"], ["dsm/2.tif"]]
-    wide = [[file for file, *_ in tile_graph(tile, compose(HALO, "x")).sources[0][1]] for tile in tiles]
+    wide = [[file for file, *_ in Pattern.of(compose(HALO, "x")).graph(tile).sources[0][1]] for tile in tiles]
     # The halo of the second tile ends where the first file does.
     assert wide == [["dsm/0.tif", "dsm/1.tif"], ["dsm/1.tif", "dsm/2.tif"], ["dsm/1.tif", "dsm/2.tif"]]
 
@@ -314,13 +315,13 @@ def test_missing_files_around_the_tile_are_not_its_own(survey):
     own, (beside, *_) = own_and_neighbours(tile)
     config = compose(HALO, "x")
     beside.unlink()
-    graph = tile_graph(tile, config)
+    graph = Pattern.of(config).graph(tile)
     assert any_file_missing(graph)
     assert own_files_missing(graph) == []
     own.unlink()
-    assert own_files_missing(tile_graph(tile, config)) == [str(own)]
+    assert own_files_missing(Pattern.of(config).graph(tile)) == [str(own)]
     unknown = replace(tile, layers=tuple(replace(layer, extents=()) for layer in tile.layers))
-    assert set(own_files_missing(tile_graph(unknown, config))) == {str(own), str(beside)}
+    assert set(own_files_missing(Pattern.of(config).graph(unknown))) == {str(own), str(beside)}
 
 
 @pytest.mark.parametrize(

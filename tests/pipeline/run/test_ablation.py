@@ -7,7 +7,7 @@ import pytest
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.graph.graph import tile_graph
+from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
@@ -29,14 +29,14 @@ NODES = {
 
 def test_ablation_graph_has_expected_node_counts(survey):
     config = load_config("ablation")
-    graph = tile_graph(Catalog.read(survey).tiles[0], config)
+    graph = Pattern.of(config).graph(Catalog.read(survey).tiles[0])
     assert len(config.chains) == VARIANTS
     assert Counter(node.stage for node in graph.nodes.values()) == NODES
 
 
 def test_main_variants_equal_those_of_paper_configuration(survey):
     tile = Catalog.read(survey).tiles[0]
-    ours, paper = (tile_graph(tile, load_config(name)).variants for name in ("ablation", "paper"))
+    ours, paper = (Pattern.of(load_config(name)).graph(tile).variants for name in ("ablation", "paper"))
     for variant in ("plane", "rgt", "flexroad"):
         del ours[variant]["evaluate"], paper[variant]["evaluate"]
         assert ours[variant] == paper[variant]
@@ -45,7 +45,7 @@ def test_main_variants_equal_those_of_paper_configuration(survey):
 @pytest.mark.parametrize("name", ["ablation_true", "ablation_dsm"])
 def test_other_truth_changes_only_evaluation(survey, name):
     tile = Catalog.read(survey).tiles[0]
-    ours, true = (tile_graph(tile, load_config(config)).variants for config in ("ablation", name))
+    ours, true = (Pattern.of(load_config(config)).graph(tile).variants for config in ("ablation", name))
     assert ours.keys() == true.keys()
     for variant, nodes in ours.items():
         assert {stage for stage in nodes if nodes[stage] != true[variant][stage]} == {"evaluate"}
@@ -53,7 +53,7 @@ def test_other_truth_changes_only_evaluation(survey, name):
 
 def test_literal_changes_only_the_nurbs_and_what_follows(survey):
     tile = Catalog.read(survey).tiles[0]
-    ours, literal = (tile_graph(tile, load_config(name)).variants for name in ("ablation", "literal"))
+    ours, literal = (Pattern.of(load_config(name)).graph(tile).variants for name in ("ablation", "literal"))
     assert ours.keys() == literal.keys()
     for variant, nodes in ours.items():
         changed = {stage for stage in nodes if nodes[stage] != literal[variant][stage]}

@@ -28,7 +28,7 @@ from flexroad.catalog import Catalog, Layer
 from flexroad.catalog.storage import paths
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.event_log import EventLog
+from flexroad.pipeline.run.events import EventLog
 from flexroad.pipeline.run.lock import Owner, run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -413,7 +413,7 @@ def test_run_clock_set_back_midway_is_cached_next_time(night, before_tile, monke
     def set_back() -> None:
         monkeypatch.setattr(time, "time", lambda: now() - 5 * DAY_S)
         frozen = "2001-01-01T00:00:00.000+00:00"
-        for module in ("worker.evaluator", "worker.tile", "run.event_log", "run.runner"):
+        for module in ("worker.evaluator", "worker.tile", "run.events", "run.runner"):
             monkeypatch.setattr(f"flexroad.pipeline.{module}.utc_now", lambda: frozen)
         monkeypatch.setattr(paths, "write", write_with_old_time)
 

@@ -23,7 +23,7 @@ from rasterio.merge import merge
 from flexroad.catalog import Catalog
 from flexroad.catalog.guard import kept_rasters, open_raster
 from flexroad.catalog.sources import rasters
-from flexroad.pipeline.cli.dry_run import Verdict, plan
+from flexroad.pipeline.cli.dry_run import plan
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.graph import sources
@@ -33,7 +33,8 @@ from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import open_database, tile_states
-from flexroad.pipeline.store import checked_json, codec
+from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.records import load_checked
 from flexroad.tasks.io import vectors
 from flexroad.tasks.products import npz
 from flexroad.tools.synthetic.scenes import write_scenes
@@ -415,7 +416,7 @@ def test_blocks_damaged_for_some_nights_leave_no_trace(survey, tmp_path):
             damage(sheet, *cell)
         os.utime(sheet, ns=(stat.st_atime_ns, stat.st_mtime_ns))
         assert night(out, catalog)[0].failed == len(cells[:1])
-        item = checked_json.loads((out / "tiles" / "500040_5600040" / "item.json").read_bytes())
+        item = load_checked((out / "tiles" / "500040_5600040" / "item.json").read_bytes())
         loads.append(item["properties"]["flexroad:nodes"]["flexroad"]["load"])
     assert loads[0] == loads[1]
     assert len(set(loads)) == 3
@@ -434,7 +435,7 @@ def test_damaged_file_is_named_by_every_command(survey, tmp_path):
             states = list(tile_states(run, database))
         assert [state for _, state in states] == ["failed" if s.failed else "done" for s, _ in states]
         assert [status.last_record.left_out for status, _ in states if status.done] == [(name,)] * 3
-        lines = list(plan(run, run.catalog.tiles, Verdict()))
+        plan(run, run.catalog.tiles, (lines := []).append)
         assert sum(f"file left out: {name} could not be used" in line for line in lines) == 3
         # A thread keeps sources open, as they were.
         with ThreadPoolExecutor(1) as thread:
@@ -448,7 +449,7 @@ def assert_computed_as_stored(run, empty):
         if snapshot:
             places = stored, replace(stored, store=str(empty))
             one, other = (FinishedTile(tile, "flexroad", snapshot, place) for place in places)
-            assert codec.encode(one.surface, {}) == codec.encode(other.surface, {})
+            assert codec.encode(one.surface, {}, (), "") == codec.encode(other.surface, {}, (), "")
             assert one.graph.fingerprint == snapshot.fingerprint
 
 

@@ -10,7 +10,7 @@ from flexroad.catalog import Catalog, CatalogError
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.seal import seal, sealed
-from flexroad.pipeline.store import checked_json
+from flexroad.pipeline.store.records import dump_checked, load_checked
 from tests.faulty_files import intercepted
 from tests.power_loss import Recording, states
 
@@ -102,9 +102,9 @@ def test_store_outside_of_a_foreign_run_needs_allow(flexroad, survey, quick_conf
     config, catalog = _settings(survey, quick_config)
     Run.create(run, config, catalog, store)
     assert Run.open(run).store == store
-    record = checked_json.loads((run / "run.json").read_bytes())
+    record = load_checked((run / "run.json").read_bytes())
     other = tmp_path / "other"
-    (run / "run.json").write_bytes(checked_json.dumps(record | {"store": str(other)}))
+    (run / "run.json").write_bytes(dump_checked(record | {"store": str(other)}))
     line = f"{run} has its store in {other}, which this user has not given .* add --allow {other}$"
     with pytest.raises(ConfigError, match=line):
         Run.open(run)
@@ -138,10 +138,10 @@ def test_changed_list_of_a_run_allows_nothing(flexroad, survey, quick_config, tm
     Run.create(run, *_settings(survey, quick_config))
     tile = Run.open(run).catalog.tiles[0]
     assert all(path.exists() for path in tile.paths(tile.layers[0]))
-    record = checked_json.loads((run / "run.json").read_bytes())
+    record = load_checked((run / "run.json").read_bytes())
     assert str(survey.parent) in record["allowed"]
     record["allowed"] = allowed
-    (run / "run.json").write_bytes(checked_json.dumps(record))
+    (run / "run.json").write_bytes(dump_checked(record))
     tile = Run.open(run).catalog.tiles[0]
     with pytest.raises(CatalogError, match=f"--allow {survey.parent}"):
         tile.paths(tile.layers[0])

@@ -17,8 +17,8 @@ from flexroad.pipeline.run.collection import write_states
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.sampler import RunSampler
-from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.products import TileProducts
+from flexroad.pipeline.store.records import load_checked
 from flexroad.tools.export.source import select
 from flexroad.tools.report.content import gather
 from flexroad.tools.synthetic.scenes import write_scenes
@@ -59,7 +59,7 @@ def products(run: Run, number: int = 0) -> dict[str, bytes]:
 
 
 def failed(run: Run) -> dict:
-    return checked_json.loads((run.folder(run.catalog.tiles[0].id).path / "failed.json").read_bytes())
+    return load_checked((run.folder(run.catalog.tiles[0].id).path / "failed.json").read_bytes())
 
 
 def marked(run: Run, number: int = 0) -> tuple[str, bool]:

@@ -7,7 +7,7 @@ import pytest
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import compose, load_config
-from flexroad.pipeline.graph.graph import tile_graph
+from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.run.lock import Owner, owner, run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import last_record, matches, progress
@@ -70,7 +70,7 @@ def done(folder, graph) -> bool:
 
 
 def test_tile_with_other_graph_or_incomplete_product_is_not_done(survey, tmp_path):
-    graph = tile_graph(Catalog.read(survey).tiles[0], compose(QUICK, "x"))
+    graph = Pattern.of(compose(QUICK, "x")).graph(Catalog.read(survey).tiles[0])
     folder = TileProducts.of(tmp_path, graph.tile.id)
     item = {
         "id": graph.tile.id,
@@ -82,7 +82,7 @@ def test_tile_with_other_graph_or_incomplete_product_is_not_done(survey, tmp_pat
     (folder.path / "mesh.glb").write_bytes(b"ab")
     assert not done(folder, graph)
     (folder.path / "mesh.glb").write_bytes(b"abc")
-    other = tile_graph(graph.tile, compose({**QUICK, "sample": {"road_m": 2}}, "x"))
+    other = Pattern.of(compose({**QUICK, "sample": {"road_m": 2}}, "x")).graph(graph.tile)
     assert not done(folder, other)
     (folder.path / "item.json").write_text("{")
     assert not done(folder, graph)

@@ -17,7 +17,7 @@ from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.worker.texture import NO_PHOTO
+from flexroad.pipeline.worker.exports import NO_PHOTO
 from tests.whole_run import LIGHT
 
 CELL = 0.5

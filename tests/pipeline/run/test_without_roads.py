@@ -14,7 +14,8 @@ from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.run.status import open_database, recorded_summary, summary
+from flexroad.pipeline.run.status import open_database, recorded, summary
+from flexroad.pipeline.run.summary import summarise
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import QUALITY
 from flexroad.tasks.products import npz
@@ -55,7 +56,7 @@ def test_run_tiles_without_roads_are_done_flagged_and_cached(half, tmp_path, exe
         assert (result.done, result.cached, result.without_roads, result.exit_code) == (4, cached, 2, 0)
     assert summary(run).without_roads == 2
     with open_database(run) as database:
-        assert recorded_summary(run, database, "").without_roads == 2
+        assert summarise(run.catalog, recorded(run, database, ""), "flexroad").without_roads == 2
     rows = read_metrics(run.path)
     bare = rows.tile_id.isin([half.tiles[number].id for number in BARE])
     assert set(rows.status) == {"done"}

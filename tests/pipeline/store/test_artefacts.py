@@ -12,7 +12,7 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.config.loading import compose
-from flexroad.pipeline.graph.graph import tile_graph
+from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.store import codec
 from flexroad.pipeline.store.artefacts import DAMAGED, ArtefactStore
 from flexroad.pipeline.store.products import TileProducts, file_entry
@@ -44,7 +44,7 @@ def same(a, b) -> bool:
 
 @pytest.fixture
 def evaluator(survey, tmp_path):
-    graph = tile_graph(Catalog.read(survey).tiles[0], compose(CONFIG, "x"))
+    graph = Pattern.of(compose(CONFIG, "x")).graph(Catalog.read(survey).tiles[0])
     return Evaluator(graph, ArtefactStore(tmp_path / "store"), keep=True)
 
 
@@ -54,7 +54,7 @@ def test_codec_restores_every_result_exactly(evaluator):
         if node.stage == "load":
             continue
         value = evaluator(fingerprint)
-        back, seconds, notes = codec.decode(codec.encode(value, {"fit": 0.25}, ("dsm: a note",)))
+        back, seconds, notes = codec.decode(codec.encode(value, {"fit": 0.25}, ("dsm: a note",), ""), "")
         assert (seconds, notes) == ({"fit": 0.25}, ("dsm: a note",))
         assert type(back) is type(value)
         for field in fields(value):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexroad.pipeline.store import checked_json
+from flexroad.pipeline.store.records import CHECKSUM, dump_checked, load_checked
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
@@ -17,29 +17,29 @@ values = st.recursive(
 CONTENT = {"id": "a", "rows": [{"road_l2": 0.0281, "tile": "ä"}], "size": 17}
 
 
-@given(content=st.dictionaries(st.text(), values, max_size=5).filter(lambda c: checked_json.KEY not in c))
+@given(content=st.dictionaries(st.text(), values, max_size=5).filter(lambda c: CHECKSUM not in c))
 def test_loads_what_was_dumped(content):
-    assert checked_json.loads(checked_json.dumps(content)) == content
+    assert load_checked(dump_checked(content)) == content
 
 
 def test_any_flipped_bit_is_noticed_or_changes_no_value():
-    data = checked_json.dumps(CONTENT)
+    data = dump_checked(CONTENT)
     noticed = 0
     for at in range(len(data)):
         for bit in range(8):
             copy = bytearray(data)
             copy[at] ^= 1 << bit
             try:
-                assert checked_json.loads(bytes(copy)) == CONTENT
+                assert load_checked(bytes(copy)) == CONTENT
             except ValueError:
                 noticed += 1
     assert noticed > 7 * len(data)
 
 
 def test_format_and_order_of_keys_do_not_matter():
-    content = json.loads(checked_json.dumps(CONTENT))
+    content = json.loads(dump_checked(CONTENT))
     again = json.dumps(dict(reversed(content.items())), separators=(",", ":"), ensure_ascii=False)
-    assert checked_json.loads(again.encode()) == CONTENT
+    assert load_checked(again.encode()) == CONTENT
 
 
 @pytest.mark.parametrize(
@@ -47,9 +47,9 @@ def test_format_and_order_of_keys_do_not_matter():
 )
 def test_other_files_raise_value_error(data):
     with pytest.raises(ValueError, match="."):
-        checked_json.loads(data)
+        load_checked(data)
 
 
 def test_numbers_that_json_lacks_raise_error():
     with pytest.raises(ValueError, match="JSON"):
-        checked_json.dumps({"height": np.inf})
+        dump_checked({"height": np.inf})

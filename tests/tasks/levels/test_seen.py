@@ -129,7 +129,7 @@ def test_tile_without_decks_has_the_bytes_of_one_without_the_option(tmp_path):
     assert with_option.road.mask.any()
     for name in ("road", "clusters", "surface"):
         one, other = getattr(with_option, name), getattr(without, name)
-        assert codec.encode(one, {}) == codec.encode(other, {})
+        assert codec.encode(one, {}, (), "") == codec.encode(other, {}, (), "")
 
 
 def test_levels_see_their_own_heights(tmp_path):

@@ -73,7 +73,9 @@ def test_flags_of_decks_are_those_of_the_tile_and_results_keep_them():
     assert own[1].structures.clearance_m == pytest.approx(-1, abs=1e-9)
     assert {BELOW, NO_RISE} <= set(quality.flags)
     assert {BELOW, NO_RISE} <= set(own[1].flags)
-    assert codec.decode(codec.encode(quality, {})).value.levels[0][1].structures == own[1].structures
+    assert (
+        codec.decode(codec.encode(quality, {}, (), ""), "").value.levels[0][1].structures == own[1].structures
+    )
 
 
 @pytest.mark.parametrize(

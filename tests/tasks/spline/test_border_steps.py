@@ -126,7 +126,7 @@ def test_meshes_meet_with_steps_away_from_the_road(method):
 
 def test_edge_is_stored_without_loss():
     edge = frame_of("across the edge", TILES[0]).east
-    restored, *_ = codec.decode(codec.encode(edge, {}))
+    restored, *_ = codec.decode(codec.encode(edge, {}, (), ""), "")
     assert np.array_equal(restored.steps, edge.steps)
     assert np.array_equal(restored.road_m, edge.road_m)
 

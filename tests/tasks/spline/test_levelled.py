@@ -129,7 +129,7 @@ CLUSTERS = RoadClusters(GRID, np.ones(GRID.shape, np.int32))
     ids=["mask", "clusters", "corner", "edge", "surface"],
 )
 def test_results_with_levels_are_stored(result):
-    same(codec.decode(codec.encode(result, {})).value, result)
+    same(codec.decode(codec.encode(result, {}, (), ""), "").value, result)
 
 
 def test_frame_part_of_missing_level_is_that_of_ground():

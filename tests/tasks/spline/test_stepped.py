@@ -135,7 +135,7 @@ def test_hidden_road_has_no_steps():
 def test_stepped_surface_is_stored_without_loss():
     data, clusters, _ = tile(4.0)
     surface = fitted(data, clusters)
-    restored, *_ = codec.decode(codec.encode(surface, {}))
+    restored, *_ = codec.decode(codec.encode(surface, {}, (), ""), "")
     assert type(restored) is type(surface)
     assert isinstance(restored, NurbsSurface)
     assert heights(restored).tobytes() == heights(surface).tobytes()

@@ -1,26 +1,28 @@
-"""The stages of the paper: their names, their inputs and the file of each.
-
-::
-
-    load      tasks/load.py               DSM, DTM, masks and reference of a tile, on one lattice
-    segment   tasks/segment/METHOD.py     the road mask M^r (step B)
-    ecsrc     tasks/filter/METHOD.py      the filtered mask M^{r+} (step B, Algorithm 1)
-    fit       tasks/fit/METHOD.py         the surface S (step C)
-    sample    tasks/sample.py             the mesh (dynamic surface sampling)
-    evaluate  tasks/metrics/evaluate.py   error, smoothness and size of the mesh
-    assess    tasks/quality/assess.py     flags and an error estimate without ground truth; not the paper's
-
-`pipeline.config.methods` imports the files.
-"""
+"""The stages of the paper: the module of each or the package of its methods, inputs, versions and models."""
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from flexroad.tasks.options import Options, stage_module
 
+HOMES = {
+    "load": "flexroad.tasks.load",
+    "segment": "flexroad.tasks.segment",
+    "ecsrc": "flexroad.tasks.filter",
+    "fit": "flexroad.tasks.fit",
+    "sample": "flexroad.tasks.sample",
+    "evaluate": "flexroad.tasks.metrics.evaluate",
+    "assess": "flexroad.tasks.quality.assess",
+}
+"""Stage -> its module, or the package of its methods if it has several; in the paper's order."""
+DEFAULTS = {"segment": "mask", "ecsrc": "paper", "fit": "nurbs"}
+"""Default method of each stage that has several."""
 STAGES: dict[str, tuple[str, ...]] = {
     "load": (),
     "segment": ("load",),
@@ -32,6 +34,24 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 """The stages of the paper, in its order, and the stages whose results their functions take, in that order."""
 STAGE_NAMES = tuple(STAGES)
+
+
+@cache
+def methods(stage: str) -> dict[str, Any]:
+    """Return the modules of a stage by method; the key is ``""`` for a stage with a single method.
+
+    A method's module is NAME.py, or NAME/segment.py for a learned method. Its methods are the values of the
+    field ``method`` in its options.
+    """
+    home: Any = importlib.import_module(HOMES[stage])
+    if stage not in DEFAULTS:
+        return {"": home}
+    modules: dict[str, Any] = {}
+    for file in sorted(pkgutil.iter_modules(home.__path__), key=lambda file: file.name):
+        name = f"{file.name}.{stage}" if file.ispkg else file.name
+        module = importlib.import_module(f"{HOMES[stage]}.{name}")
+        modules |= dict.fromkeys(get_args(module.Options.model_fields["method"].annotation), module)
+    return modules
 
 
 def stage_version(stage: str, options: Options) -> tuple[str, int]:

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from flexroad.pipeline.run.event_log import EventLog
+from flexroad.pipeline.run.events import EventLog
 
 
 @pytest.mark.parametrize("before", ["", '{"event": "end"}\n', '{"event": "e', "\0\0"])

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from flexroad.pipeline.execute import AdaptiveExecutor, Jobs
-from flexroad.pipeline.execute.adaptive import (
+from flexroad.pipeline.execute.executor import (
     ENOUGH,
     MANY,
     MARGIN,
@@ -31,7 +31,7 @@ class Parallel:
 
 @pytest.fixture
 def two_cores(monkeypatch):
-    monkeypatch.setattr("flexroad.pipeline.execute.adaptive.workers_of", lambda asked: asked or 2)
+    monkeypatch.setattr("flexroad.pipeline.execute.executor.workers_of", lambda asked: asked or 2)
 
 
 def made_clock(monkeypatch, *job_s: float):

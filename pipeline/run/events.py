@@ -1,6 +1,6 @@
-"""The event log of a run, one JSON line per event: ``RUN/log.jsonl``, in a bucket ``RUN/log/<start>.jsonl``.
+"""The events of a run: for whoever shows them (`Observer`), and in its log (`EventLog`), a JSON line each.
 
-::
+The log is ``RUN/log.jsonl``, in a bucket ``RUN/log/<start>.jsonl``. ::
 
     run    start of a run: tiles, config, versions
     stage  one stage of a tile, with its start time: seconds, bytes written, peak memory (MB), host, pid,
@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
@@ -22,10 +23,11 @@ from typing import IO, Any
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.storage.staging import StagedFile
+from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import utc_now
 from flexroad.pipeline.worker.tile import TileResult
 
-NAME = "log.jsonl"
+LOG = "log.jsonl"
 
 
 class EventLog:
@@ -33,7 +35,7 @@ class EventLog:
 
     def __init__(self, run: Location) -> None:
         start = utc_now().replace(":", "").replace("+0000", "Z")
-        self._staged = StagedFile(run / "log" / f"{start}.jsonl" if is_remote(run) else run / NAME)
+        self._staged = StagedFile(run / "log" / f"{start}.jsonl" if is_remote(run) else run / LOG)
         self._file: IO[str] | None = None
 
     def __enter__(self) -> EventLog:
@@ -85,3 +87,29 @@ def _is_cut_off(path: Path) -> bool:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - 1, 0))
         return file.read() not in (b"", b"\n")
+
+
+class Observer:
+    """Takes the events of a run in their order; each method does nothing unless a subclass overrides it."""
+
+    def working(self, work: str) -> AbstractContextManager[None]:
+        """Enclose work before the first tile that may take long: ``reading survey.parquet``."""
+        return contextlib.nullcontext()
+
+    def note(self, text: str) -> None:
+        """Take a remark in one line."""
+
+    def warning(self, text: str) -> None:
+        """Take a warning in one line: something that could not be done, and does not stop the run."""
+
+    def start(self, tiles: int, selected: int) -> None:
+        """Take the number of tiles of the run, and how many of them are to be brought up to date."""
+
+    def line(self, text: str) -> None:
+        """Take what the executor tells while it works: a decision, a wait, the address of a dashboard."""
+
+    def tile(self, result: TileResult) -> None:
+        """Take the result of a tile, also of one that was up to date."""
+
+    def end(self, summary: Summary) -> None:
+        """Take the state of the run after its last tile."""
