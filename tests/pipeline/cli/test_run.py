@@ -15,6 +15,7 @@ from flexroad.catalog import Catalog, Layer
 from flexroad.catalog.storage import paths
 from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.run import record
+from flexroad.pipeline.run.finished import surface_and_road
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.store.records import dump_checked, load_checked
 from tests.command_line import same_signals
@@ -265,6 +266,8 @@ def test_query_after_edit_of_configuration_answers_from_the_last_finished_state(
         "note: sources or options of 1 tile have changed since; the values are of the last"
     )
     shutil.rmtree(run / "store")
+    # Each command is a process of its own, which has no surfaces yet.
+    surface_and_road.cache_clear()
     assert "1 point lies on no finished tile" in flexroad("query", run, "--points", points)
 
 
