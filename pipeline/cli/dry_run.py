@@ -14,7 +14,7 @@ from flexroad.pipeline.check.reasons import UP_TO_DATE, reason
 from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.execute.executor import decision, workers_of
 from flexroad.pipeline.graph.borders import STAGE as BORDER
-from flexroad.pipeline.graph.graph import Node, layers_read, own_files_missing
+from flexroad.pipeline.graph.graph import Node, TileGraph, layers_read, own_files_missing
 from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import refuse_incomplete
@@ -23,7 +23,9 @@ from flexroad.pipeline.run.status import TileStatus, peek_statuses
 STORED, TO_DO, DONE = "stored", "to do", "done"
 
 
-def plan(run: Run, tiles: Collection[Tile], say: Notify, workers: int | None = None) -> int:
+def plan(
+    run: Run, tiles: Collection[Tile], say: Notify, workers: int | None = None, verbose: bool = False
+) -> int:
     """Say one line per tile with the reason why it is computed, the totals, and what would fail.
 
     After the number of tiles follows whether worker processes would be started.
@@ -35,6 +37,7 @@ def plan(run: Run, tiles: Collection[Tile], say: Notify, workers: int | None = N
     - `run`: the run, which need not exist yet (`Run.planned`).
     - `tiles`: the selected tiles.
     - `workers`: largest number of worker processes; by default that of the configuration.
+    - `verbose`: whether each tile also has a line per node of its graph.
     - result: exit code of the run, which the last line says with its reasons.
     """
     place, totals, reasons = RunPlace.of(run), Counter[tuple[str, str]](), Counter[str]()
@@ -57,6 +60,8 @@ def plan(run: Run, tiles: Collection[Tile], say: Notify, workers: int | None = N
                 totals[node.stage, states[name]] += 1
             # Corners and edges are nodes of several tiles.
             counted |= {name} if node.border else set()
+        for line in _nodes(graph, states) if verbose else ():
+            say(line)
     numbers = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
     say(f"{count(reasons.total(), 'tile')}: {numbers}")
     if todo and not run.config.cluster.needs_workers:
@@ -114,3 +119,14 @@ def _state(node: Node, place: RunPlace, borders: dict[str, str]) -> str:
     if node.border:
         borders[node.fingerprint] = state
     return state
+
+
+def _nodes(graph: TileGraph, states: dict[str, str]) -> Iterator[str]:
+    """Yield a line per node of a tile: stage, fingerprint, state, inputs and variants."""
+    users: dict[str, list[str]] = {}
+    for variant, nodes in graph.variants.items():
+        for name in (*nodes.values(), *graph.nodes[nodes["fit"]].frame):
+            users.setdefault(name, []).append(variant)
+    for name, node in graph.nodes.items():
+        inputs = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in (*node.inputs, *node.frame)) or "files"
+        yield f"  {node.stage:9}{name[:8]}  {states[name]:7} <- {inputs}  ({', '.join(users[name])})"

@@ -106,6 +106,9 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print why each tile would be computed, and what would fail.")
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="With --dry-run: also the stages of each tile.")
+    ] = False,
 ) -> None:
     """Bring every tile of a run up to date.
 
@@ -118,7 +121,7 @@ def run(
         selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
         tiles, selected = selection.of(path, source, allow or (), chosen)
         planned = Run.planned(path, chosen, tiles, root, checksum)
-        raise typer.Exit(plan(planned, selected.tiles, echo, workers))
+        raise typer.Exit(plan(planned, selected.tiles, echo, workers, verbose))
     with _interruptible() as shown:
         chosen = load_config(config, settings or ())
         selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)

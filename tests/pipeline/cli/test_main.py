@@ -168,6 +168,9 @@ def test_run_dry_run_prints_a_line_per_tile_and_writes_nothing(made_survey, tmp_
     assert said[:5] == [*(f"{name}: new" for name in ids), "4 tiles: 4 new"]
     assert "12 to do" in said[-2]
     assert said[-1] == "expected exit code: 0"
+    graph = flexroad("run", *words, "--dry-run", "--verbose")
+    assert graph.count("fit ") == 4 * 3 + 1
+    assert "(plane, rgt, flexroad)" in graph
 
 
 def test_run_with_tile_or_bbox_selects_tiles(made_survey, tmp_path):
