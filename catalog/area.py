@@ -15,7 +15,7 @@ from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.guard.open_vector import ERRORS, in_its_encoding, vector_name
-from flexroad.catalog.guard.rejected import InputRejected
+from flexroad.catalog.guard.source_files import InputRejected
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.scan.vectors import layers, listed
 from flexroad.catalog.text import count, reason

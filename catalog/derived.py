@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.guard.rejected import require_regular
+from flexroad.catalog.guard.source_files import require_regular
 from flexroad.catalog.storage.outputs import atomic_path
 from flexroad.catalog.text import one_line
 

@@ -30,6 +30,10 @@ REACH_M = 200.0
 """A tile's layers list the files within this distance of it (m): for halos and for ground along borders."""
 RECENT = 2**14
 """Layers and dates that are kept to be shared: of the last thousands of tiles."""
+MIN_COVER = 0.25
+"""Default share below which catalogs leave a tile out and `load` fails on it."""
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
+"""Heights outside are nodata (m)."""
 TOUCH_M = 0.001
 """Files that overlap ground by no more than this (m) only touch it."""
 

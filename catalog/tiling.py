@@ -25,12 +25,11 @@ from flexroad.catalog.crs_checks import elsewhere, require_scale
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid, is_whole, union
 from flexroad.catalog.index import Catalog
-from flexroad.catalog.limits import MIN_COVER
-from flexroad.catalog.scan.cover import height_share
+from flexroad.catalog.scan.cell_values import height_share
 from flexroad.catalog.scan.rasters import RasterFile, require_metric, zoned
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import count, some
-from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, RECENT, Layer, Tile, by_cover
+from flexroad.catalog.tile import HEIGHTS, LAYERS, MIN_COVER, REACH_M, RECENT, Layer, Tile, by_cover
 
 MASKS = ("road_mask", "reference_road")
 MAX_CELL_RATIO = 50

@@ -25,9 +25,16 @@ from weakref import finalize
 from xml.parsers import expat
 
 from flexroad.catalog.gdal_options import settle_vectors
-from flexroad.catalog.guard.rejected import InputRejected, archive_note, head, require_beside
-from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, source_stat
-from flexroad.catalog.guard.sqlite_contents import opened, require_sound_contents
+from flexroad.catalog.guard.source_files import (
+    SHAPEFILE_PARTS,
+    SQLITE_PARTS,
+    InputRejected,
+    archive_note,
+    head,
+    require_beside,
+    source_stat,
+)
+from flexroad.catalog.guard.vector_contents import opened, require_sound_contents
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.storage.scratch import ScratchFolder

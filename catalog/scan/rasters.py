@@ -29,7 +29,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.gdal_options import CHOSEN, DEFAULTS
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.guard.rejected import InputRejected
+from flexroad.catalog.guard.source_files import InputRejected
 from flexroad.catalog.scan.valid_cells import color_kinds
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.storage.settings import gdal_options

@@ -18,8 +18,8 @@ from flexroad.catalog.crs_checks import angle_fault, crs_of, elsewhere
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, union
 from flexroad.catalog.guard.open_vector import ERRORS, layer_info, vector_name
-from flexroad.catalog.guard.rejected import InputRejected
-from flexroad.catalog.guard.spatial_index import real_bounds
+from flexroad.catalog.guard.source_files import InputRejected
+from flexroad.catalog.guard.vector_contents import real_bounds
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.scan.rasters import matching
 from flexroad.catalog.skipped import Skipped

@@ -23,16 +23,14 @@ from flexroad.catalog.derived import write_heights
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.scan.cell_values import mask_notes, plateau_notes
 from flexroad.catalog.scan.editions import newest_first
-from flexroad.catalog.scan.mask_values import mask_notes
-from flexroad.catalog.scan.plateaus import plateau_notes
 from flexroad.catalog.scan.point_clouds import chunks
 from flexroad.catalog.scan.rasters import RasterFile, glob, opened, scan, there, unlisted_folders
 from flexroad.catalog.scan.vectors import find, with_roads
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import some
-from flexroad.catalog.tile import HEIGHTS, Tile
+from flexroad.catalog.tile import HEIGHTS, MIN_COVER, Tile
 from flexroad.catalog.tiling import Conversion, TilingResult, cut
 
 CRS = "EPSG:25832"

@@ -8,13 +8,11 @@ from datetime import datetime
 from pathlib import Path
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.scan.cell_values import mask_notes, plateau_notes
 from flexroad.catalog.scan.editions import newest_first
-from flexroad.catalog.scan.mask_values import mask_notes
-from flexroad.catalog.scan.plateaus import plateau_notes
 from flexroad.catalog.scan.rasters import RasterFile, scan
 from flexroad.catalog.scan.vectors import find, with_roads
-from flexroad.catalog.tile import HEIGHTS, LAYERS
+from flexroad.catalog.tile import HEIGHTS, LAYERS, MIN_COVER
 from flexroad.catalog.tiling import MASKS, NO_CONVERSION, Conversion, TilingResult, cut
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from flexroad.catalog import Bounds, CatalogError
-from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
 from flexroad.catalog.scan.point_clouds import CHUNK, Chunk, Cloud, chunks, survey_dates
+from flexroad.catalog.tile import HIGHEST_M, LOWEST_M
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.execute import Executor
 from flexroad.tools.prepare.options import check_extent
