@@ -36,21 +36,16 @@ def needed(catalog: Catalog, folder: Location | str, layers: Collection[str] = L
 
 
 def _needed(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str]) -> tuple[str, ...]:
-    folders = _outermost({posixpath.dirname(name) for name in _outside(catalog, allowed, layers)})
+    names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
+    # Addresses cannot be allowed.
+    outside = (name for name in names if not ADDRESS.match(name) and not allowed.permits(name))
+    folders = _outermost(posixpath.dirname(resolved(name)) for name in outside)
     while len(folders) > MAX_FOLDERS:
         parents = _outermost(map(posixpath.dirname, folders))
         if not parents.isdisjoint(TOPS):
             break
         folders = parents
     return tuple(sorted(folders))
-
-
-def _outside(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str]) -> Iterator[str]:
-    """Yield the name of every file outside the allowed folders that could be allowed."""
-    names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
-    for name in names:
-        if not ADDRESS.match(name) and not allowed.permits(name):
-            yield resolved(name)
 
 
 def _chosen(catalog: Catalog, layers: Collection[str]) -> Iterator[tuple[Tile, Layer]]:

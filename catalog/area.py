@@ -43,7 +43,6 @@ class Area:
         """Read the polygons of a vector file.
 
         - `path`: GeoPackage, GeoJSON, FlatGeobuf or Shapefile.
-        - `layer`: layer of a file with several.
         """
         try:
             name = vector_name(path)

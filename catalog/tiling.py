@@ -151,11 +151,8 @@ def cut(
       files overlap, the first one with a value is used.
     - `road_values`: cell values that mean road in the masks; empty: every value but 0 and nodata.
     - `tile_size_m`: edge of a tile (m); tiles lie on multiples of it in the DSM's CRS.
-    - `date`: date of the survey; overrides the files' dates.
-    - `crs`: CRS of files without one.
     - `min_cover`: tiles with a DSM height in less than this share (0 to 1) of their cells are left out, as
       `load.min_valid` would fail on them. 0 keeps all that files touch, and reads no heights.
-    - `dataset`: name of the data in reports.
     - `conversion`: whether and where to files in other CRSs are reprojected.
     """
     dsm = layer_files["dsm"]
@@ -383,19 +380,14 @@ def _covered(
 
 def _cover(root: Path, grid: Grid, dsm: _OnTile, min_cover: float, reproject: bool) -> float:
     """Return the share of a tile that the DSM covers: by heights, or by the extents of the files."""
-    by_extents = _area(dsm.shared) / (grid.width * grid.cell) ** 2
+    covered_m2 = float(shapely.union_all(shapely.box(*dsm.shared.T)).area)
+    by_extents = covered_m2 / (grid.width * grid.cell) ** 2
     others = [file for file in dsm.files if not same(file.crs, grid.crs)]
     if not min_cover or by_extents < min_cover or (others and not reproject):
         return by_extents
-    # What a VRT names was checked when the files were found.
     bare = next((file.crs for file in dsm.files if not file.has_crs), None)
     by_heights = height_share(grid, [root / file.name for file in dsm.files], crs=bare)
     return by_extents if by_heights is None else by_heights
-
-
-def _area(boxes: NDArray[np.float64]) -> float:
-    """Return the area of the union of boxes, ``(n, 4)`` (m2)."""
-    return float(shapely.union_all(shapely.box(*boxes.T)).area)
 
 
 def _layers(
@@ -422,7 +414,7 @@ def _layers(
     return layer
 
 
-def taken(dsm: Sequence[RasterFile], date: datetime | None) -> tuple[datetime, bool]:
+def taken(dsm: Sequence[RasterFile], date: datetime | None = None) -> tuple[datetime, bool]:
     """Return the date of a tile's DSM (``date`` overrides its files), and whether it is only assumed."""
     if date is not None:
         return zoned(date), False

@@ -96,13 +96,8 @@ def _files(path: str) -> Iterator[str]:
     for beside in _beside(folder or ".", name):
         part = f"{folder}/{beside}" if folder else beside
         # Readers of a GeoPackage leave an empty -wal.
-        if not part.endswith("-wal") or _has_bytes(part):
+        if not part.endswith("-wal") or ((found := file_stat(part)) and found.size > 0):
             yield part
-
-
-def _has_bytes(path: str) -> bool:
-    found = file_stat(path)
-    return found is not None and found.size > 0
 
 
 @lru_cache(maxsize=65536)

@@ -87,7 +87,11 @@ def _fault(path: Path, state: FileStat) -> str:
                 "SELECT type, name FROM sqlite_master WHERE type IN ('table', 'view')"
             ).fetchall()
             for kind, name in names:
-                fault = _of_view(file, name, path, state) if kind == "view" else _of_table(file, name, path)
+                if kind == "table":
+                    fault = _of_table(file, name, path)
+                elif fault := _trial(file, name, STEPS + STEPS_PER_BYTE * state.size):
+                    remedy = _command(path, f"DROP VIEW {_bracketed(name)}")
+                    fault = f"{fault}; write its result to a table, or remove it: {remedy}"
                 if fault:
                     return fault
             return _of_counts(file, {name.lower() for kind, name in names if kind == "table"}, path)
@@ -128,16 +132,8 @@ def _of_counts(file: sqlite3.Connection, tables: set[str], path: Path) -> str:
     return ""
 
 
-def _of_view(file: sqlite3.Connection, name: str, path: Path, state: FileStat) -> str:
-    why = _trial(file, name, STEPS + STEPS_PER_BYTE * state.size)
-    if not why:
-        return ""
-    remedy = _command(path, f"DROP VIEW {_bracketed(name)}")
-    return f"has the view {name!r}, which {why}; write its result to a table, or remove it: {remedy}"
-
-
 def _trial(file: sqlite3.Connection, view: str, most_steps: int) -> str:
-    """Run the query of a view; return why it is not read, empty if it ends."""
+    """Run the query of a view; return that it is not read and why, empty if it ends."""
     others: list[str] = []
 
     def authorize(action: int, _: str | None, function: str | None, *__: str | None) -> int:
@@ -155,10 +151,12 @@ def _trial(file: sqlite3.Connection, view: str, most_steps: int) -> str:
             pass
     except sqlite3.Error as error:
         if others:
-            return f"calls the function {others[0]}"
+            return f"has the view {view!r}, which calls the function {others[0]}"
         if NO_ROWS.search(str(error)):
             return ""
-        return "does not end" if "interrupted" in str(error) else f"cannot be checked ({one_line(error)})"
+        endless = "interrupted" in str(error)
+        why = "does not end" if endless else f"cannot be checked ({one_line(error)})"
+        return f"has the view {view!r}, which {why}"
     finally:
         file.set_authorizer(None)
         file.set_progress_handler(None, 0)
@@ -190,7 +188,6 @@ BOXES = np.dtype(
 def has_complete_index(file: str, info: Mapping[str, Any]) -> bool:
     """Return whether each feature of a layer is in its index, within its box there.
 
-    - `file`: GDAL's name of the file.
     - `info`: what pyogrio knows of the layer.
     - result: also False of a view, whose index is the table's, and of a Shapefile: its index is not read
       here.

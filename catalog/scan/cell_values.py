@@ -32,7 +32,6 @@ AS_TEXT = (".xyz", ".gz", ".asc", ".txt")
 def height_share(grid: Grid, paths: Iterable[Location], crs: str | None = None) -> float | None:
     """Return the share (0 to 1) of a grid's cells whose centre has a height in one of the rasters.
 
-    - `paths`: rasters of heights, north up.
     - `crs`: CRS of rasters without one; None: the grid's.
     - result: None if a raster cannot be read, or not in parts, or has far finer cells than the grid.
     """
@@ -90,9 +89,6 @@ def mask_notes(root: Path, layer: str, names: Sequence[str], road_values: Sequen
 
     Parts of some files are read, so that the time does not depend on the size of the survey.
 
-    - `root`: folder that the names are relative to.
-    - `layer`: name of the layer, for messages.
-    - `names`: the mask's files.
     - `road_values`: values that mean road; empty: every value but 0 and nodata.
     """
     step = -(-len(names) // MOST_MASKS)
@@ -116,7 +112,6 @@ def values_note(values: set[float], road_values: Sequence[int], has_nodata: bool
 
     - `values`: values of its cells, at least one; nodata is none of them.
     - `road_values`: values that mean road; empty: every value but 0 and nodata.
-    - `has_nodata`: whether cells are nodata.
     - `option`: name of the option that has ``road_values``.
     """
     ordered = sorted(values)
@@ -178,9 +173,6 @@ def plateau_notes(layer: str, files: Mapping[str, Location]) -> list[str]:
     """Return a note on each exact height that many cells of a file have, with their share.
 
     Parts of some files are read, so that the time does not depend on the size of the survey.
-
-    - `layer`: name of the layer, for messages.
-    - `files`: the layer's files by name.
     """
     step = -(-len(files) // MOST_HEIGHTS) or 1
     by_value: dict[tuple[float, float], list[str]] = defaultdict(list)

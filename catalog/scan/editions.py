@@ -64,9 +64,6 @@ def newest_first(root: Path, layer: str, files: Sequence[RasterFile]) -> tuple[l
 
     The age is that of the dates in which the two names differ, else of the dates in the files' tags, else of
     their times, if these are a day apart. Files without another of the same ground keep their places.
-
-    - `root`: folder that the names are relative to.
-    - `layer`: name of the layer.
     """
     pairs = [_aged(files, one, other) for one, other in _same_ground(files)]
     if not pairs:

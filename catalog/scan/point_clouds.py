@@ -161,9 +161,6 @@ def chunks(
 ) -> Iterator[Chunk]:
     """Yield the points of a cloud, decoded once; withheld points are left out.
 
-    - `path`: LAS, LAZ or COPC file.
-    - `size`: points decoded at a time, at most.
-    - `drop`: classes to leave out.
     - `points`: points to decode, in the order of the file; None: all.
     """
     _checked(path)
@@ -222,18 +219,16 @@ def _checked(path: Path) -> int:
 
 def _opened(path: Path, fields: Collection[str] = ()) -> Any:
     """Open a checked cloud; of compressed points only some fields are decoded, all if none are named."""
-    selection = {"decompression_selection": _selection(fields)} if fields else {}
+    selection = {}
+    if fields:
+        # Formats before LAS 1.4 are always decoded completely.
+        chosen = laspy.DecompressionSelection.xy_returns_channel()
+        for name in fields:
+            chosen |= laspy.DecompressionSelection[name]
+        selection = {"decompression_selection": chosen}
     # The parallel decoder allocates a complete chunk, which the header may give as 2^32 points, and goes to
     # wrong points of files with chunks of different sizes, as COPC has (laz-rs #62).
     return _attempt(path, lambda: laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, **selection))
-
-
-def _selection(fields: Collection[str]) -> Any:
-    """Return what laspy decodes; formats before LAS 1.4 are always decoded completely."""
-    chosen = laspy.DecompressionSelection.xy_returns_channel()
-    for name in fields:
-        chosen |= laspy.DecompressionSelection[name]
-    return chosen
 
 
 def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:

@@ -122,15 +122,7 @@ class _Skip(Exception):
 
 
 def scan(root: Path, layer: str, pattern: str, crs: str | None) -> tuple[list[RasterFile], list[Skipped]]:
-    """Open each file of a layer once.
-
-    - `root`: the folder, resolved.
-    - `layer`: name of the layer, for messages.
-    - `pattern`: glob pattern: see `matching`.
-    - `crs`: CRS of files without one.
-    - `files`: ordered by name.
-    - `skipped`: files and folders that are left out.
-    """
+    """Open each file of a layer once."""
     paths, unlisted = matching(root, layer, pattern)
     files, skipped = opened(root, layer, paths, crs)
     if not files:
@@ -166,7 +158,6 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[Ski
     If the pattern's last part has a dot, it names files, and a folder that matches is in place of one.
 
     - `root`: the folder that relative patterns start from, resolved.
-    - `layer`: name of the layer, for messages.
     - `pattern`: relative to ``root``; absolute, or with ``..``, it names files outside.
     """
     folder, relative = _start(root, pattern)
@@ -186,7 +177,6 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[Ski
 def glob(folder: Path, pattern: str) -> tuple[list[Path], list[tuple[Path, OSError]]]:
     """Return all that matches a glob pattern, and the folders that may hold more.
 
-    - `folder`: folder that the pattern is relative to.
     - `paths`: files, folders, and links to nothing, by name.
     - `unlisted`: folders on the pattern's way that cannot be listed, each with the error; `Path.glob` ignores
       them.

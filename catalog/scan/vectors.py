@@ -55,10 +55,7 @@ def find(
 ) -> tuple[list[VectorFile], list[Skipped]]:
     """Open vector files; return the usable ones, and the others.
 
-    - `root`: the folder of the catalog's rasters.
     - `given`: a file, or a glob pattern relative to ``root``.
-    - `crs`: CRS of files without one.
-    - `sublayer`: layer of files with several.
     """
     root = root.resolve()
     paths, unlisted = ([Path(given)], []) if Path(given).is_file() else matching(root, "roads", given)
@@ -152,10 +149,7 @@ def bounds_of(info: Mapping[str, Any]) -> Bounds:
 def with_roads(
     tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | None
 ) -> tuple[tuple[Tile, ...], list[Skipped]]:
-    """Return the tiles with a layer ``roads`` of the files within `REACH_M` of each tile.
-
-    - `far`: the files that reach no tile.
-    """
+    """Return the tiles with a layer ``roads`` of the files within `REACH_M`, and the files far from all."""
     if not files:
         return tuple(tiles), []
     extents = {

@@ -88,17 +88,7 @@ PUT_S = 60.0
 class StagedFile:
     """A local copy of a file in a bucket that is uploaded from time to time.
 
-    Parameters
-    ----------
-    where : Location
-        The file.
-    writable : bool
-        Whether changes are uploaded; False for reading only.
-
-    Attributes
-    ----------
-    path : Path
-        The local file to read and write.
+    Its `path` is the local file to read and write. Unless it is ``writable``, changes are not uploaded.
     """
 
     def __init__(self, where: Location, writable: bool = True) -> None:

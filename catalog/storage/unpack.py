@@ -28,7 +28,6 @@ def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Pa
 
     A folder that is there is complete: it gets its name when all files are in it.
 
-    - `archive`: the zip file.
     - `sha256`: checksum of the published file.
     - `progress`: shows how far the checksum and the unpacking are.
     - `notify`: takes a line that says how much is unpacked where, or that the folder is there.
@@ -38,7 +37,7 @@ def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Pa
         notify(f"{target} is there and is read in place of {archive.name}; remove it to unpack anew")
         return target
     entries = _entries(archive)
-    size, free = sum(entry.file_size for entry in entries), _free(target.parent)
+    size, free = sum(entry.file_size for entry in entries), shutil.disk_usage(target.parent).free
     notify(f"{archive.name} unpacks to {size / GB:.2f} GB in {target}; {free / GB:.2f} GB are free")
     if size > free:
         raise CatalogError(
@@ -62,7 +61,6 @@ def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Pa
 
 
 def _entries(archive: Path) -> list[zipfile.ZipInfo]:
-    """Return the files of an archive, checked."""
     if archive.exists() and not archive.is_file():
         # To open a pipe would wait for a writer.
         raise CatalogError(f"{archive} is not a regular file; replace it by one")
@@ -140,7 +138,3 @@ def _whole(sizes: Iterator[int]) -> Iterator[int]:
         while rest >= CHUNK_BYTES:
             rest -= CHUNK_BYTES
             yield 1
-
-
-def _free(folder: Path) -> int:
-    return shutil.disk_usage(folder).free
