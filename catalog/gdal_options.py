@@ -154,14 +154,7 @@ WITHOUT_DEFAULT = (
 """Options without a value that stands for no value: they are removed from the environment."""
 NETWORK = "PROJ_NETWORK"
 """PROJ asks a server for grids, so that places depend on its answer; conda sets it in every shell."""
-FOLDERS = (
-    "PROJ_LIB",
-    "PROJ_DATA",
-    "GDAL_DATA",
-    "GDAL_DRIVER_PATH",
-    "OGR_DRIVER_PATH",
-    "GDAL_PYTHON_DRIVER_PATH",
-)
+FOLDERS = "PROJ_LIB PROJ_DATA GDAL_DATA GDAL_DRIVER_PATH OGR_DRIVER_PATH GDAL_PYTHON_DRIVER_PATH".split()
 """Folders of data and drivers, which only fit the GDAL and PROJ that they were installed with."""
 FILE = "GDAL_CONFIG_FILE"
 

@@ -139,7 +139,15 @@ class Catalog:
         if path.suffix not in (".parquet", *JSON_SUFFIXES):
             raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, but not {path.name}")
         folder = absolute(path).parent
-        items = (item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles)
+        prefix = str(folder).rstrip("/") + "/"
+
+        def written(tile: Tile) -> Item:
+            if not movable:
+                return item(tile, tile.root)
+            # Links are not resolved: a folder of links stays one.
+            return item(tile.renamed(lambda file: normalise(join(tile.root, file)).removeprefix(prefix)))
+
+        items = map(written, self.tiles)
         files = [to_fields(one.below(str(folder)) if movable else one) for one in self.skipped]
         try:
             if path.suffix in JSON_SUFFIXES:
@@ -189,7 +197,8 @@ class Catalog:
             usable = [tile for tile in tiles if not tile.fault]
             tiles = list(compress(usable, area.touched(tile.grid for tile in usable)))
             if not tiles:
-                raise area.none_touched()
+                place = f"check its CRS, {short(area.crs)}, and its place"
+                raise CatalogError(f"no tile touches --area {area.name}; {place}")
         return replace(self, tiles=tuple(tiles))
 
     def same_places(self) -> str:
@@ -218,14 +227,6 @@ def _location(path: Location | str) -> Location:
 
 def _not_a_catalog(path: Location, reason: str) -> CatalogError:
     return CatalogError(f"{path} is not a FlexRoad catalog: {reason}; make one with `flexroad catalog`")
-
-
-def _rooted(tile: Tile, root: Location) -> Tile:
-    """Return the tile with file names relative to ``root`` where they lie below it, else absolute."""
-    prefix = str(root).rstrip("/") + "/"
-    # Links are not resolved: a folder of links stays one.
-    renamed = tile.renamed(lambda file: normalise(join(tile.root, file)).removeprefix(prefix))
-    return replace(renamed, root=str(root))
 
 
 @lru_cache(maxsize=16)

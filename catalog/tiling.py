@@ -201,20 +201,18 @@ def _place(
     root: Path, layer: str, files: Sequence[RasterFile], crs: str
 ) -> tuple[list[_PlacedFile], list[Skipped]]:
     """Return the files with their bounds in the tiles' CRS, and those without a position in it."""
-    placed = [
-        _PlacedFile(f, f.bounds if same(f.crs, crs) else bounds_in(crs, f.crs, f.bounds)) for f in files
-    ]
     kept, lost = list[_PlacedFile](), list[Skipped]()
-    for entry in placed:
+    for file in files:
+        bounds = file.bounds if same(file.crs, crs) else bounds_in(crs, file.crs, file.bounds)
         # NaN is not below either.
-        if np.abs(entry.bounds).max() <= FARTHEST:
-            kept.append(entry)
+        if np.abs(bounds).max() <= FARTHEST:
+            kept.append(_PlacedFile(file, bounds))
             continue
         reason = (
-            f"in {short(entry.file.crs)} it has no position in {short(crs)}, the CRS of the dsm; "
+            f"in {short(file.crs)} it has no position in {short(crs)}, the CRS of the dsm; "
             "correct its CRS with `gdal_edit.py -a_srs`"
         )
-        lost.append(Skipped(entry.file.name, layer, reason, str(root)))
+        lost.append(Skipped(file.name, layer, reason, str(root)))
     if not kept:
         raise CatalogError(f"no usable file of the layer {layer}; {lines(lost)[0]}")
     return kept, lost
@@ -416,18 +414,12 @@ def _layers(
 
 def taken(dsm: Sequence[RasterFile], date: datetime | None = None) -> tuple[datetime, bool]:
     """Return the date of a tile's DSM (``date`` overrides its files), and whether it is only assumed."""
-    if date is not None:
-        return zoned(date), False
-    dates = [file.taken for file in dsm if file.taken]
-    return (dates[0], False) if dates else (dsm[0].modified, True)
+    known = date or next((file.taken for file in dsm if file.taken), None)
+    return (zoned(known), False) if known else (dsm[0].modified, True)
 
 
 def assumed(tiles: Sequence[Tile]) -> list[str]:
     """Return a note on the tiles whose date is only assumed; empty if there are none."""
     undated = [tile.id for tile in tiles if tile.datetime_assumed]
-    if not undated:
-        return []
-    return [
-        f"no date in the dsm of {count(len(undated), 'tile')}: the files' times are used instead "
-        "(--date sets it)"
-    ]
+    note = f"no date in the dsm of {count(len(undated), 'tile')}: the files' times are used instead"
+    return [f"{note} (--date sets it)"] * bool(undated)

@@ -70,22 +70,19 @@ def check(path: Path) -> int:
             raise ValueError(f"its points begin at byte {start:,} of {size:,}, after a header of {length}")
         if records * RECORD > start - length:
             raise ValueError(f"its header counts {records:,} records before its points at byte {start:,}")
-        points, item = _count(head), int(struct.unpack_from("<H", head, 105)[0])
+        # The number of points has 64 bits since LAS 1.4.
+        is_long = head[25] >= 4 and len(head) == LONGEST
+        number = struct.unpack_from(*(("<Q", head, 247) if is_long else ("<I", head, 107)))
+        points, item = int(number[0]), int(struct.unpack_from("<H", head, 105)[0])
         if points:
             # Files without points have the largest numbers that there are as bounds.
             _check_numbers(head)
-        if head[25] >= 4 and len(head) == LONGEST:
+        if is_long:
             _check_extended(file, head, size)
         if not head[104] & COMPRESSED:
             return 0
         span = _Span(start, size, points, item)
         return item * _largest_chunk(file, length, records, span)
-
-
-def _count(head: bytes) -> int:
-    """Return the number of points: of 64 bits since LAS 1.4."""
-    is_long = head[25] >= 4 and len(head) == LONGEST
-    return int(struct.unpack_from("<Q", head, 247)[0] if is_long else struct.unpack_from("<I", head, 107)[0])
 
 
 def _check_numbers(head: bytes) -> None:

@@ -144,7 +144,7 @@ def opened(
             try:
                 files.append(_open(root, path, crs, layer in HEIGHTS))
             except _Skip as reason:
-                skipped.append(Skipped(_name(root, path), layer, str(reason), str(root)))
+                skipped.append(Skipped(name_below(root, path), layer, str(reason), str(root)))
     return files, skipped
 
 
@@ -181,11 +181,7 @@ def glob(folder: Path, pattern: str) -> tuple[list[Path], list[tuple[Path, OSErr
     - `unlisted`: folders on the pattern's way that cannot be listed, each with the error; `Path.glob` ignores
       them.
     """
-    paths = sorted(folder.glob(pattern))
-    return paths, list(_unlisted(folder, pattern))
-
-
-def _unlisted(folder: Path, pattern: str) -> Iterator[tuple[Path, OSError]]:
+    paths, unlisted = sorted(folder.glob(pattern)), list[tuple[Path, OSError]]()
     above = PurePath(pattern).parts[:-1]
     places = {folder}
     for depth in range(1, len(above) + 1):
@@ -197,7 +193,8 @@ def _unlisted(folder: Path, pattern: str) -> Iterator[tuple[Path, OSError]]:
         except (FileNotFoundError, NotADirectoryError):
             continue
         except OSError as error:
-            yield place, error
+            unlisted.append((place, error))
+    return paths, unlisted
 
 
 def _is_folder(path: Path) -> bool:
@@ -209,7 +206,7 @@ def _is_folder(path: Path) -> bool:
 def unlisted_folders(root: Path, layer: str, unlisted: Iterable[tuple[Path, OSError]]) -> list[Skipped]:
     """Return folders that cannot be listed as a catalog keeps them."""
     return [
-        Skipped(f"{_name(root, folder)}/", layer, f"it {access_reason(error)}", str(root))
+        Skipped(f"{name_below(root, folder)}/", layer, f"it {access_reason(error)}", str(root))
         for folder, error in unlisted
     ]
 
@@ -236,7 +233,7 @@ def there(folder: Path, remedy: str = "") -> str:
     return f"there are {names}{remedy}" if names else "the folder is empty"
 
 
-def _name(root: Path, path: Path) -> str:
+def name_below(root: Path, path: Path) -> str:
     """Return the path relative to the folder if it lies below it, else the complete path."""
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
@@ -270,7 +267,7 @@ def _open(root: Path, path: Path, crs: str | None, heights: bool) -> RasterFile:
         raise _Skip(f"it {angles}; give its CRS with --crs, or declare it with gdal_edit.py -a_srs")
     west, south, east, north = bounds
     return RasterFile(
-        name=_name(root, path),
+        name=name_below(root, path),
         crs=plan,
         has_crs=has_crs,
         # GDAL swaps south and north of XYZ files that are sorted from south to north.

@@ -156,20 +156,16 @@ def by_name(layout: Mapping[str, Any]) -> bool:
 
 def _gerod_notes(tiles: Sequence[Tile]) -> list[str]:
     """Return notes on tiles that are not at the corner in their id (a wrong template or CRS) or missing."""
-    off = [tile.id for tile in tiles if not _is_at_id(tile)]
+    off = []
+    for tile in tiles:
+        corner, (west, south) = CORNER.fullmatch(tile.id), tile.grid.bounds[:2]
+        # Some programs write rasters of points, which begin half a cell before the corner.
+        if not corner or math.dist(map(float, corner.groups()), (west, south)) > tile.grid.cell:
+            off.append(tile.id)
     notes = [f"not at the corner given by the tile's name: {some(off)}; check layout and CRS"] if off else []
     if len(tiles) != layouts.TILES:
         notes.append(f"{len(tiles)} of the dataset's {layouts.TILES} tiles are here")
     return notes
-
-
-def _is_at_id(tile: Tile) -> bool:
-    """Return whether the tile's south-west corner is the one in its id, to within one cell."""
-    corner = CORNER.fullmatch(tile.id)
-    # Some programs write rasters of points, which begin half a cell before the corner.
-    return (
-        corner is not None and math.dist(map(float, corner.groups()), tile.grid.bounds[:2]) <= tile.grid.cell
-    )
 
 
 def _dsc3d_notes(tiles: Sequence[Tile]) -> list[str]:

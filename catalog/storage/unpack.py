@@ -8,7 +8,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.text import Notify, one_line, printable, write_reason
@@ -94,8 +93,9 @@ def _check_sum(archive: Path, sha256: str, progress: Progress) -> None:
     digest = hashlib.sha256()
     try:
         with archive.open("rb") as file:
-            for chunk in _chunks(file, archive.stat().st_size, f"checksum of {archive.name} (MB)", progress):
-                digest.update(chunk)
+            number = -(-archive.stat().st_size // CHUNK_BYTES)
+            for _ in progress(range(number), f"checksum of {archive.name} (MB)", number):
+                digest.update(file.read(CHUNK_BYTES))
     except OSError as error:
         raise CatalogError(f"{archive} cannot be read: {error.strerror or error}") from error
     if digest.hexdigest() != sha256:
@@ -105,36 +105,24 @@ def _check_sum(archive: Path, sha256: str, progress: Progress) -> None:
         )
 
 
-def _chunks(file: BinaryIO, size: int, step: str, progress: Progress) -> Iterator[bytes]:
-    for _ in progress(range(-(-size // CHUNK_BYTES)), step, -(-size // CHUNK_BYTES)):
-        yield file.read(CHUNK_BYTES)
-
-
 def _extract(
     archive: Path, entries: list[zipfile.ZipInfo], part: Path, progress: Progress, size: int
 ) -> None:
     def written() -> Iterator[int]:
+        """Yield a number for each complete `CHUNK_BYTES`."""
+        done = 0
         for entry in entries:
             target = part / entry.filename
             target.parent.mkdir(parents=True, exist_ok=True)
             with opened.open(entry) as source, target.open("xb") as file:
                 while chunk := source.read(CHUNK_BYTES):
                     file.write(chunk)
-                    yield len(chunk)
+                    before, done = done, done + len(chunk)
+                    yield from range(before // CHUNK_BYTES, done // CHUNK_BYTES)
 
     try:
         with zipfile.ZipFile(archive) as opened:
-            for _ in progress(_whole(written()), f"unpacking {archive.name} (MB)", size // CHUNK_BYTES):
+            for _ in progress(written(), f"unpacking {archive.name} (MB)", size // CHUNK_BYTES):
                 pass
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError, ValueError) as error:
         raise CatalogError(f"{archive} is damaged: {one_line(error)}; download it again") from error
-
-
-def _whole(sizes: Iterator[int]) -> Iterator[int]:
-    """Yield once for each complete `CHUNK_BYTES` of some sizes."""
-    rest = 0
-    for size in sizes:
-        rest += size
-        while rest >= CHUNK_BYTES:
-            rest -= CHUNK_BYTES
-            yield 1
