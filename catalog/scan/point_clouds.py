@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, timedelta
+from datetime import date
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,10 +35,6 @@ RGB = ("red", "green", "blue")
 USED = ("Z", "CLASSIFICATION", "FLAGS", "RGB", "GPS_TIME")
 """Fields that are decoded besides the coordinates in plan, as laspy calls them."""
 DEGREES = 360.0
-GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(seconds=10**9)
-"""The zero of adjusted standard GPS time (ASPRS LAS 1.4), without leap seconds."""
-FIRST_GPS = (datetime(1990, 1, 1, tzinfo=UTC) - GPS_EPOCH).total_seconds()
-WEEK_S = 604_800
 SLACK = 0.01
 """Points may exceed the header's bounds by this fraction of the extent plus one unit."""
 
@@ -140,20 +136,6 @@ def _has_dates(header: Any) -> bool:
     has_times = "gps_time" in header.point_format.dimension_names
     # 1 in LAS: adjusted standard GPS time; 0: seconds of the week.
     return has_times and int(header.global_encoding.gps_time_type) == 1
-
-
-def survey_dates(gps: Floats) -> tuple[datetime, datetime] | None:
-    """Return the dates of the first and the last point, or None if no time can be one of a survey.
-
-    - `gps`: see `Chunk.gps`. Times of a week (0 to 604,800 s) are left out, as some files have them although
-      their header declares standard times; so are times before 1990 and in the future.
-    """
-    latest = (datetime.now(UTC) - GPS_EPOCH).total_seconds()
-    times = gps[np.isfinite(gps) & ((gps < 0) | (gps > WEEK_S)) & (gps > FIRST_GPS) & (gps < latest)]
-    if not len(times):
-        return None
-    first, last = (GPS_EPOCH + timedelta(seconds=float(time)) for time in (times.min(), times.max()))
-    return first, last
 
 
 def chunks(

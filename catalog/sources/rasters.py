@@ -60,7 +60,12 @@ def index(
         reaches a tile.
     """
     root = root.resolve()
-    _check(root, patterns)
+    if unknown := sorted(set(patterns) - set(LAYERS)):
+        raise CatalogError(f"unknown layer {unknown[0]!r}; layers are {', '.join(LAYERS)}")
+    if "dsm" not in patterns:
+        raise CatalogError("a catalog needs surface heights; give their files with --dsm")
+    if not root.is_dir():
+        raise CatalogError(f"folder {root} does not exist")
     scanned = {
         name: scan(root, name, patterns[name], crs) for name in LAYERS if name in patterns and name != "roads"
     }
@@ -89,13 +94,3 @@ def index(
     roads, unusable = find(root, patterns["roads"], crs, roads_layer)
     tiles, far = with_roads(indexed.tiles, roads, crs)
     return replace(indexed, tiles=tiles, skipped=(*indexed.skipped, *unusable, *far))
-
-
-def _check(root: Path, patterns: Mapping[str, str]) -> None:
-    unknown = sorted(set(patterns) - set(LAYERS))
-    if unknown:
-        raise CatalogError(f"unknown layer {unknown[0]!r}; layers are {', '.join(LAYERS)}")
-    if "dsm" not in patterns:
-        raise CatalogError("a catalog needs surface heights; give their files with --dsm")
-    if not root.is_dir():
-        raise CatalogError(f"folder {root} does not exist")
