@@ -1,4 +1,4 @@
-"""Files of buckets on this machine: lists of them, and copies of those that grow, change or are large.
+"""Lists of the files in buckets, and local copies of files that grow, change in place, or are large.
 
 Millions of listed files are in a temporary database, not in memory. A bucket stores only complete files, so
 files that grow are written locally and uploaded. On disk the staged file is the file itself.
