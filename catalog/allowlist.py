@@ -23,11 +23,10 @@ def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
     - `layers`: the layers that will be read; other layers are not checked.
     """
     for tile, layer in _chosen(catalog, layers):
-        if tile.allowed is None:
-            continue
-        if outside := tile.outside(layer):
-            folders = _needed(catalog, tile.allowed, layers)
-            raise tile.allowed.refusal(f"tile {tile.id}: {layer.name}", outside, folders)
+        for name in (full_name(tile.root, file) for file in layer.files):
+            if tile.allowed and not tile.allowed.permits(name):
+                folders = _needed(catalog, tile.allowed, layers)
+                raise tile.allowed.refusal(f"tile {tile.id}: {layer.name}", name, folders)
 
 
 def needed(catalog: Catalog, folder: Location | str, layers: Collection[str] = LAYERS) -> tuple[str, ...]:

@@ -194,13 +194,6 @@ class Tile:
         """Return whether a file of the tile is missing: when its graph was made, or if unknown, now."""
         return stat(path) is None if self.missing is None else str(path) in self.missing
 
-    def outside(self, layer: Layer) -> str | None:
-        """Return the full name of the first file of a layer that may not be read, None if there is none."""
-        if self.allowed is None:
-            return None
-        names = (full_name(self.root, file) for file in layer.files)
-        return next((name for name in names if not self.allowed.permits(name)), None)
-
     def renamed(self, rename: Callable[[str], str]) -> Tile:
         """Return the tile with other names of its files."""
         layers, nearby = (
