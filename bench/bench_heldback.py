@@ -36,13 +36,13 @@ from scipy.spatial import cKDTree
 
 import flexroad
 from flexroad.catalog import Catalog, Grid
-from flexroad.catalog.sources import prepared, rasters
+from flexroad.catalog.sources import rasters
 from flexroad.pipeline.cli.main import main as command
 from flexroad.tasks.quality.estimate import INTERVAL
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.export.source import select
 from flexroad.tools.prepare.points.to_rasters import Options
-from flexroad.tools.synthetic import SceneOptions, make_scene
+from flexroad.tools.synthetic import SceneOptions, make_scene, prepared
 from flexroad.tools.synthetic.scene import DECK, GROUND, scan
 from tests.make_clouds import rasterise
 

@@ -13,17 +13,11 @@ if TYPE_CHECKING:
 
 __all__ = ["LAYERS", "Bounds", "Catalog", "CatalogError", "Grid", "Layer", "Tile"]
 
-_HOMES = {
-    "errors": ("CatalogError",),
-    "grid": ("Bounds", "Grid"),
-    "index": ("Catalog",),
-    "tile": ("LAYERS", "Layer", "Tile"),
-}
+_HOMES = {"CatalogError": "errors", "Bounds": "grid", "Grid": "grid", "Catalog": "index"}
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use, so that commands without a catalog start fast."""
-    for home, names in _HOMES.items():
-        if name in names:
-            return getattr(importlib.import_module(f"flexroad.catalog.{home}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"flexroad.catalog.{_HOMES.get(name, 'tile')}"), name)

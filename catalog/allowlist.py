@@ -23,11 +23,10 @@ def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
     - `layers`: the layers that will be read; other layers are not checked.
     """
     for tile, layer in _chosen(catalog, layers):
-        if tile.allowed is None:
-            continue
-        if outside := tile.outside(layer):
-            folders = _needed(catalog, tile.allowed, layers)
-            raise tile.allowed.refusal(f"tile {tile.id}: {layer.name}", outside, folders)
+        for name in (full_name(tile.root, file) for file in layer.files):
+            if tile.allowed and not tile.allowed.permits(name):
+                folders = _needed(catalog, tile.allowed, layers)
+                raise tile.allowed.refusal(f"tile {tile.id}: {layer.name}", name, folders)
 
 
 def needed(catalog: Catalog, folder: Location | str, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
@@ -36,21 +35,16 @@ def needed(catalog: Catalog, folder: Location | str, layers: Collection[str] = L
 
 
 def _needed(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str]) -> tuple[str, ...]:
-    folders = _outermost({posixpath.dirname(name) for name in _outside(catalog, allowed, layers)})
+    names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
+    # Addresses cannot be allowed.
+    outside = (name for name in names if not ADDRESS.match(name) and not allowed.permits(name))
+    folders = _outermost(posixpath.dirname(resolved(name)) for name in outside)
     while len(folders) > MAX_FOLDERS:
         parents = _outermost(map(posixpath.dirname, folders))
         if not parents.isdisjoint(TOPS):
             break
         folders = parents
     return tuple(sorted(folders))
-
-
-def _outside(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str]) -> Iterator[str]:
-    """Yield the name of every file outside the allowed folders that could be allowed."""
-    names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
-    for name in names:
-        if not ADDRESS.match(name) and not allowed.permits(name):
-            yield resolved(name)
 
 
 def _chosen(catalog: Catalog, layers: Collection[str]) -> Iterator[tuple[Tile, Layer]]:

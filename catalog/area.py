@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import shapely
 
-from flexroad.catalog.crs import short, transformer
+from flexroad.catalog.crs import transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.guard.open_vector import ERRORS, in_its_encoding, vector_name
-from flexroad.catalog.guard.rejected import InputRejected
+from flexroad.catalog.guard.source_files import InputRejected
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.scan.vectors import layers, listed
 from flexroad.catalog.text import count, reason
@@ -43,7 +43,6 @@ class Area:
         """Read the polygons of a vector file.
 
         - `path`: GeoPackage, GeoJSON, FlatGeobuf or Shapefile.
-        - `layer`: layer of a file with several.
         """
         try:
             name = vector_name(path)
@@ -79,12 +78,6 @@ class Area:
         """
         tree = shapely.STRtree(self.polygons)
         return [bool(tree.query(self._outline(grid), predicate="intersects").size) for grid in grids]
-
-    def none_touched(self) -> CatalogError:
-        """Return the error of an area without tiles."""
-        return CatalogError(
-            f"no tile touches --area {self.name}; check its CRS, {short(self.crs)}, and its place"
-        )
 
     def _outline(self, grid: Grid) -> Any:
         """Return the outline of a grid in the CRS of the area; empty if it cannot be transformed."""

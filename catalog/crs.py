@@ -193,7 +193,6 @@ def degrees(text: str, easting: float, northing: float) -> tuple[float, float]:
 def scales(source: str, target: str, x: float, y: float) -> tuple[float, float]:
     """Return how far one unit of a CRS reaches along the two axes of another one, in units of the latter.
 
-    - `source`, `target`: the two CRSs.
     - `x`, `y`: a point, in ``source``.
     """
     step = 1e-5 if is_geographic(source) else 1.0

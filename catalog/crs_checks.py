@@ -47,10 +47,7 @@ def crs_of(declared: str | None, given: str | None, bounds: Bounds) -> str | Non
 
 
 def angle_fault(crs: str, bounds: Bounds) -> str | None:
-    """Return that coordinates are no angles though a CRS says so, to follow a file's name; None if they may.
-
-    The file's remedy is left to the caller.
-    """
+    """Return that coordinates are no angles though a CRS says so, to follow a file's name; else None."""
     if not np.isfinite(bounds).all() or may_be_in(crs, bounds):
         return None
     west, south, east, north = bounds
@@ -104,9 +101,7 @@ def _to_degrees(crs: str) -> tuple[Transformer, Geod]:
 def elsewhere(crs: str, bounds: Bounds, target: str, ground: Bounds, reach_m: float) -> str:
     """Return where a layer lies that does not reach the tiles, and where these lie, to follow its name.
 
-    - `crs`: CRS of the layer.
-    - `bounds`: its bounds, in that CRS.
-    - `target`, `ground`: CRS and bounds of the tiles.
+    - `crs`, `bounds`: CRS and bounds of the layer; `target`, `ground`: those of the tiles.
     - `reach_m`: distance up to which a layer reaches a tile (m).
     """
     text = f"lies at {edges(bounds)} in {short(crs)}, the tiles at {edges(ground)} in {short(target)}"

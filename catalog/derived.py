@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.guard.rejected import require_regular
+from flexroad.catalog.guard.source_files import require_regular
 from flexroad.catalog.storage.outputs import atomic_path
 from flexroad.catalog.text import one_line
 
@@ -72,7 +72,9 @@ def rasters_of_points(source: Path, corner: tuple[float, float]) -> tuple[dict[s
         raise CatalogError(f"{source.name}: x, y and z do not belong together; points need one of each")
     if max(np.abs(x).max(), np.abs(y).max()) < 1000:
         x, y = x + corner[0], y + corner[1]
-    cell = _spacing(np.unique(x))
+    steps = np.diff(np.unique(x))
+    # Rounded numbers that should be equal differ by less than a millimetre.
+    cell = float(steps[steps > 0.001].min(initial=np.inf))
     col, row = (x - x.min()) / cell, (y.max() - y) / cell
     shape = round(row.max()) + 1, round(col.max()) + 1
     off = max(np.abs(axis - np.round(axis)).max() for axis in (col, row))
@@ -84,12 +86,6 @@ def rasters_of_points(source: Path, corner: tuple[float, float]) -> tuple[dict[s
     for name, raster in rasters.items():
         raster[np.round(row).astype(int), np.round(col).astype(int)] = values[name]
     return rasters, Affine(cell, 0, x.min() - cell / 2, 0, -cell, y.max() + cell / 2)
-
-
-def _spacing(axis: Floats) -> float:
-    # Rounded numbers that should be equal differ by less than a millimetre.
-    steps = np.diff(axis)
-    return float(steps[steps > 0.001].min(initial=np.inf))
 
 
 def _arrays(source: Path) -> dict[str, NDArray[np.generic]]:

@@ -61,14 +61,9 @@ class TileReader:
 
     Values are checked by hand, which is several times as fast as pydantic.
 
-    Parameters
-    ----------
-    folder : str
-        The catalog's folder, which file names are relative to.
-    allowed : AllowedFolders
-        Where the files of tiles may lie.
-    kind, file : str
-        What an entry is called, and the name of the catalog's file, for messages.
+    - `folder`: the catalog's folder, which file names are relative to.
+    - `allowed`: where the files of tiles may lie.
+    - `kind`, `file`: what an entry is called, and the name of the catalog's file, for messages.
     """
 
     def __init__(self, folder: str, allowed: AllowedFolders, kind: str, file: str) -> None:
@@ -92,7 +87,6 @@ class TileReader:
         return tuple(self._with_id(tile, number, taken) for number, tile in enumerate(tiles, 1))
 
     def _with_id(self, tile: Tile, number: int, taken: set[str]) -> Tile:
-        """Return the tile, one without an id with a new one."""
         if tile.id:
             return tile
         new = f"entry-{number}"
@@ -109,8 +103,11 @@ class TileReader:
             if reason := ids.problem(entry["id"]) if "id" in entry else "missing":
                 raise CatalogError(f"id: {reason}")
             tile_id = entry["id"]
-            if known := _known_fault(entry):
-                return faulty(tile_id, known, self._folder)
+            properties = entry.get("properties")
+            known = properties.get("flexroad:fault") if isinstance(properties, dict) else None
+            if known and isinstance(known, str):
+                # It was not usable in the catalog that this one was copied from.
+                return faulty(tile_id, printable(known)[: 2 * MAX_MESSAGE], self._folder)
             return self._usable(tile_id, _field(entry, "properties", dict), _field(entry, "assets", dict))
         except CatalogError as error:
             reason = str(error)
@@ -124,11 +121,12 @@ class TileReader:
         grid = _grid(properties)
         found = [self._layer(name, assets[name]) for name in LAYERS if assets.get(name) is not None]
         layers, nearby = by_cover(found, grid)
+        root = properties.get("flexroad:root")
         return Tile(
             id=tile_id,
             grid=grid,
             layers=layers,
-            root=self._root(properties) or self._folder,
+            root=self._named([root], "properties.flexroad:root")[0] if root else self._folder,
             datetime=_date(properties),
             datetime_assumed=bool(_optional(properties, "flexroad:datetime_assumed", bool, PROPERTIES)),
             stratum=_label(properties, "flexroad:stratum"),
@@ -149,17 +147,16 @@ class TileReader:
             system = _optional(asset, "flexroad:crs", str)
             if system is not None:
                 _check_crs(system, "flexroad:crs")
+            files = self._named(names, "flexroad:files")
+            extents = _extents(asset, len(names))
+            reproject = bool(_optional(asset, "flexroad:reproject", bool))
+            sublayer = _optional(asset, "flexroad:sublayer", str)
+            unit = _optional(asset, "flexroad:height_unit", str)
+            if unit is not None and unit not in HEIGHT_UNITS:
+                units = ", ".join(HEIGHT_UNITS)
+                raise CatalogError(f"flexroad:height_unit: {shown(unit)} is not one of {units}")
             layer: Layer = _shared(
-                Layer(
-                    name,
-                    self._named(names, "flexroad:files"),
-                    tuple(values),
-                    system,
-                    _extents(asset, len(names)),
-                    bool(_optional(asset, "flexroad:reproject", bool)),
-                    _optional(asset, "flexroad:sublayer", str),
-                    _height_unit(asset),
-                )
+                Layer(name, files, tuple(values), system, extents, reproject, sublayer, unit)
             )
             return layer
         except CatalogError as error:
@@ -175,22 +172,11 @@ class TileReader:
             # A list or an object.
             raise CatalogError(f"{field}: {shown(names)} is not a list of texts") from error
 
-    def _root(self, properties: dict[str, Any]) -> str:
-        root = properties.get("flexroad:root")
-        return self._named([root], "properties.flexroad:root")[0] if root else ""
-
 
 @lru_cache(RECENT)
 def _shared(value: T) -> T:
     """Return the first one of equal values: most tiles have the layers and the date of a neighbour."""
     return value
-
-
-def _known_fault(entry: dict[str, Any]) -> str:
-    """Return the fault of an entry that was not usable in the catalog that this one was copied from."""
-    properties = entry.get("properties")
-    fault = properties.get("flexroad:fault") if isinstance(properties, dict) else None
-    return printable(fault)[: 2 * MAX_MESSAGE] if isinstance(fault, str) else ""
 
 
 def _field(fields: dict[str, Any], name: str, kind: type, place: str = "") -> Any:
@@ -336,11 +322,3 @@ def _unpacked(edges: bytes) -> tuple[Bounds, ...]:
     if np.isnan(np.frombuffer(edges)).any():
         raise CatalogError("flexroad:extents: a number is NaN")
     return tuple(struct.iter_unpack("=4d", edges))
-
-
-def _height_unit(asset: dict[str, Any]) -> str | None:
-    """Return the unit of heights of files that declare none."""
-    unit: str | None = _optional(asset, "flexroad:height_unit", str)
-    if unit is not None and unit not in HEIGHT_UNITS:
-        raise CatalogError(f"flexroad:height_unit: {shown(unit)} is not one of {', '.join(HEIGHT_UNITS)}")
-    return unit

@@ -81,7 +81,7 @@ DEFAULTS = {
     "GDAL_WARP_USE_TRANSLATION_OPTIM": "YES",
     # A locale would change what a comma in a number means.
     "GDAL_DISABLE_CPLLOCALEC": "NO",
-    # Damaged XML of a VRT or a side-car file would be read as far as it goes.
+    # Damaged XML of a side-car file would be read as far as it goes.
     "CPL_MINIXML_RELAXED": "NO",
     # These change the rasters that are written.
     "GDAL_TIFF_ENDIANNESS": "NATIVE",
@@ -122,7 +122,6 @@ DEFAULTS = {
     "ALLOW_OGR_SQL_FUNCTIONS_FROM_TRIGGER_AND_VIEW": "NO",
     "ALLOW_VIRTUAL_OGR_FROM_TRIGGER_AND_VIEW": "NO",
     "OGR_SQLITE_ALLOW_EXTERNAL_ACCESS": "NO",
-    "GDAL_VRT_ENABLE_PYTHON": "NO",
 }
 """GDAL's own values."""
 WITHOUT_DEFAULT = (
@@ -155,14 +154,7 @@ WITHOUT_DEFAULT = (
 """Options without a value that stands for no value: they are removed from the environment."""
 NETWORK = "PROJ_NETWORK"
 """PROJ asks a server for grids, so that places depend on its answer; conda sets it in every shell."""
-FOLDERS = (
-    "PROJ_LIB",
-    "PROJ_DATA",
-    "GDAL_DATA",
-    "GDAL_DRIVER_PATH",
-    "OGR_DRIVER_PATH",
-    "GDAL_PYTHON_DRIVER_PATH",
-)
+FOLDERS = "PROJ_LIB PROJ_DATA GDAL_DATA GDAL_DRIVER_PATH OGR_DRIVER_PATH GDAL_PYTHON_DRIVER_PATH".split()
 """Folders of data and drivers, which only fit the GDAL and PROJ that they were installed with."""
 FILE = "GDAL_CONFIG_FILE"
 

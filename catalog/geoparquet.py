@@ -55,13 +55,17 @@ def entries(data: bytes) -> tuple[Iterator[Item], Any]:
     Reading complete items is many times slower.
     """
     file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False, page_checksum_verification=True)
-    _check_size(file.metadata)
+    metadata = file.metadata
+    # A few kilobytes can unpack to any size.
+    unpacked = sum(metadata.row_group(number).total_byte_size for number in range(metadata.num_row_groups))
+    if metadata.num_rows > MAX_ROWS or unpacked > MAX_UNPACKED:
+        raise ValueError(f"it has {metadata.num_rows:,} rows, which unpack to {unpacked / 2**30:,.1f} GiB")
     paths = (file.schema.column(number).path.split(".") for number in range(len(file.schema)))
     columns = dict.fromkeys(".".join(path[:3] if path[0] == "assets" else path[:1]) for path in paths)
     plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
     plain += [name for name in columns if name.startswith("assets.") and name.endswith(FIELDS)]
     names = [name for name in columns if name.endswith(".flexroad:extents")]
-    skipped = (file.metadata.metadata or {}).get(SKIPPED.encode(), b"[]")
+    skipped = (metadata.metadata or {}).get(SKIPPED.encode(), b"[]")
     return _rows(file, plain, names), json.loads(skipped)
 
 
@@ -74,19 +78,8 @@ def _rows(file: Any, plain: list[str], names: list[str]) -> Iterator[Item]:
         rows = _values(pa.Table.from_batches([part]))
         for field in assets["assets"].type if assets else ():
             _add_extents(rows, field.name, assets["assets"].field(field.name).field("flexroad:extents"))
-        yield from ({**_top(row), "properties": row} for row in rows)
-
-
-def _check_size(metadata: Any) -> None:
-    """Check what the file declares: a few kilobytes can unpack to any size."""
-    groups = (metadata.row_group(number) for number in range(metadata.num_row_groups))
-    unpacked = sum(group.total_byte_size for group in groups)
-    if metadata.num_rows > MAX_ROWS or unpacked > MAX_UNPACKED:
-        raise ValueError(f"it has {metadata.num_rows:,} rows, which unpack to {unpacked / 2**30:,.1f} GiB")
-
-
-def _top(row: Item) -> Item:
-    return {name: row[name] for name in ("id", "assets") if name in row}
+        for row in rows:
+            yield {name: row[name] for name in ("id", "assets") if name in row} | {"properties": row}
 
 
 def _values(table: Any) -> list[Item]:
@@ -138,9 +131,10 @@ def schema_of(full: Item) -> Any:
     """Return the columns of a table of items, inferred from an item with all fields."""
     schema = pa.Table.from_pylist([row(full)]).schema
     number = schema.get_field_index("geometry")
+    outlines = pyproj.CRS.from_epsg(4326).to_json_dict()
     metadata = {
         "ARROW:extension:name": "geoarrow.wkb",
-        "ARROW:extension:metadata": json.dumps({"crs": _crs()}, separators=(",", ":")),
+        "ARROW:extension:metadata": json.dumps({"crs": outlines}, separators=(",", ":")),
     }
     return schema.set(number, schema.field(number).with_metadata(metadata))
 
@@ -152,7 +146,8 @@ def table_bytes(items: Iterable[Item], schema: Any, skipped: Sequence[Item] = ()
 
     - `skipped`: entries of skipped files, which its metadata have.
     """
-    column = {"encoding": "WKB", "geometry_types": [], "crs": _crs(), "edges": "planar"}
+    outlines = pyproj.CRS.from_epsg(4326).to_json_dict()
+    column = {"encoding": "WKB", "geometry_types": [], "crs": outlines, "edges": "planar"}
     column["covering"] = {"bbox": {name: ["bbox", name] for name in EDGES}}
     geo = {"version": "1.1.0", "columns": {"geometry": column}, "primary_column": "geometry"}
     metadata = {"geo": json.dumps(geo), "stac-geoparquet": json.dumps({"version": "1.0.0"})}
@@ -166,15 +161,8 @@ def table_bytes(items: Iterable[Item], schema: Any, skipped: Sequence[Item] = ()
 
 
 def _tables(rows: Iterator[Item], schema: Any) -> Iterator[Any]:
-    """Yield rows as tables of `AT_ONCE` rows."""
     while part := list(islice(rows, AT_ONCE)):
         yield pa.Table.from_pylist(part, schema)
-
-
-def _crs() -> Item:
-    """Return the CRS of the outlines as PROJJSON."""
-    crs: Item = pyproj.CRS.from_epsg(4326).to_json_dict()
-    return crs
 
 
 def row(item: Item) -> Item:

@@ -11,7 +11,7 @@ import difflib
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property, lru_cache
@@ -28,7 +28,7 @@ from flexroad.catalog.crs import short
 from flexroad.catalog.entries import TileReader
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.geoparquet import SKIPPED, Item, Unreadable
-from flexroad.catalog.grid import Bounds, Grid, overlap
+from flexroad.catalog.grid import Bounds, Grid, overlap, union
 from flexroad.catalog.skipped import Skipped, from_fields, to_fields
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
@@ -85,7 +85,11 @@ class Catalog:
         """
         path = _location(path)
         try:
-            data = _content(path)
+            file = paths.stat(path)
+            if file is not None and file.size > MAX_BYTES:
+                size = f"{file.size:,} bytes, more than {MAX_BYTES:,}"
+                raise CatalogError(f"{path} has {size}; make several catalogs")
+            data = paths.read(path)
         except FileNotFoundError as error:
             raise CatalogError(f"catalog {path} does not exist; make one with `flexroad catalog`") from error
         except IsADirectoryError as error:
@@ -135,11 +139,23 @@ class Catalog:
         if path.suffix not in (".parquet", *JSON_SUFFIXES):
             raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, but not {path.name}")
         folder = absolute(path).parent
-        items = (item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles)
+        prefix = str(folder).rstrip("/") + "/"
+
+        def written(tile: Tile) -> Item:
+            if not movable:
+                return item(tile, tile.root)
+            # Links are not resolved: a folder of links stays one.
+            return item(tile.renamed(lambda file: normalise(join(tile.root, file)).removeprefix(prefix)))
+
+        items = map(written, self.tiles)
         files = [to_fields(one.below(str(folder)) if movable else one) for one in self.skipped]
-        make = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet
         try:
-            paths.write(path, make(items, files), flushed=True)
+            if path.suffix in JSON_SUFFIXES:
+                content = {"type": "FeatureCollection", "features": list(items)}
+                data = json.dumps(content | ({SKIPPED: files} if files else {}), indent=1).encode()
+            else:
+                data = geoparquet.table_bytes(items, _schema(), files)
+            paths.write(path, data, flushed=True)
         except OSError as error:
             raise CatalogError(f"cannot write catalog {path}: {error.strerror or error}") from error
 
@@ -170,7 +186,10 @@ class Catalog:
         wanted = set(ids)
         tiles = [tile for tile in self.tiles if not ids or tile.id in wanted]
         if bbox is not None:
-            self._check_bbox(bbox)
+            west, south, east, north = bbox
+            if west > east or south > north:
+                order = "the order is west south east north"
+                raise CatalogError(f"--bbox {edges(bbox)} is empty; {order}; {self._extent()}")
             tiles = [tile for tile in tiles if not tile.fault and overlap(tile.grid.bounds, bbox)]
             if not tiles:
                 raise CatalogError(f"no tile touches --bbox {edges(bbox)}; {self._extent()}")
@@ -178,7 +197,8 @@ class Catalog:
             usable = [tile for tile in tiles if not tile.fault]
             tiles = list(compress(usable, area.touched(tile.grid for tile in usable)))
             if not tiles:
-                raise area.none_touched()
+                place = f"check its CRS, {short(area.crs)}, and its place"
+                raise CatalogError(f"no tile touches --area {area.name}; {place}")
         return replace(self, tiles=tuple(tiles))
 
     def same_places(self) -> str:
@@ -189,23 +209,12 @@ class Catalog:
         shared = [" and ".join(same) for same in ids.values() if len(same) > 1]
         return f"tiles on the same place: {some(shared)}; their results cover each other" if shared else ""
 
-    def _check_bbox(self, bbox: Bounds) -> None:
-        west, south, east, north = bbox
-        if west > east or south > north:
-            raise CatalogError(
-                f"--bbox {edges(bbox)} is empty; the order is west south east north; {self._extent()}"
-            )
-
     def _extent(self) -> str:
         """Return where the tiles lie, for a message."""
         corners: dict[str, list[Bounds]] = defaultdict(list)
         for tile in self.usable:
             corners[tile.grid.crs].append(tile.grid.bounds)
-        places = []
-        for crs, bounds in corners.items():
-            west, south, east, north = zip(*bounds, strict=True)
-            whole = edges((min(west), min(south), max(east), max(north)))
-            places.append(f"{whole} in {short(crs)}")
+        places = [f"{edges(union(bounds))} in {short(crs)}" for crs, bounds in corners.items()]
         return f"the tiles lie within {' and '.join(places)}"
 
 
@@ -218,14 +227,6 @@ def _location(path: Location | str) -> Location:
 
 def _not_a_catalog(path: Location, reason: str) -> CatalogError:
     return CatalogError(f"{path} is not a FlexRoad catalog: {reason}; make one with `flexroad catalog`")
-
-
-def _rooted(tile: Tile, root: Location) -> Tile:
-    """Return the tile with file names relative to ``root`` where they lie below it, else absolute."""
-    prefix = str(root).rstrip("/") + "/"
-    # Links are not resolved: a folder of links stays one.
-    renamed = tile.renamed(lambda file: normalise(join(tile.root, file)).removeprefix(prefix))
-    return replace(renamed, root=str(root))
 
 
 @lru_cache(maxsize=16)
@@ -310,14 +311,6 @@ def _asset(layer: Layer, root: str) -> Item:
     }
 
 
-def _content(path: Location) -> bytes:
-    """Return the bytes of a catalog, which are several times as large in memory when they are read."""
-    file = paths.stat(path)
-    if file is not None and file.size > MAX_BYTES:
-        raise CatalogError(f"{path} has {file.size:,} bytes, more than {MAX_BYTES:,}; make several catalogs")
-    return paths.read(path)
-
-
 def _from_json(data: bytes) -> tuple[list[Any], Any]:
     """Return the entries of tiles and of skipped files."""
     content = json.loads(data, object_pairs_hook=_unique)
@@ -334,15 +327,6 @@ def _unique(pairs: list[tuple[str, Any]]) -> Item:
         names = Counter(name for name, _ in pairs)
         found |= {name: Unreadable("given twice") for name, count in names.items() if count > 1}
     return found
-
-
-def _to_json(items: Iterable[Item], skipped: Sequence[Item]) -> bytes:
-    content = {"type": "FeatureCollection", "features": list(items)}
-    return json.dumps(content | ({SKIPPED: skipped} if skipped else {}), indent=1).encode()
-
-
-def _to_parquet(items: Iterable[Item], skipped: Sequence[Item]) -> bytes:
-    return geoparquet.table_bytes(items, _schema(), skipped)
 
 
 @cache

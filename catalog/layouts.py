@@ -13,7 +13,7 @@ import json
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -91,12 +91,17 @@ def find(root: Path) -> tuple[list[Found], list[str]]:
         tiles = ID.findall(name)
         layer = layer_of(name, OWN_NAMES) or ("dsm" if name.lower().endswith(POINTS) else "")
         if tiles and layer in LAYERS:
-            found.append(Found(name, tiles[-1], layer, _stratum(name) or of_tile.get(tiles[-1], "")))
+            folders = map(stratum_of, reversed(PurePosixPath(name).parts[:-1]))
+            stratum = next(filter(None, folders), "") or of_tile.get(tiles[-1], "")
+            found.append(Found(name, tiles[-1], layer, stratum))
         elif tiles:
             unclear.append(name)
     if unclear:
         notes.append(f"not a layer by the name: {some(unclear)}; describe the files with --layout")
-    return _best(found), notes
+    points = {file: file.name.lower().endswith(POINTS) for file in found}
+    # Points are left out where the tile also has a raster of the layer.
+    rasters = {(file.tile, file.layer) for file in found if not points[file]}
+    return [file for file in found if not points[file] or (file.tile, file.layer) not in rasters], notes
 
 
 def layer_of(name: str, words: Sequence[tuple[str, str]] = NAMES) -> str:
@@ -161,26 +166,8 @@ def _names(root: Path) -> Iterator[str]:
     for parent, folders, names in os.walk(root):
         # Hidden files, and the copies of names that macOS puts into archives.
         folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))
-        yield from (
-            Path(parent, name).relative_to(root).as_posix()
-            for name in sorted(names)
-            if not name.startswith(".")
-        )
-
-
-def _stratum(name: str) -> str:
-    return next(filter(None, map(stratum_of, reversed(PurePosixPath(name).parts[:-1]))), "")
-
-
-def _best(found: Iterable[Found]) -> list[Found]:
-    """Return the files without points of a layer that a tile also has as raster."""
-    files = list(found)
-    rasters = {(file.tile, file.layer) for file in files if not file.name.lower().endswith(POINTS)}
-    return [
-        file
-        for file in files
-        if not file.name.lower().endswith(POINTS) or (file.tile, file.layer) not in rasters
-    ]
+        shown = (name for name in sorted(names) if not name.startswith("."))
+        yield from (Path(parent, name).relative_to(root).as_posix() for name in shown)
 
 
 def _strata(root: Path, names: Sequence[str]) -> tuple[dict[str, str], list[str]]:
@@ -189,18 +176,16 @@ def _strata(root: Path, names: Sequence[str]) -> tuple[dict[str, str], list[str]
     for name in names:
         try:
             if (root / name).stat().st_size <= MAX_TABLE_BYTES:
-                strata |= dict(_pairs(_parsed(root / name), "", ""))
+                text = read(root / name).decode("utf-8-sig")
+                if name.lower().endswith(".csv"):
+                    # One separator for all: ids and strata have neither.
+                    parsed: Any = [";".join(line).split(";") for line in csv.reader(text.splitlines())]
+                else:
+                    parsed = json.loads(text)
+                strata |= dict(_pairs(parsed, "", ""))
         except (OSError, ValueError, csv.Error, RecursionError) as error:
             notes.append(f"{name} was not read: {access_reason(error) or one_line(error)}")
     return strata, notes
-
-
-def _parsed(path: Path) -> Any:
-    text = read(path).decode("utf-8-sig")
-    if path.suffix.lower() == ".csv":
-        # One separator for all: ids and strata have neither.
-        return [row for line in csv.reader(text.splitlines()) for row in [";".join(line).split(";")]]
-    return json.loads(text)
 
 
 def _pairs(node: Any, tile: str, stratum: str) -> Iterator[tuple[str, str]]:

@@ -69,8 +69,5 @@ def _imported(name: str) -> ModuleType:
 
 
 def lazy(name: str) -> Any:
-    """Return a library that is imported when one of its names is first asked for.
-
-    - `name`: name of the library or of a module in it, as ``rasterio`` or ``matplotlib.figure``.
-    """
+    """Return a library that is imported when one of its names is first asked for."""
     return LazyModule(name)

@@ -48,7 +48,6 @@ class Skipped:
 def lost(before: Sequence[Tile], tiles: Collection[str], skipped: Sequence[Skipped]) -> tuple[Skipped, ...]:
     """Return skipped files with the tiles of an earlier catalog that are missing without them.
 
-    - `before`: tiles of the earlier catalog.
     - `tiles`: ids of the tiles of the catalog that skipped the files.
     """
     gone: dict[str, list[str]] = defaultdict(list)

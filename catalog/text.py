@@ -30,7 +30,7 @@ def printable(text: str) -> str:
     These are control characters, line breaks, reversals of the direction and lone surrogates. A file name or
     a tag may have them, and a terminal would obey them.
     """
-    return text if text.isprintable() else "".join(map(_escaped, text))
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def without_credentials(text: str) -> str:
@@ -101,7 +101,3 @@ def write_reason(error: BaseException) -> str:
 def one_line(error: BaseException) -> str:
     """Return an error's complete message as one short line, or its type if it has none."""
     return " ".join(str(error).split())[:MAX_LINE] or type(error).__name__
-
-
-def _escaped(character: str) -> str:
-    return character if character.isprintable() else ascii(character)[1:-1]

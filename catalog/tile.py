@@ -30,6 +30,10 @@ REACH_M = 200.0
 """A tile's layers list the files within this distance of it (m): for halos and for ground along borders."""
 RECENT = 2**14
 """Layers and dates that are kept to be shared: of the last thousands of tiles."""
+MIN_COVER = 0.25
+"""Default share below which catalogs leave a tile out and `load` fails on it."""
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
+"""Heights outside are nodata (m)."""
 TOUCH_M = 0.001
 """Files that overlap ground by no more than this (m) only touch it."""
 
@@ -189,13 +193,6 @@ class Tile:
     def lacks(self, path: Location) -> bool:
         """Return whether a file of the tile is missing: when its graph was made, or if unknown, now."""
         return stat(path) is None if self.missing is None else str(path) in self.missing
-
-    def outside(self, layer: Layer) -> str | None:
-        """Return the full name of the first file of a layer that may not be read, None if there is none."""
-        if self.allowed is None:
-            return None
-        names = (full_name(self.root, file) for file in layer.files)
-        return next((name for name in names if not self.allowed.permits(name)), None)
 
     def renamed(self, rename: Callable[[str], str]) -> Tile:
         """Return the tile with other names of its files."""

@@ -25,12 +25,11 @@ from flexroad.catalog.crs_checks import elsewhere, require_scale
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid, is_whole, union
 from flexroad.catalog.index import Catalog
-from flexroad.catalog.limits import MIN_COVER
-from flexroad.catalog.scan.cover import height_share
+from flexroad.catalog.scan.cell_values import height_share
 from flexroad.catalog.scan.rasters import RasterFile, require_metric, zoned
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import count, some
-from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, RECENT, Layer, Tile, by_cover
+from flexroad.catalog.tile import HEIGHTS, LAYERS, MIN_COVER, REACH_M, RECENT, Layer, Tile, by_cover
 
 MASKS = ("road_mask", "reference_road")
 MAX_CELL_RATIO = 50
@@ -152,11 +151,8 @@ def cut(
       files overlap, the first one with a value is used.
     - `road_values`: cell values that mean road in the masks; empty: every value but 0 and nodata.
     - `tile_size_m`: edge of a tile (m); tiles lie on multiples of it in the DSM's CRS.
-    - `date`: date of the survey; overrides the files' dates.
-    - `crs`: CRS of files without one.
     - `min_cover`: tiles with a DSM height in less than this share (0 to 1) of their cells are left out, as
       `load.min_valid` would fail on them. 0 keeps all that files touch, and reads no heights.
-    - `dataset`: name of the data in reports.
     - `conversion`: whether and where to files in other CRSs are reprojected.
     """
     dsm = layer_files["dsm"]
@@ -205,20 +201,18 @@ def _place(
     root: Path, layer: str, files: Sequence[RasterFile], crs: str
 ) -> tuple[list[_PlacedFile], list[Skipped]]:
     """Return the files with their bounds in the tiles' CRS, and those without a position in it."""
-    placed = [
-        _PlacedFile(f, f.bounds if same(f.crs, crs) else bounds_in(crs, f.crs, f.bounds)) for f in files
-    ]
     kept, lost = list[_PlacedFile](), list[Skipped]()
-    for entry in placed:
+    for file in files:
+        bounds = file.bounds if same(file.crs, crs) else bounds_in(crs, file.crs, file.bounds)
         # NaN is not below either.
-        if np.abs(entry.bounds).max() <= FARTHEST:
-            kept.append(entry)
+        if np.abs(bounds).max() <= FARTHEST:
+            kept.append(_PlacedFile(file, bounds))
             continue
         reason = (
-            f"in {short(entry.file.crs)} it has no position in {short(crs)}, the CRS of the dsm; "
+            f"in {short(file.crs)} it has no position in {short(crs)}, the CRS of the dsm; "
             "correct its CRS with `gdal_edit.py -a_srs`"
         )
-        lost.append(Skipped(entry.file.name, layer, reason, str(root)))
+        lost.append(Skipped(file.name, layer, reason, str(root)))
     if not kept:
         raise CatalogError(f"no usable file of the layer {layer}; {lines(lost)[0]}")
     return kept, lost
@@ -384,19 +378,14 @@ def _covered(
 
 def _cover(root: Path, grid: Grid, dsm: _OnTile, min_cover: float, reproject: bool) -> float:
     """Return the share of a tile that the DSM covers: by heights, or by the extents of the files."""
-    by_extents = _area(dsm.shared) / (grid.width * grid.cell) ** 2
+    covered_m2 = float(shapely.union_all(shapely.box(*dsm.shared.T)).area)
+    by_extents = covered_m2 / (grid.width * grid.cell) ** 2
     others = [file for file in dsm.files if not same(file.crs, grid.crs)]
     if not min_cover or by_extents < min_cover or (others and not reproject):
         return by_extents
-    # What a VRT names was checked when the files were found.
     bare = next((file.crs for file in dsm.files if not file.has_crs), None)
     by_heights = height_share(grid, [root / file.name for file in dsm.files], crs=bare)
     return by_extents if by_heights is None else by_heights
-
-
-def _area(boxes: NDArray[np.float64]) -> float:
-    """Return the area of the union of boxes, ``(n, 4)`` (m2)."""
-    return float(shapely.union_all(shapely.box(*boxes.T)).area)
 
 
 def _layers(
@@ -423,20 +412,14 @@ def _layers(
     return layer
 
 
-def taken(dsm: Sequence[RasterFile], date: datetime | None) -> tuple[datetime, bool]:
+def taken(dsm: Sequence[RasterFile], date: datetime | None = None) -> tuple[datetime, bool]:
     """Return the date of a tile's DSM (``date`` overrides its files), and whether it is only assumed."""
-    if date is not None:
-        return zoned(date), False
-    dates = [file.taken for file in dsm if file.taken]
-    return (dates[0], False) if dates else (dsm[0].modified, True)
+    known = date or next((file.taken for file in dsm if file.taken), None)
+    return (zoned(known), False) if known else (dsm[0].modified, True)
 
 
 def assumed(tiles: Sequence[Tile]) -> list[str]:
     """Return a note on the tiles whose date is only assumed; empty if there are none."""
     undated = [tile.id for tile in tiles if tile.datetime_assumed]
-    if not undated:
-        return []
-    return [
-        f"no date in the dsm of {count(len(undated), 'tile')}: the files' times are used instead "
-        "(--date sets it)"
-    ]
+    note = f"no date in the dsm of {count(len(undated), 'tile')}: the files' times are used instead"
+    return [f"{note} (--date sets it)"] * bool(undated)

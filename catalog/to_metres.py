@@ -67,8 +67,15 @@ class MetricTransform:
         if not (is_projected(source) or is_geographic(source)):
             raise CatalogError(f"{short(source)} is neither projected nor geographic; reproject the source")
         height_m, notes = _heights(source, unit)
-        twin = _target(source, place)
-        target = _metric(to_crs) if to_crs else twin
+        if is_projected(source):
+            twin = metric_twin(source, *place)
+        else:
+            longitude, latitude = degrees(source, *place)
+            twin = utm_of((longitude, latitude, longitude, latitude))
+        if to_crs and not (is_projected(to_crs) and plan_unit(to_crs)[1] == 1):
+            remedy = "give a projected CRS in metres, such as EPSG:25832"
+            raise CatalogError(f"--to-crs {to_crs} is in {_units(to_crs)}; {remedy}")
+        target = in_plan(to_crs) if to_crs else twin
         exact = is_projected(source) and same(target, twin)
         return cls(source, target, plan_unit(source)[1] if exact else None, height_m, notes)
 
@@ -113,22 +120,6 @@ def agreed(files: Sequence[tuple[str, str | None]], option: str | None) -> str:
         remedy = "leave --crs out" if name == "--crs" else "prepare them apart, or reproject one"
         raise CatalogError(f"mixed CRS: {first_name} is in {_full(first)}, {name} in {_full(crs)}; {remedy}")
     return next((crs for _, crs in crs_of if height_unit(crs)), first)
-
-
-def _target(source: str, place: tuple[float, float]) -> str:
-    if is_projected(source):
-        return metric_twin(source, *place)
-    longitude, latitude = degrees(source, *place)
-    return utm_of((longitude, latitude, longitude, latitude))
-
-
-def _metric(to_crs: str) -> str:
-    """Return the CRS given with --to-crs; raise an error if it is not projected in metres."""
-    if not is_projected(to_crs) or plan_unit(to_crs)[1] != 1:
-        raise CatalogError(
-            f"--to-crs {to_crs} is in {_units(to_crs)}; give a projected CRS in metres, such as EPSG:25832"
-        )
-    return in_plan(to_crs)
 
 
 def _heights(source: str, unit: str | None) -> tuple[float, tuple[str, ...]]:

@@ -47,17 +47,13 @@ class AllowedFolders:
         return cls(str(home), tuple(dict.fromkeys((*own, *(normalise(str(folder)) for folder in more)))))
 
     def permits(self, name: str) -> bool:
-        """Return whether a file may be read.
-
-        - `name`: full path or address.
-        """
+        """Return whether a file may be read, by its full path or address."""
         return _permitted(name, self.folders)
 
     def refusal(self, subject: str, name: str, folders: Sequence[str] = ()) -> CatalogError:
         """Return the error that a file may not be read, with the options that allow it.
 
         - `subject`: what names the file: ``tile 1: dsm``.
-        - `name`: full path or address.
         - `folders`: the folders to allow; by default that of the file.
         """
         if len(name) > LONGEST_SHOWN:

@@ -14,9 +14,8 @@ import numpy as np
 from pydantic import Field
 
 from flexroad.catalog import Grid, Layer, Tile
-from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.scan.rasters import quiet
-from flexroad.catalog.tile import HEIGHTS
+from flexroad.catalog.tile import HEIGHTS, MIN_COVER
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.dsm_and_dtm import below_ground_note, survey_difference

@@ -9,8 +9,7 @@ from pyproj import Transformer
 from flexroad.catalog import Catalog
 from flexroad.catalog.grid import Bounds, union
 from flexroad.catalog.scan.vectors import opened, with_roads
-from flexroad.catalog.sources import prepared
-from flexroad.tools.synthetic import block
+from flexroad.tools.synthetic import block, prepared
 from flexroad.tools.synthetic.crossings import REACH_M, CrossingOptions, Crossings, make_crossings
 from tests.make_roads import write_osm
 

@@ -59,11 +59,7 @@ class _Span(NamedTuple):
 
 
 def check(path: Path) -> int:
-    """Check a header.
-
-    - result: size of the largest chunk of a compressed file, unpacked (bytes); 0 if the file is not
-      compressed.
-    """
+    """Check a header; return the unpacked size of the largest chunk (bytes), 0 if nothing is compressed."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(LONGEST)
@@ -74,11 +70,14 @@ def check(path: Path) -> int:
             raise ValueError(f"its points begin at byte {start:,} of {size:,}, after a header of {length}")
         if records * RECORD > start - length:
             raise ValueError(f"its header counts {records:,} records before its points at byte {start:,}")
-        points, item = _count(head), int(struct.unpack_from("<H", head, 105)[0])
+        # The number of points has 64 bits since LAS 1.4.
+        is_long = head[25] >= 4 and len(head) == LONGEST
+        number = struct.unpack_from(*(("<Q", head, 247) if is_long else ("<I", head, 107)))
+        points, item = int(number[0]), int(struct.unpack_from("<H", head, 105)[0])
         if points:
             # Files without points have the largest numbers that there are as bounds.
             _check_numbers(head)
-        if head[25] >= 4 and len(head) == LONGEST:
+        if is_long:
             _check_extended(file, head, size)
         if not head[104] & COMPRESSED:
             return 0
@@ -86,14 +85,7 @@ def check(path: Path) -> int:
         return item * _largest_chunk(file, length, records, span)
 
 
-def _count(head: bytes) -> int:
-    """Return the number of points: of 64 bits since LAS 1.4."""
-    is_long = head[25] >= 4 and len(head) == LONGEST
-    return int(struct.unpack_from("<Q", head, 247)[0] if is_long else struct.unpack_from("<I", head, 107)[0])
-
-
 def _check_numbers(head: bytes) -> None:
-    """Check scales, offsets and bounds."""
     numbers = np.frombuffer(head, "<f8", 12, 131)
     scales, offsets, bounds = numbers[:3], numbers[3:6], numbers[6:]
     if not ((scales > 0) & (scales <= COARSEST)).all():
@@ -105,7 +97,6 @@ def _check_numbers(head: bytes) -> None:
 
 
 def _check_extended(file: BinaryIO, head: bytes, size: int) -> None:
-    """Check that the extended records lie in the file."""
     start, records = struct.unpack_from("<QI", head, 235)
     for _ in range(records):
         file.seek(min(start, size))
@@ -142,7 +133,9 @@ def _check_chunks(file: BinaryIO, record: bytes, span: _Span) -> int:
     Return the number of points that the decoder expects in the largest chunk.
     """
     chunk = struct.unpack_from("<I", record, 12)[0]
-    items = _items(record)
+    # Type and length (bytes) of each item of a point.
+    number = struct.unpack_from("<H", record, 32)[0]
+    items = [struct.unpack_from("<HH", record, 34 + 6 * place) for place in range(number)]
     if sum(length for _, length in items) != span.item:
         raise ValueError(f"its points have {span.item:,} bytes, but its compression is for other points")
     table = _chunk_table(file, record, span)
@@ -154,12 +147,6 @@ def _check_chunks(file: BinaryIO, record: bytes, span: _Span) -> int:
     if struct.unpack_from("<H", record)[0] == LAYERED:
         _check_layers(file, items, span.start, lengths)
     return max(counts, default=0) if chunk == VARIABLE else chunk or span.points
-
-
-def _items(record: bytes) -> list[tuple[int, int]]:
-    """Return type and length (bytes) of each item of a point."""
-    count = struct.unpack_from("<H", record, 32)[0]
-    return [struct.unpack_from("<HH", record, 34 + 6 * number) for number in range(count)]
 
 
 def _check_layers(file: BinaryIO, items: list[tuple[int, int]], start: int, lengths: list[int]) -> None:

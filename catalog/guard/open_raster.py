@@ -3,22 +3,33 @@
 GDAL chooses the driver by a file's content, whatever its name: a VRT or WMS named ``a.tif`` would make it
 read other files or the web. So the driver is chosen here, by the first bytes, and is the only one allowed.
 Side-car files and metadata can name further files, too; they are checked as well.
+
+A thread keeps rasters open (`kept_raster`): a tile, its corners and its edges read the same files. Only files
+on disk without side-car files are kept. One that has changed since, or whose folder has, is opened again.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import threading
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import rasterio
 from rasterio.errors import CRSError, RasterioError
 
-from flexroad.catalog.guard.rejected import InputRejected, archive_note, head, require_beside
+from flexroad.catalog.guard.source_files import (
+    InputRejected,
+    archive_note,
+    head,
+    require_beside,
+    side_car_names,
+)
 from flexroad.catalog.storage.paths import Location, gdal_name, sidecars
 
 UNKNOWN = (
@@ -26,10 +37,7 @@ UNKNOWN = (
     "fetch it again, or convert it with gdal_translate"
 )
 MAGIC = {
-    b"II*\0": "GTiff",
-    b"MM\0*": "GTiff",
-    b"II+\0": "GTiff",
-    b"MM\0+": "GTiff",
+    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "GTiff"),
     b"\x89PNG\r\n\x1a\n": "PNG",
     b"\xff\xd8\xff": "JPEG",
     b"\0\0\0\x0cjP  \r\n\x87\n": "JP2OpenJPEG",
@@ -50,14 +58,14 @@ NOT_TEXT = re.compile(rb"[<\0-\x08\x0e-\x19\x1b-\x1f]")
 """Bytes that ASCII grids and XYZ do not have; 0x1a ends some files."""
 MARK = re.compile(rb"<[A-Za-z]{3}")
 ASCII_GRID = re.compile(rb"\s*(ncols|nrows|xll|yll|cellsize|dx|dy|nodata)", re.IGNORECASE)
-APPENDED = (".aux.xml", ".ovr", ".msk", ".aux")
-REPLACED = (".aux.xml", ".aux", ".prj", ".tab", ".wld")
 ERRORS = (RasterioError, CRSError, OSError, UnicodeDecodeError)
 """What rasterio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
 BLOCK_CACHE_BYTES = 16 * 2**20
 """Blocks of files that stay open which GDAL keeps in memory; its own default grows with the machine."""
 OFFLINE = {"CPL_VSIL_CURL_ALLOWED_FILENAME": "none"}
 """GDAL's option for local files: its file system on the web opens nothing."""
+MOST_KEPT = 64
+"""Largest number of files that a thread keeps open: nine tiles with seven layers."""
 A_VRT = "is a VRT, which only names other files; give those files by a pattern, e.g. 'dsm/*.tif'"
 
 
@@ -163,47 +171,88 @@ def _side_cars(path: Path) -> list[Path]:
     return found
 
 
-def _require_plain(path: Path) -> None:
-    """Check the metadata of overviews or a mask."""
-    try:
-        env = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="TRUE", **OFFLINE)
-        with env, rasterio.open(str(path), driver="GTiff") as dataset:
-            _require_no_link(dataset)
-    except (RasterioError, UnicodeDecodeError) as error:
-        raise InputRejected(f"cannot be read: {error}; fetch it again") from error
-
-
 def _check_side_car(side: Path) -> None:
     suffix = side.suffix.lower()
     if suffix in (".ovr", ".msk"):
         if MAGIC.get(head(side)[:4]) != "GTiff":
             raise InputRejected("is no TIFF; remove it")
         _side_cars(side)
-        # GDAL takes a raster without a mask that it cannot read.
-        _require_plain(side)
+        try:
+            env = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="TRUE", **OFFLINE)
+            with env, rasterio.open(str(side), driver="GTiff") as dataset:
+                _require_no_link(dataset)
+        except (RasterioError, UnicodeDecodeError) as error:
+            # GDAL takes a raster without a mask that it cannot read.
+            raise InputRejected(f"cannot be read: {error}; fetch it again") from error
     elif suffix == ".xml":
-        _require_xml(side)
+        data = side.read_bytes()
+        # Of a file that is cut off or has zeros, GDAL takes a raster without its nodata value.
+        if b"\0" in data or not data.rstrip().endswith(b">"):
+            raise InputRejected("is damaged; fetch it again, or remove it")
     elif suffix == ".aux" and head(side).startswith(b"EHFA_HEADER_TAG"):
         raise InputRejected("is of Erdas Imagine and may name other files; remove it")
 
 
-def _require_xml(side: Path) -> None:
-    """Raise an error if a file is cut off or has zeros: GDAL then takes a raster without its nodata value."""
-    data = side.read_bytes()
-    if b"\0" in data or not data.rstrip().endswith(b">"):
-        raise InputRejected("is damaged; fetch it again, or remove it")
+@contextmanager
+def kept_raster(path: Location) -> Iterator[Any]:
+    """Open a source raster as `open_raster` does, and keep it open for the next time if nothing fails."""
+    if not isinstance(path, Path):
+        with open_raster(path) as dataset:
+            yield dataset
+        return
+    path = path.absolute()
+    # Before it is opened: a later change is noticed the next time.
+    state = _state(path)
+    dataset = _idle.take(path, state) or open_alone(path)
+    if dataset is None:
+        with open_raster(path) as dataset:
+            yield dataset
+        return
+    try:
+        yield dataset
+    except BaseException:
+        dataset.close()
+        raise
+    _idle.keep(path, state, dataset)
 
 
-@lru_cache(maxsize=65536)
-def side_car_names(name: str) -> tuple[str, ...]:
-    """Return the names of side-car files that GDAL looks for beside a file of this name."""
-    path = Path(name)
-    end = path.suffix[1:]
-    worlds = {f".{end}w", f".{end[:1]}{end[-1:]}w"} if end else set()
-    appended = [name + case for text in APPENDED for case in (text, text.upper())]
-    replaced = [
-        path.with_suffix(case).name
-        for text in sorted({*REPLACED, *worlds})
-        for case in dict.fromkeys((text, text.lower(), text.upper()))
-    ]
-    return (*appended, *replaced)
+def _state(path: Path) -> tuple[int, ...]:
+    """Return what shows that a file has changed, or that its folder has other files; last the process."""
+    file = path.stat()
+    # A forked process would share the position in the file with its parent.
+    return file.st_ino, file.st_size, file.st_mtime_ns, path.parent.stat().st_mtime_ns, os.getpid()
+
+
+class _Idle(threading.local):
+    """The open files of a thread that it does not use at the moment."""
+
+    def __init__(self) -> None:
+        self.files = OrderedDict[Path, tuple[tuple[int, ...], Any]]()
+
+    def take(self, path: Path, state: tuple[int, ...]) -> Any | None:
+        """Return the open file, None if there is none in this state."""
+        before, dataset = self.files.pop(path, (None, None))
+        if dataset is not None and before == state:
+            # Opening a file clears this thread's last error in GDAL. This call raises the error, whatever its
+            # file, and so clears it.
+            with contextlib.suppress(Exception):
+                _ = dataset.colorinterp
+            return dataset
+        self._close(before, dataset)
+        return None
+
+    def keep(self, path: Path, state: tuple[int, ...], dataset: Any) -> None:
+        """Keep an open file, and close the one that has not been used for longest if there are too many."""
+        self._close(*self.files.pop(path, (None, None)))
+        self.files[path] = state, dataset
+        if len(self.files) > MOST_KEPT:
+            _, longest = self.files.popitem(last=False)
+            self._close(*longest)
+
+    @staticmethod
+    def _close(state: tuple[int, ...] | None, dataset: Any) -> None:
+        if state and state[-1] == os.getpid():
+            dataset.close()
+
+
+_idle = _Idle()

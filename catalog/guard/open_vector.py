@@ -25,9 +25,16 @@ from weakref import finalize
 from xml.parsers import expat
 
 from flexroad.catalog.gdal_options import settle_vectors
-from flexroad.catalog.guard.rejected import InputRejected, archive_note, head, require_beside
-from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, source_stat
-from flexroad.catalog.guard.sqlite_contents import opened, require_sound_contents
+from flexroad.catalog.guard.source_files import (
+    SHAPEFILE_PARTS,
+    SQLITE_PARTS,
+    InputRejected,
+    archive_note,
+    head,
+    require_beside,
+    source_stat,
+)
+from flexroad.catalog.guard.vector_contents import opened, require_sound_contents
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.storage.scratch import ScratchFolder
@@ -84,15 +91,7 @@ def vector_name(path: Path) -> str:
         for part in (path, *parts):
             _require_complete(part)
     elif data.startswith(SQLITE):
-        path = _complete(path, data)
-        is_geopackage = data[68:72] in GEOPACKAGES
-        if not (is_geopackage or _is_spatialite(path)):
-            raise InputRejected(UNKNOWN)
-        _require_own_tables(path)
-        require_sound_contents(path, _state(path))
-        if not is_geopackage:
-            # The prefix selects the driver, whatever the file's name ends in.
-            return f"SQLITE:{path}"
+        return _sqlite_name(_complete(path, data), data[68:72] in GEOPACKAGES)
     elif not (
         data.startswith(b"fgb\x03") or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader") or _is_osm(text)
     ):
@@ -131,19 +130,19 @@ def _objects(path: Path, condition: str) -> list[tuple[str, str]]:
         return []
 
 
-def _is_spatialite(path: Path) -> bool:
-    """Return whether an SQLite file has the tables of SpatiaLite, and GDAL can read it."""
+def _sqlite_name(path: Path, is_geopackage: bool) -> str:
     tables = "name IN ('geometry_columns', 'spatial_ref_sys')"
-    return len(_objects(path, tables)) == 2 and "SQLite" in pyogrio.list_drivers()
-
-
-def _require_own_tables(path: Path) -> None:
-    """Raise an error if an SQLite file has a table that may be made of another file."""
+    is_spatialite = not is_geopackage and len(_objects(path, tables)) == 2
+    if not (is_geopackage or (is_spatialite and "SQLite" in pyogrio.list_drivers())):
+        raise InputRejected(UNKNOWN)
     for name, statement in _objects(path, "sql LIKE '%virtual%'"):
         if VIRTUAL.match(statement) and not INDEX.match(statement):
             raise InputRejected(
                 f"has the virtual table {name!r}, which may be made of another file; convert it with ogr2ogr"
             )
+    require_sound_contents(path, _state(path))
+    # The prefix selects the driver, whatever the file's name ends in.
+    return str(path) if is_geopackage else f"SQLITE:{path}"
 
 
 def _complete(path: Path, data: bytes) -> Path:

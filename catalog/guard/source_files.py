@@ -1,4 +1,4 @@
-"""All files that a source on disk consists of, and its state: what shows that any of them has changed."""
+"""Files that a source on disk consists of: whether they may be opened, and whether any has changed."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import time
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
+from stat import S_ISREG
 
-from flexroad.catalog.guard.open_raster import side_car_names
 from flexroad.catalog.storage.paths import FileStat, Location, file_stat, stat
 
 SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".sbx", ".idm", ".ind")
@@ -19,6 +19,52 @@ ALONE = (".geojson", ".json", ".fgb", ".osm", ".pbf")
 """Endings of vector formats of one file."""
 SETTLED_NS = 2 * 10**9
 """Age at which the time of a folder shows every later change of its names."""
+APPENDED = (".aux.xml", ".ovr", ".msk", ".aux")
+REPLACED = (".aux.xml", ".aux", ".prj", ".tab", ".wld")
+"""Endings of the side-car files of rasters, after a file's name or in place of its suffix."""
+HEAD_BYTES = 65536
+CHUNK_BYTES = 2**20
+ARCHIVES = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"BZh", b"\xfd7zXZ\0")
+"""First bytes of files of archives."""
+
+
+class InputRejected(OSError):
+    """A file that is not opened; the message continues a sentence that begins with its name."""
+
+
+def head(path: Path) -> bytes:
+    """Return the first bytes of a regular file; links are followed."""
+    require_regular(path)
+    # Opening a pipe would wait for a writer, if one has just taken the file's place.
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as file:
+        return file.read(HEAD_BYTES) or b""
+
+
+def archive_note(data: bytes) -> str:
+    """Return the remedy if a file is an archive, by its first bytes, to end a message; else empty."""
+    is_archive = data.startswith(ARCHIVES) or data[257:262] == b"ustar"
+    return "; it is an archive: unpack it first" if is_archive else ""
+
+
+def read_through(path: Path) -> None:
+    """Read all bytes of a regular file."""
+    require_regular(path)
+    with path.open("rb", buffering=0) as file:
+        while file.read(CHUNK_BYTES):
+            pass
+
+
+def require_beside(side: Path, path: Path) -> None:
+    """Raise an error if a file that a library opens with another one is not a regular file of its folder."""
+    if side.is_symlink() and side.resolve().parent not in (path.resolve().parent, path.parent.resolve()):
+        raise InputRejected("is a link to another folder; replace it by the file")
+    head(side)
+
+
+def require_regular(path: Path) -> None:
+    """Raise an error if a path is not a regular file."""
+    if not S_ISREG(path.stat().st_mode):
+        raise InputRejected("is not a regular file; replace it by one")
 
 
 def source_stat(where: Location) -> FileStat | None:
@@ -50,13 +96,8 @@ def _files(path: str) -> Iterator[str]:
     for beside in _beside(folder or ".", name):
         part = f"{folder}/{beside}" if folder else beside
         # Readers of a GeoPackage leave an empty -wal.
-        if not part.endswith("-wal") or _has_bytes(part):
+        if not part.endswith("-wal") or ((found := file_stat(part)) and found.size > 0):
             yield part
-
-
-def _has_bytes(path: str) -> bool:
-    found = file_stat(path)
-    return found is not None and found.size > 0
 
 
 @lru_cache(maxsize=65536)
@@ -69,6 +110,21 @@ def _part_names(name: str) -> tuple[str, ...]:
     if suffix in (*ALONE, ".gpkg"):
         return sqlite
     return (*sqlite, *dict.fromkeys(side_car_names(name)))
+
+
+@lru_cache(maxsize=65536)
+def side_car_names(name: str) -> tuple[str, ...]:
+    """Return the names of side-car files that GDAL looks for beside a file of this name."""
+    path = Path(name)
+    end = path.suffix[1:]
+    worlds = {f".{end}w", f".{end[:1]}{end[-1:]}w"} if end else set()
+    appended = [name + case for text in APPENDED for case in (text, text.upper())]
+    replaced = [
+        path.with_suffix(case).name
+        for text in sorted({*REPLACED, *worlds})
+        for case in dict.fromkeys((text, text.lower(), text.upper()))
+    ]
+    return (*appended, *replaced)
 
 
 def _beside(folder: str, name: str) -> tuple[str, ...]:

@@ -51,32 +51,21 @@ class _Pair(NamedTuple):
     rule: str
 
 
-class _Difference(NamedTuple):
-    """Difference of the heights of two files where both have one."""
-
-    median: float
-    share: float
-    """Share of the cells that differ by more than `DIFFERENT_M`."""
-
-
 def newest_first(root: Path, layer: str, files: Sequence[RasterFile]) -> tuple[list[RasterFile], list[str]]:
     """Return the files of a layer with the newest before others of the same ground, and notes on that.
 
     The age is that of the dates in which the two names differ, else of the dates in the files' tags, else of
     their times, if these are a day apart. Files without another of the same ground keep their places.
-
-    - `root`: folder that the names are relative to.
-    - `layer`: name of the layer.
     """
     pairs = [_aged(files, one, other) for one, other in _same_ground(files)]
     if not pairs:
         return list(files), []
     compared = {pair: _difference(root, files, pair) for pair in _some(pairs) if layer in HEIGHTS}
     for pair, difference in compared.items():
-        if not pair.rule and difference and difference.share > DIFFERENT_SHARE:
+        if not pair.rule and difference and difference[1] > DIFFERENT_SHARE:
             raise CatalogError(
                 f"{layer}: {files[pair.newer].name} and {files[pair.older].name} cover the same ground, "
-                f"{_text(difference)}, and no date in their names, tags or times tells which is newer; "
+                f"{difference[0]}, and no date in their names, tags or times tells which is newer; "
                 "leave one out, or write the year into their names"
             )
     known = [pair for pair in pairs if pair.rule]
@@ -156,7 +145,7 @@ def _notes(
     layer: str,
     files: Sequence[RasterFile],
     pairs: Sequence[_Pair],
-    compared: dict[_Pair, _Difference | None],
+    compared: dict[_Pair, tuple[str, float] | None],
 ) -> list[str]:
     """Return a note for each rule that was used, with one pair as an example."""
     notes = []
@@ -169,20 +158,16 @@ def _notes(
         notes.append(
             f"{layer}: {count(len(own), 'pair')} of files cover the same ground; by the dates {where}, "
             f"{files[shown.newer].name} is used before {files[shown.older].name}"
-            + (f", and {_text(difference)}" if difference else "")
+            + (f", and {difference[0]}" if difference else "")
         )
     return notes
 
 
-def _text(difference: _Difference) -> str:
-    return (
-        f"their heights differ by {difference.median:.2f} in the median, by more than {DIFFERENT_M:g} in "
-        f"{difference.share:.0%} of the cells"
-    )
+def _difference(root: Path, files: Sequence[RasterFile], pair: _Pair) -> tuple[str, float] | None:
+    """Return newer minus older as a text, and the share of the cells that differ by `DIFFERENT_M`, or None.
 
-
-def _difference(root: Path, files: Sequence[RasterFile], pair: _Pair) -> _Difference | None:
-    """Return newer minus older on a sample of their common ground; None if it cannot be told."""
+    A sample of their common ground is compared.
+    """
     a, b = files[pair.newer].bounds, files[pair.older].bounds
     shared = (max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3]))
     try:
@@ -194,7 +179,9 @@ def _difference(root: Path, files: Sequence[RasterFile], pair: _Pair) -> _Differ
     apart = apart[np.isfinite(apart)]
     if not apart.size:
         return None
-    return _Difference(float(np.median(apart)), float((np.abs(apart) > DIFFERENT_M).mean()))
+    share = float((np.abs(apart) > DIFFERENT_M).mean())
+    by = f"by {np.median(apart):.2f} in the median, by more than {DIFFERENT_M:g} in {share:.0%} of the cells"
+    return f"their heights differ {by}", share
 
 
 def _heights(path: Path, bounds: Bounds) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, timedelta
+from datetime import date
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,10 +35,6 @@ RGB = ("red", "green", "blue")
 USED = ("Z", "CLASSIFICATION", "FLAGS", "RGB", "GPS_TIME")
 """Fields that are decoded besides the coordinates in plan, as laspy calls them."""
 DEGREES = 360.0
-GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(seconds=10**9)
-"""The zero of adjusted standard GPS time (ASPRS LAS 1.4), without leap seconds."""
-FIRST_GPS = (datetime(1990, 1, 1, tzinfo=UTC) - GPS_EPOCH).total_seconds()
-WEEK_S = 604_800
 SLACK = 0.01
 """Points may exceed the header's bounds by this fraction of the extent plus one unit."""
 
@@ -142,28 +138,11 @@ def _has_dates(header: Any) -> bool:
     return has_times and int(header.global_encoding.gps_time_type) == 1
 
 
-def survey_dates(gps: Floats) -> tuple[datetime, datetime] | None:
-    """Return the dates of the first and the last point, or None if no time can be one of a survey.
-
-    - `gps`: see `Chunk.gps`. Times of a week (0 to 604,800 s) are left out, as some files have them although
-      their header declares standard times; so are times before 1990 and in the future.
-    """
-    latest = (datetime.now(UTC) - GPS_EPOCH).total_seconds()
-    times = gps[np.isfinite(gps) & ((gps < 0) | (gps > WEEK_S)) & (gps > FIRST_GPS) & (gps < latest)]
-    if not len(times):
-        return None
-    first, last = (GPS_EPOCH + timedelta(seconds=float(time)) for time in (times.min(), times.max()))
-    return first, last
-
-
 def chunks(
     path: Path, size: int = CHUNK, drop: Collection[int] = NOISE, points: range | None = None
 ) -> Iterator[Chunk]:
     """Yield the points of a cloud, decoded once; withheld points are left out.
 
-    - `path`: LAS, LAZ or COPC file.
-    - `size`: points decoded at a time, at most.
-    - `drop`: classes to leave out.
     - `points`: points to decode, in the order of the file; None: all.
     """
     _checked(path)
@@ -222,18 +201,16 @@ def _checked(path: Path) -> int:
 
 def _opened(path: Path, fields: Collection[str] = ()) -> Any:
     """Open a checked cloud; of compressed points only some fields are decoded, all if none are named."""
-    selection = {"decompression_selection": _selection(fields)} if fields else {}
+    selection = {}
+    if fields:
+        # Formats before LAS 1.4 are always decoded completely.
+        chosen = laspy.DecompressionSelection.xy_returns_channel()
+        for name in fields:
+            chosen |= laspy.DecompressionSelection[name]
+        selection = {"decompression_selection": chosen}
     # The parallel decoder allocates a complete chunk, which the header may give as 2^32 points, and goes to
     # wrong points of files with chunks of different sizes, as COPC has (laz-rs #62).
     return _attempt(path, lambda: laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, **selection))
-
-
-def _selection(fields: Collection[str]) -> Any:
-    """Return what laspy decodes; formats before LAS 1.4 are always decoded completely."""
-    chosen = laspy.DecompressionSelection.xy_returns_channel()
-    for name in fields:
-        chosen |= laspy.DecompressionSelection[name]
-    return chosen
 
 
 def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:

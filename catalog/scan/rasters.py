@@ -29,7 +29,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.gdal_options import CHOSEN, DEFAULTS
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.guard.rejected import InputRejected
+from flexroad.catalog.guard.source_files import InputRejected
 from flexroad.catalog.scan.valid_cells import color_kinds
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.storage.settings import gdal_options
@@ -122,15 +122,7 @@ class _Skip(Exception):
 
 
 def scan(root: Path, layer: str, pattern: str, crs: str | None) -> tuple[list[RasterFile], list[Skipped]]:
-    """Open each file of a layer once.
-
-    - `root`: the folder, resolved.
-    - `layer`: name of the layer, for messages.
-    - `pattern`: glob pattern: see `matching`.
-    - `crs`: CRS of files without one.
-    - `files`: ordered by name.
-    - `skipped`: files and folders that are left out.
-    """
+    """Open each file of a layer once."""
     paths, unlisted = matching(root, layer, pattern)
     files, skipped = opened(root, layer, paths, crs)
     if not files:
@@ -152,7 +144,7 @@ def opened(
             try:
                 files.append(_open(root, path, crs, layer in HEIGHTS))
             except _Skip as reason:
-                skipped.append(Skipped(_name(root, path), layer, str(reason), str(root)))
+                skipped.append(Skipped(name_below(root, path), layer, str(reason), str(root)))
     return files, skipped
 
 
@@ -166,7 +158,6 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[Ski
     If the pattern's last part has a dot, it names files, and a folder that matches is in place of one.
 
     - `root`: the folder that relative patterns start from, resolved.
-    - `layer`: name of the layer, for messages.
     - `pattern`: relative to ``root``; absolute, or with ``..``, it names files outside.
     """
     folder, relative = _start(root, pattern)
@@ -186,16 +177,11 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[Ski
 def glob(folder: Path, pattern: str) -> tuple[list[Path], list[tuple[Path, OSError]]]:
     """Return all that matches a glob pattern, and the folders that may hold more.
 
-    - `folder`: folder that the pattern is relative to.
     - `paths`: files, folders, and links to nothing, by name.
     - `unlisted`: folders on the pattern's way that cannot be listed, each with the error; `Path.glob` ignores
       them.
     """
-    paths = sorted(folder.glob(pattern))
-    return paths, list(_unlisted(folder, pattern))
-
-
-def _unlisted(folder: Path, pattern: str) -> Iterator[tuple[Path, OSError]]:
+    paths, unlisted = sorted(folder.glob(pattern)), list[tuple[Path, OSError]]()
     above = PurePath(pattern).parts[:-1]
     places = {folder}
     for depth in range(1, len(above) + 1):
@@ -207,7 +193,8 @@ def _unlisted(folder: Path, pattern: str) -> Iterator[tuple[Path, OSError]]:
         except (FileNotFoundError, NotADirectoryError):
             continue
         except OSError as error:
-            yield place, error
+            unlisted.append((place, error))
+    return paths, unlisted
 
 
 def _is_folder(path: Path) -> bool:
@@ -219,7 +206,7 @@ def _is_folder(path: Path) -> bool:
 def unlisted_folders(root: Path, layer: str, unlisted: Iterable[tuple[Path, OSError]]) -> list[Skipped]:
     """Return folders that cannot be listed as a catalog keeps them."""
     return [
-        Skipped(f"{_name(root, folder)}/", layer, f"it {access_reason(error)}", str(root))
+        Skipped(f"{name_below(root, folder)}/", layer, f"it {access_reason(error)}", str(root))
         for folder, error in unlisted
     ]
 
@@ -246,7 +233,7 @@ def there(folder: Path, remedy: str = "") -> str:
     return f"there are {names}{remedy}" if names else "the folder is empty"
 
 
-def _name(root: Path, path: Path) -> str:
+def name_below(root: Path, path: Path) -> str:
     """Return the path relative to the folder if it lies below it, else the complete path."""
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
@@ -280,7 +267,7 @@ def _open(root: Path, path: Path, crs: str | None, heights: bool) -> RasterFile:
         raise _Skip(f"it {angles}; give its CRS with --crs, or declare it with gdal_edit.py -a_srs")
     west, south, east, north = bounds
     return RasterFile(
-        name=_name(root, path),
+        name=name_below(root, path),
         crs=plan,
         has_crs=has_crs,
         # GDAL swaps south and north of XYZ files that are sorted from south to north.

@@ -11,17 +11,16 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from flexroad.catalog.crs import bounds_in, transformer
 from flexroad.catalog.crs_checks import angle_fault, crs_of, elsewhere
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, union
 from flexroad.catalog.guard.open_vector import ERRORS, layer_info, vector_name
-from flexroad.catalog.guard.rejected import InputRejected
-from flexroad.catalog.guard.spatial_index import real_bounds
+from flexroad.catalog.guard.source_files import InputRejected
+from flexroad.catalog.guard.vector_contents import real_bounds
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.scan.rasters import matching
+from flexroad.catalog.scan.rasters import matching, name_below
 from flexroad.catalog.skipped import Skipped
 from flexroad.catalog.text import access_reason, count, reason
 from flexroad.catalog.tile import REACH_M, RECENT, Layer, Tile
@@ -55,10 +54,7 @@ def find(
 ) -> tuple[list[VectorFile], list[Skipped]]:
     """Open vector files; return the usable ones, and the others.
 
-    - `root`: the folder of the catalog's rasters.
     - `given`: a file, or a glob pattern relative to ``root``.
-    - `crs`: CRS of files without one.
-    - `sublayer`: layer of files with several.
     """
     root = root.resolve()
     paths, unlisted = ([Path(given)], []) if Path(given).is_file() else matching(root, "roads", given)
@@ -152,10 +148,7 @@ def bounds_of(info: Mapping[str, Any]) -> Bounds:
 def with_roads(
     tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | None
 ) -> tuple[tuple[Tile, ...], list[Skipped]]:
-    """Return the tiles with a layer ``roads`` of the files within `REACH_M` of each tile.
-
-    - `far`: the files that reach no tile.
-    """
+    """Return the tiles with a layer ``roads`` of the files within `REACH_M`, and the files far from all."""
     if not files:
         return tuple(tiles), []
     extents = {
@@ -163,7 +156,13 @@ def with_roads(
         for target in {tile.grid.crs for tile in tiles}
     }
     # As a tree: in a state there are as many files as tiles.
-    trees = {target: shapely.STRtree(_boxes(bounds)) for target, bounds in extents.items()}
+    trees = {}
+    for target, bounds in extents.items():
+        boxes = np.full(len(bounds), None, object)
+        # None where a file reaches nothing.
+        known = np.isfinite(bounds).all(axis=1)
+        boxes[known] = shapely.box(*bounds[known].T)
+        trees[target] = shapely.STRtree(boxes)
     near = [
         np.sort(trees[tile.grid.crs].query(shapely.box(*tile.grid.buffered(REACH_M).bounds)))
         for tile in tiles
@@ -183,10 +182,7 @@ def with_roads(
     def layer(numbers: tuple[int, ...], target: str, root: Path) -> Layer:
         """Return the layer of files given by their numbers; neighbouring tiles share it."""
         chosen = [files[number] for number in numbers]
-        names = tuple(
-            file.path.relative_to(root).as_posix() if file.path.is_relative_to(root) else str(file.path)
-            for file in chosen
-        )
+        names = tuple(name_below(root, file.path) for file in chosen)
         bounds = tuple(map(tuple, extents[target][list(numbers)].tolist()))
         return Layer("roads", names, crs=bare, extents=bounds, sublayer=chosen[0].sublayer)
 
@@ -197,14 +193,6 @@ def with_roads(
         for tile, numbers in zip(tiles, near, strict=True)
     )
     return tuple(with_layer), far
-
-
-def _boxes(extents: NDArray[np.float64]) -> NDArray[np.object_]:
-    """Return extents, ``(n, 4)``, as polygons, None where a file reaches nothing."""
-    boxes: NDArray[np.object_] = np.full(len(extents), None, object)
-    known = np.isfinite(extents).all(axis=1)
-    boxes[known] = shapely.box(*extents[known].T)
-    return boxes
 
 
 def _far(file: VectorFile, tiles: Sequence[Tile]) -> str:

@@ -19,20 +19,18 @@ import numpy as np
 from affine import Affine
 
 from flexroad.catalog.crs import short
-from flexroad.catalog.derived import write_heights
+from flexroad.catalog.derived import is_current, write_heights
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.guard.open_raster import open_raster
+from flexroad.catalog.scan.cell_values import mask_notes, plateau_notes
 from flexroad.catalog.scan.editions import newest_first
-from flexroad.catalog.scan.mask_values import mask_notes
-from flexroad.catalog.scan.plateaus import plateau_notes
 from flexroad.catalog.scan.point_clouds import chunks
 from flexroad.catalog.scan.rasters import RasterFile, glob, opened, scan, there, unlisted_folders
 from flexroad.catalog.scan.vectors import find, with_roads
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.text import some
-from flexroad.catalog.tile import HEIGHTS, Tile
+from flexroad.catalog.tile import HEIGHTS, MIN_COVER
 from flexroad.catalog.tiling import Conversion, TilingResult, cut
 
 CRS = "EPSG:25832"
@@ -161,7 +159,10 @@ def index(
         vectors, unusable = find(root, roads, CRS, roads_layer)
         tiles, far = with_roads(indexed.tiles, vectors, CRS)
         indexed = replace(indexed, tiles=tiles, skipped=(*indexed.skipped, *unusable, *far))
-    return replace(indexed, notes=(*indexed.notes, *_without_terrain(indexed.tiles)))
+    if lacking := [tile.id for tile in indexed.tiles if tile.layer("dtm") is None]:
+        fault = f"no dgm1 file under {some(lacking)}: these tiles will fail"
+        indexed = replace(indexed, notes=(*indexed.notes, f"{fault}; download the terrain model as well"))
+    return indexed
 
 
 def _downloads(root: Path) -> tuple[list[Download], list[Skipped]]:
@@ -186,19 +187,14 @@ def _placed(
         west, south, east, north = download.square
         x, y = (file.bounds[0] + file.bounds[2]) / 2, (file.bounds[1] + file.bounds[3]) / 2
         if file.crs == CRS and west < x < east and south < y < north:
-            kept.append(_dated(file, download.year))
+            # By the year in its name, unless its tags give a date in that year.
+            year = 0 if file.taken and file.taken.year == download.year else download.year
+            kept.append(replace(file, taken=datetime(year, 1, 1, tzinfo=UTC)) if year else file)
         else:
             reason = f"its centre {x:.0f} {y:.0f} in {short(file.crs)} does not match its name"
             reason = f"{reason}; download it again"
             misplaced.append(Skipped(file.name, str(download.layer), reason, str(root)))
     return kept, misplaced
-
-
-def _dated(file: RasterFile, year: int) -> RasterFile:
-    """Return the file dated by the year in its name, unless its tags give a date in that year."""
-    if not year or (file.taken and file.taken.year == year):
-        return file
-    return replace(file, taken=datetime(year, 1, 1, tzinfo=UTC))
 
 
 def _bridges(
@@ -229,9 +225,9 @@ def _deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
 
     Return whether there are any. A target that is not older than the cloud is kept, unless it is damaged.
     """
-    kept = _kept(cloud, target)
-    if kept is not None:
-        return kept
+    if is_current(cloud, target):
+        with open_raster(target) as raster:
+            return bool(np.isfinite(raster.read(1)).any())
     west, south, east, north = square
     width, height = math.ceil((east - west) / DECK_CELL_M), math.ceil((north - south) / DECK_CELL_M)
     total, count = np.zeros(width * height), np.zeros(width * height, np.int64)
@@ -250,21 +246,3 @@ def _deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
         heights = (total / count).reshape(height, width)
     write_heights(target, heights, Affine(DECK_CELL_M, 0, west, 0, -DECK_CELL_M, north), crs)
     return bool(count.any())
-
-
-def _kept(cloud: Path, target: Path) -> bool | None:
-    """Return whether an existing target has bridges; None if it is older than the cloud, or damaged."""
-    try:
-        if target.stat().st_mtime_ns < cloud.stat().st_mtime_ns:
-            return None
-        with open_raster(target) as raster:
-            return bool(np.isfinite(raster.read(1)).any())
-    except ERRORS:
-        return None
-
-
-def _without_terrain(tiles: Sequence[Tile]) -> list[str]:
-    lacking = [tile.id for tile in tiles if tile.layer("dtm") is None]
-    if not lacking:
-        return []
-    return [f"no dgm1 file under {some(lacking)}: these tiles will fail; download the terrain model as well"]

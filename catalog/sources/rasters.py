@@ -8,13 +8,11 @@ from datetime import datetime
 from pathlib import Path
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.scan.cell_values import mask_notes, plateau_notes
 from flexroad.catalog.scan.editions import newest_first
-from flexroad.catalog.scan.mask_values import mask_notes
-from flexroad.catalog.scan.plateaus import plateau_notes
 from flexroad.catalog.scan.rasters import RasterFile, scan
 from flexroad.catalog.scan.vectors import find, with_roads
-from flexroad.catalog.tile import HEIGHTS, LAYERS
+from flexroad.catalog.tile import HEIGHTS, LAYERS, MIN_COVER
 from flexroad.catalog.tiling import MASKS, NO_CONVERSION, Conversion, TilingResult, cut
 
 
@@ -62,7 +60,12 @@ def index(
         reaches a tile.
     """
     root = root.resolve()
-    _check(root, patterns)
+    if unknown := sorted(set(patterns) - set(LAYERS)):
+        raise CatalogError(f"unknown layer {unknown[0]!r}; layers are {', '.join(LAYERS)}")
+    if "dsm" not in patterns:
+        raise CatalogError("a catalog needs surface heights; give their files with --dsm")
+    if not root.is_dir():
+        raise CatalogError(f"folder {root} does not exist")
     scanned = {
         name: scan(root, name, patterns[name], crs) for name in LAYERS if name in patterns and name != "roads"
     }
@@ -91,13 +94,3 @@ def index(
     roads, unusable = find(root, patterns["roads"], crs, roads_layer)
     tiles, far = with_roads(indexed.tiles, roads, crs)
     return replace(indexed, tiles=tiles, skipped=(*indexed.skipped, *unusable, *far))
-
-
-def _check(root: Path, patterns: Mapping[str, str]) -> None:
-    unknown = sorted(set(patterns) - set(LAYERS))
-    if unknown:
-        raise CatalogError(f"unknown layer {unknown[0]!r}; layers are {', '.join(LAYERS)}")
-    if "dsm" not in patterns:
-        raise CatalogError("a catalog needs surface heights; give their files with --dsm")
-    if not root.is_dir():
-        raise CatalogError(f"folder {root} does not exist")

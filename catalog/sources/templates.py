@@ -15,7 +15,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,15 +91,15 @@ class _MatchedFile(NamedTuple):
     """Read from its path."""
 
 
+_ByLayer = dict[str, dict[str, _MatchedFile]]
+
+
 def index(
-    root: Path,
-    layout: Mapping[str, Any],
-    dataset: str,
-    *,
-    date: datetime | None = None,
-    derived: Path | None = None,
+    root: Path, layout: Mapping[str, Any], dataset: str, *, derived: Path | None = None
 ) -> TilingResult:
     """Return the tiles of a dataset's folder, with notes on what differs from the paper's.
+
+    A tile's grid is that of its DSM file.
 
     Parameters
     ----------
@@ -111,22 +110,43 @@ def index(
         `by_name`.
     dataset : str
         `GEROD` or `DSC3D`.
-    date : datetime, optional
-        Date of the survey; overrides the files' dates.
     derived : Path, optional
         Folder for rasters of points (``.npz``), which are left out without it.
 
     Raises
     ------
     CatalogError
-        If the layout is invalid, or the folder does not match it.
+        If the layout is invalid, there is no usable DSM in metres, or two files are the same layer of a tile.
     """
-    if dataset == GEROD and by_name(layout):
-        result = _named(root, Layout.of({"layers": dict.fromkeys(NEEDED, "{tile}"), **layout}), date, derived)
-    else:
-        result = read(root, Layout.of(layout), dataset=dataset, date=date)
-    notes = {GEROD: _gerod_notes, DSC3D: _dsc3d_notes}[dataset](result.tiles)
-    return replace(result, notes=(*result.notes, *notes))
+    named = dataset == GEROD and by_name(layout)
+    paths = Layout.of({"layers": dict.fromkeys(NEEDED, "{tile}"), **layout} if named else layout)
+    if not root.is_dir():
+        raise CatalogError(f"folder {root} does not exist")
+    root = root.resolve()
+    by_layer, notes, left_out = _named(root, paths, derived) if named else _by_templates(root, paths)
+    if not by_layer.get("dsm"):
+        why = lines(left_out)[0] if left_out else there(root, "; describe them with --layout")
+        meant = f"matches {paths.layers['dsm']!r} (dsm)"
+        if named:
+            meant = f"is the dsm of a tile such as {layouts.NAMED[0]}"
+        raise CatalogError(f"no usable file {meant} below {root}; {why}")
+    left_out += _without_metres(root, by_layer["dsm"])
+    tiles = tuple(
+        _tile(
+            root,
+            tile_id,
+            {name: of[tile_id] for name, of in by_layer.items() if tile_id in of},
+            paths,
+            dataset,
+        )
+        for tile_id in sorted(by_layer["dsm"])
+    )
+    for name in () if named else paths.layers:
+        if lacking := [tile.id for tile in tiles if tile.layer(name) is None]:
+            share = f"{len(lacking)} of {len(tiles)} tiles"
+            notes.append(f"no {name} at {paths.layers[name]!r} for {share}: {some(lacking)}")
+    own = {GEROD: _gerod_notes, DSC3D: _dsc3d_notes}[dataset](tiles)
+    return TilingResult(tiles, (*notes, *assumed(tiles), *own), tuple(left_out))
 
 
 def by_name(layout: Mapping[str, Any]) -> bool:
@@ -136,20 +156,16 @@ def by_name(layout: Mapping[str, Any]) -> bool:
 
 def _gerod_notes(tiles: Sequence[Tile]) -> list[str]:
     """Return notes on tiles that are not at the corner in their id (a wrong template or CRS) or missing."""
-    off = [tile.id for tile in tiles if not _is_at_id(tile)]
+    off = []
+    for tile in tiles:
+        corner, (west, south) = CORNER.fullmatch(tile.id), tile.grid.bounds[:2]
+        # Some programs write rasters of points, which begin half a cell before the corner.
+        if not corner or math.dist(map(float, corner.groups()), (west, south)) > tile.grid.cell:
+            off.append(tile.id)
     notes = [f"not at the corner given by the tile's name: {some(off)}; check layout and CRS"] if off else []
     if len(tiles) != layouts.TILES:
         notes.append(f"{len(tiles)} of the dataset's {layouts.TILES} tiles are here")
     return notes
-
-
-def _is_at_id(tile: Tile) -> bool:
-    """Return whether the tile's south-west corner is the one in its id, to within one cell."""
-    corner = CORNER.fullmatch(tile.id)
-    # Some programs write rasters of points, which begin half a cell before the corner.
-    return (
-        corner is not None and math.dist(map(float, corner.groups()), tile.grid.bounds[:2]) <= tile.grid.cell
-    )
 
 
 def _dsc3d_notes(tiles: Sequence[Tile]) -> list[str]:
@@ -159,61 +175,25 @@ def _dsc3d_notes(tiles: Sequence[Tile]) -> list[str]:
     return [note] if without else []
 
 
-def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = None) -> TilingResult:
-    """Return the tiles of a folder; a tile's grid is that of its DSM file.
-
-    Parameters
-    ----------
-    root : Path
-        The folder.
-    layout : Layout
-        Paths of its files.
-    dataset : str
-        Name of the data in reports.
-    date : datetime, optional
-        Date of the survey; overrides the files' dates.
-
-    Raises
-    ------
-    CatalogError
-        If there is no usable DSM in metres, or two files are the same layer of a tile.
-    """
-    if not root.is_dir():
-        raise CatalogError(f"folder {root} does not exist")
-    root, left_out = root.resolve(), list[Skipped]()
-    by_layer: dict[str, dict[str, _MatchedFile]] = {}
-    for name in LAYERS:
-        if name in layout.layers:
-            by_layer[name], skipped = _files(root, name, layout)
-            left_out += skipped
-    if not by_layer["dsm"]:
-        why = lines(left_out)[0] if left_out else there(root, "; describe them with --layout")
-        raise CatalogError(f"no usable file matches {layout.layers['dsm']!r} (dsm) below {root}; {why}")
-    left_out += _without_metres(root, by_layer["dsm"])
-    tiles = _tiles(root, by_layer, layout, dataset, date)
-    return TilingResult(tiles, (*_lacking(tiles, layout), *assumed(tiles)), tuple(left_out))
+def _by_templates(root: Path, layout: Layout) -> tuple[_ByLayer, list[str], list[Skipped]]:
+    """Return the files that match the templates by layer and tile id, notes, and what is left out."""
+    by_layer, left_out = _ByLayer(), list[Skipped]()
+    for name in (name for name in LAYERS if name in layout.layers):
+        by_layer[name], skipped = _files(root, name, layout)
+        left_out += skipped
+    return by_layer, [], left_out
 
 
-def _named(root: Path, layout: Layout, date: datetime | None, derived: Path | None) -> TilingResult:
-    """Return the tiles of GeRoD, whose files are found by their names."""
-    if not root.is_dir():
-        raise CatalogError(f"folder {root} does not exist")
-    root = root.resolve()
+def _named(root: Path, layout: Layout, derived: Path | None) -> tuple[_ByLayer, list[str], list[Skipped]]:
+    """Return the files of GeRoD, found by their names, as `_by_templates` does."""
     found, notes = layouts.find(root)
     paths, left_out = _rasters(root, found, derived, layout.crs or GEROD_CRS)
-    by_layer = {}
+    by_layer = _ByLayer()
     for name in (name for name in LAYERS if any(file.layer == name for file in paths.values())):
         parts = {path: (file.tile, file.stratum) for path, file in paths.items() if file.layer == name}
         by_layer[name], skipped = _opened(root, name, parts, layout.crs, "leave one of them")
         left_out += skipped
-    if not by_layer.get("dsm"):
-        why = lines(left_out)[0] if left_out else there(root, "; describe them with --layout")
-        raise CatalogError(
-            f"no usable file is the dsm of a tile such as {layouts.NAMED[0]} below {root}; {why}"
-        )
-    left_out += _without_metres(root, by_layer["dsm"])
-    tiles = _tiles(root, by_layer, layout, GEROD, date)
-    return TilingResult(tiles, (*notes, *assumed(tiles)), tuple(left_out))
+    return by_layer, notes, left_out
 
 
 def _rasters(
@@ -240,7 +220,8 @@ def _of_points(source: Path, file: layouts.Found, derived: Path, crs: str) -> di
     folder = derived / file.tile
     made = {path: path.stem.rpartition(".")[2] for path in sorted(folder.glob(f"{source.stem}.*.tif"))}
     if not made or not all(is_current(source, path) for path in made):
-        rasters, transform = rasters_of_points(source, _corner(file.tile))
+        east, north = map(float, file.tile.split("_"))
+        rasters, transform = rasters_of_points(source, (east, north))
         made = {}
         for name, heights in rasters.items():
             layer = file.layer if name == "z" else layouts.layer_of(name, layouts.OWN_NAMES)
@@ -248,31 +229,6 @@ def _of_points(source: Path, file: layouts.Found, derived: Path, crs: str) -> di
                 made[path := folder / f"{source.stem}.{layer}.tif"] = layer
                 write_heights(path, heights, transform, crs)
     return {path: replace(file, layer=layer) for path, layer in made.items()}
-
-
-def _corner(tile_id: str) -> tuple[float, float]:
-    east, north = map(float, tile_id.split("_"))
-    return east, north
-
-
-def _tiles(
-    root: Path,
-    by_layer: Mapping[str, Mapping[str, _MatchedFile]],
-    layout: Layout,
-    dataset: str,
-    date: datetime | None,
-) -> tuple[Tile, ...]:
-    return tuple(
-        _tile(
-            root,
-            tile_id,
-            {name: files[tile_id] for name, files in by_layer.items() if tile_id in files},
-            layout,
-            dataset,
-            date,
-        )
-        for tile_id in sorted(by_layer["dsm"])
-    )
 
 
 def _without_metres(root: Path, dsm: dict[str, _MatchedFile]) -> list[Skipped]:
@@ -348,7 +304,6 @@ def _tile(
     files: Mapping[str, _MatchedFile],
     layout: Layout,
     dataset: str,
-    date: datetime | None,
 ) -> Tile:
     dsm = files["dsm"].file
     layers = tuple(
@@ -362,15 +317,4 @@ def _tile(
     )
     stratum = next((match.stratum for match in files.values() if match.stratum), "")
     grid = Grid.covering(dsm.crs, dsm.bounds, dsm.cell)
-    return Tile(tile_id, grid, layers, str(root), *taken([dsm], date), stratum=stratum, dataset=dataset)
-
-
-def _lacking(tiles: Sequence[Tile], layout: Layout) -> list[str]:
-    """Return a note on each layer that has a template but no file for some tiles."""
-    notes = []
-    for name in layout.layers:
-        lacking = [tile.id for tile in tiles if tile.layer(name) is None]
-        if lacking:
-            share = f"{len(lacking)} of {len(tiles)} tiles"
-            notes.append(f"no {name} at {layout.layers[name]!r} for {share}: {some(lacking)}")
-    return notes
+    return Tile(tile_id, grid, layers, str(root), *taken([dsm]), stratum=stratum, dataset=dataset)

@@ -25,10 +25,7 @@ def contained(where: Location, home: Location) -> Location:
 
 
 def links_out(folder: Location, below: bool = False) -> Iterator[Path]:
-    """Yield the links in a folder that lead out of it; none if it does not exist.
-
-    - `below`: whether folders inside it are searched, too.
-    """
+    """Yield the links in a folder, with ``below`` also in folders inside it, that lead out of it."""
     if isinstance(folder, Path):
         yield from _links_out(folder, os.path.realpath(folder), below)
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from stat import S_ISREG
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 from uuid import uuid4
 
 from flexroad.catalog.errors import CatalogError
@@ -148,7 +148,9 @@ def stat(where: Location) -> FileStat | None:
         return file_stat(where)
     try:
         with named(where):
-            return _entry_stat(where.fs.info(where.path))
+            entry = where.fs.info(where.path)
+        is_file = entry["type"] == "file"
+        return FileStat(int(entry["size"]), str(entry["ETag"]).strip('"')) if is_file else None
     except FileNotFoundError:
         return None
 
@@ -186,10 +188,10 @@ def entries_of(folder: UPath) -> Iterator[tuple[str, FileStat]]:
     return _pages(folder, {"Delimiter": "/"})
 
 
-def _pages(folder: UPath, options: dict[str, str]) -> Iterator[tuple[str, FileStat]]:
+def _pages(folder: UPath, options: dict[str, str], start: str = "") -> Iterator[tuple[str, FileStat]]:
     bucket, _, key = folder.path.partition("/")
     prefix = f"{key.rstrip('/')}/" if key.strip("/") else ""
-    request = {"Bucket": bucket, "Prefix": prefix, **options}
+    request = {"Bucket": bucket, "Prefix": prefix + start, **options}
     while True:
         try:
             with named(folder):
@@ -235,9 +237,8 @@ def sidecars(where: UPath) -> set[str]:
 
     Calling this before GDAL opens a file saves a dozen requests for side-car files, which are rare.
     """
-    folder = where.parent
     with named(where):
-        return set(_files(folder, folder.fs.find(folder.path, prefix=f"{where.stem}.", detail=True)))
+        return {name for name, _ in _pages(where.parent, {"Delimiter": "/"}, f"{where.stem}.")}
 
 
 def exists(where: Location) -> bool:
@@ -333,20 +334,6 @@ def _scan(folder: Path, prefix: str) -> Iterator[tuple[str, FileStat]]:
                 with contextlib.suppress(FileNotFoundError):
                     stats = entry.stat()
                     yield name, FileStat(stats.st_size, stats.st_mtime_ns)
-
-
-def _files(folder: UPath, entries: dict[str, Any]) -> dict[str, FileStat]:
-    """Return the files among the entries of a bucket's list, by their names relative to the folder."""
-    start = len(folder.path.rstrip("/")) + 1
-    stats = {name[start:]: _entry_stat(entry) for name, entry in entries.items()}
-    return {name: stat for name, stat in stats.items() if name and stat}
-
-
-def _entry_stat(entry: dict[str, Any]) -> FileStat | None:
-    """Return the stat of a list entry, or None if it is not a file."""
-    if entry["type"] != "file":
-        return None
-    return FileStat(int(entry["size"]), str(entry["ETag"]).strip('"'))
 
 
 @contextlib.contextmanager

@@ -29,11 +29,6 @@ class ScratchFolder(tempfile.TemporaryDirectory[str]):
 
     Without `with` it is removed by `cleanup`, or when the process ends. In a parent folder, for outputs that
     are renamed or need much space, it is hidden, and those of processes that have ended are removed first.
-
-    Raises
-    ------
-    OSError
-        If it cannot be made.
     """
 
     def __init__(self, parent: Path | None = None) -> None:

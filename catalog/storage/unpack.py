@@ -8,7 +8,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.text import Notify, one_line, printable, write_reason
@@ -28,7 +27,6 @@ def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Pa
 
     A folder that is there is complete: it gets its name when all files are in it.
 
-    - `archive`: the zip file.
     - `sha256`: checksum of the published file.
     - `progress`: shows how far the checksum and the unpacking are.
     - `notify`: takes a line that says how much is unpacked where, or that the folder is there.
@@ -38,7 +36,7 @@ def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Pa
         notify(f"{target} is there and is read in place of {archive.name}; remove it to unpack anew")
         return target
     entries = _entries(archive)
-    size, free = sum(entry.file_size for entry in entries), _free(target.parent)
+    size, free = sum(entry.file_size for entry in entries), shutil.disk_usage(target.parent).free
     notify(f"{archive.name} unpacks to {size / GB:.2f} GB in {target}; {free / GB:.2f} GB are free")
     if size > free:
         raise CatalogError(
@@ -62,7 +60,6 @@ def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Pa
 
 
 def _entries(archive: Path) -> list[zipfile.ZipInfo]:
-    """Return the files of an archive, checked."""
     if archive.exists() and not archive.is_file():
         # To open a pipe would wait for a writer.
         raise CatalogError(f"{archive} is not a regular file; replace it by one")
@@ -96,8 +93,9 @@ def _check_sum(archive: Path, sha256: str, progress: Progress) -> None:
     digest = hashlib.sha256()
     try:
         with archive.open("rb") as file:
-            for chunk in _chunks(file, archive.stat().st_size, f"checksum of {archive.name} (MB)", progress):
-                digest.update(chunk)
+            number = -(-archive.stat().st_size // CHUNK_BYTES)
+            for _ in progress(range(number), f"checksum of {archive.name} (MB)", number):
+                digest.update(file.read(CHUNK_BYTES))
     except OSError as error:
         raise CatalogError(f"{archive} cannot be read: {error.strerror or error}") from error
     if digest.hexdigest() != sha256:
@@ -107,40 +105,24 @@ def _check_sum(archive: Path, sha256: str, progress: Progress) -> None:
         )
 
 
-def _chunks(file: BinaryIO, size: int, step: str, progress: Progress) -> Iterator[bytes]:
-    for _ in progress(range(-(-size // CHUNK_BYTES)), step, -(-size // CHUNK_BYTES)):
-        yield file.read(CHUNK_BYTES)
-
-
 def _extract(
     archive: Path, entries: list[zipfile.ZipInfo], part: Path, progress: Progress, size: int
 ) -> None:
     def written() -> Iterator[int]:
+        """Yield a number for each complete `CHUNK_BYTES`."""
+        done = 0
         for entry in entries:
             target = part / entry.filename
             target.parent.mkdir(parents=True, exist_ok=True)
             with opened.open(entry) as source, target.open("xb") as file:
                 while chunk := source.read(CHUNK_BYTES):
                     file.write(chunk)
-                    yield len(chunk)
+                    before, done = done, done + len(chunk)
+                    yield from range(before // CHUNK_BYTES, done // CHUNK_BYTES)
 
     try:
         with zipfile.ZipFile(archive) as opened:
-            for _ in progress(_whole(written()), f"unpacking {archive.name} (MB)", size // CHUNK_BYTES):
+            for _ in progress(written(), f"unpacking {archive.name} (MB)", size // CHUNK_BYTES):
                 pass
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError, ValueError) as error:
         raise CatalogError(f"{archive} is damaged: {one_line(error)}; download it again") from error
-
-
-def _whole(sizes: Iterator[int]) -> Iterator[int]:
-    """Yield once for each complete `CHUNK_BYTES` of some sizes."""
-    rest = 0
-    for size in sizes:
-        rest += size
-        while rest >= CHUNK_BYTES:
-            rest -= CHUNK_BYTES
-            yield 1
-
-
-def _free(folder: Path) -> int:
-    return shutil.disk_usage(folder).free

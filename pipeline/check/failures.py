@@ -13,10 +13,10 @@ from flexroad.catalog import Catalog, CatalogError, Layer, Tile
 from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.guard.rejected import InputRejected, head
-from flexroad.catalog.scan.cover import AS_TEXT, height_share
+from flexroad.catalog.guard.source_files import InputRejected, head
+from flexroad.catalog.scan.cell_values import AS_TEXT, height_share
 from flexroad.catalog.scan.rasters import heights_fault, quiet
-from flexroad.catalog.storage.listed_files import StatCache
+from flexroad.catalog.storage.buckets import StatCache
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.tile import HEIGHTS

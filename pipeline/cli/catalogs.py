@@ -13,10 +13,10 @@ from rich.console import Console
 
 from flexroad.catalog import Catalog, CatalogError, layouts
 from flexroad.catalog.allowlist import needed
-from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.sources import nrw, rasters, templates
 from flexroad.catalog.storage.unpack import unpack
 from flexroad.catalog.text import count
+from flexroad.catalog.tile import MIN_COVER
 from flexroad.catalog.tiling import Conversion, TilingResult
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, LazyGroup, group

@@ -60,17 +60,15 @@ def plan(
                 totals[node.stage, states[name]] += 1
             # Corners and edges are nodes of several tiles.
             counted |= {name} if node.border else set()
-        for line in _nodes(graph, states) if verbose else ():
-            say(line)
+        if verbose:
+            _say_nodes(graph, states, say)
     numbers = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
     say(f"{count(reasons.total(), 'tile')}: {numbers}")
     if todo and not run.config.cluster.needs_workers:
         tile_s = statistics.median(times) if times else None
         say(f"  {decision(len(todo), workers_of(workers or run.config.cluster.workers), tile_s)}")
-    for stage in (*STAGE_NAMES, BORDER):
-        counts = ", ".join(f"{n} {state}" for (name, state), n in sorted(totals.items()) if name == stage)
-        if counts:
-            say(f"  {stage:9}{counts}")
+    for line in _totals(totals):
+        say(line)
     for finding in expected_failures(todo, run.config, layers_read(run.config)):
         failing |= finding.failing
         say(f"warning: {finding.text}")
@@ -79,6 +77,14 @@ def plan(
     code, told = _verdict(len(failing), len(pending), len(run.catalog.skipped))
     say(told)
     return code
+
+
+def _totals(totals: Counter[tuple[str, str]]) -> Iterator[str]:
+    """Yield a line per stage with the number of its nodes in each state."""
+    for stage in (*STAGE_NAMES, BORDER):
+        counts = ", ".join(f"{n} {state}" for (name, state), n in sorted(totals.items()) if name == stage)
+        if counts:
+            yield f"  {stage:9}{counts}"
 
 
 def _verdict(failing: int, pending: int, skipped: int) -> tuple[int, str]:
@@ -121,12 +127,12 @@ def _state(node: Node, place: RunPlace, borders: dict[str, str]) -> str:
     return state
 
 
-def _nodes(graph: TileGraph, states: dict[str, str]) -> Iterator[str]:
-    """Yield a line per node of a tile: stage, fingerprint, state, inputs and variants."""
+def _say_nodes(graph: TileGraph, states: dict[str, str], say: Notify) -> None:
+    """Say a line per node of a tile: stage, fingerprint, state, inputs and variants."""
     users: dict[str, list[str]] = {}
     for variant, nodes in graph.variants.items():
         for name in (*nodes.values(), *graph.nodes[nodes["fit"]].frame):
             users.setdefault(name, []).append(variant)
     for name, node in graph.nodes.items():
         inputs = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in (*node.inputs, *node.frame)) or "files"
-        yield f"  {node.stage:9}{name[:8]}  {states[name]:7} <- {inputs}  ({', '.join(users[name])})"
+        say(f"  {node.stage:9}{name[:8]}  {states[name]:7} <- {inputs}  ({', '.join(users[name])})")

@@ -25,8 +25,8 @@ from flexroad.catalog.crs import bounds_in, transformer
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.index import PROJECTION, STAC_VERSION, datetime_text
+from flexroad.catalog.storage.buckets import atomic_file
 from flexroad.catalog.storage.paths import Location, remove, write
-from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import count
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import known_record, open_database, recorded

@@ -20,9 +20,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
+from flexroad.catalog.storage.buckets import StagedFile
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.storage.paths import Location, is_remote
-from flexroad.catalog.storage.staging import StagedFile
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import utc_now
 from flexroad.pipeline.worker.tile import TileResult

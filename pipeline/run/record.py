@@ -31,8 +31,8 @@ import yaml
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.allowlist import needed
 from flexroad.catalog.guard.source_files import source_stat
+from flexroad.catalog.storage.buckets import StatCache
 from flexroad.catalog.storage.links import links_out
-from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import (
     Location,
     absolute,

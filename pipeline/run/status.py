@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.listed_files import ListedFiles
+from flexroad.catalog.storage.buckets import ListedFiles
 from flexroad.catalog.storage.paths import FileStat, Location, entries, refresh
 from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
 from flexroad.pipeline.graph.sources import Stat

@@ -22,9 +22,9 @@ from dataclasses import asdict
 from hashlib import blake2b
 from typing import Any, BinaryIO
 
+from flexroad.catalog.storage.buckets import StagedFile
 from flexroad.catalog.storage.outputs import atomic_path, flush_path
 from flexroad.catalog.storage.paths import Location
-from flexroad.catalog.storage.staging import StagedFile
 from flexroad.pipeline.store.records import Failure, TileRecord, TileState
 
 NAME = "database.txt"

@@ -10,8 +10,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.storage.buckets import atomic_file
 from flexroad.catalog.storage.paths import Location, exists, read, remove
-from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import access_reason, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.store.records import LEVELS, Failure, MetricsRow

@@ -9,9 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from flexroad.catalog.crs import Unit, height_unit, is_projected, plan_unit
-from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
 from flexroad.catalog.text import count
-from flexroad.catalog.tile import Layer
+from flexroad.catalog.tile import HIGHEST_M, LOWEST_M, Layer
 from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.raster import RasterWindow
 from flexroad.tasks.types import Floats

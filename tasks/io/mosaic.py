@@ -15,7 +15,7 @@ from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.crs import bounds_in, in_plan, same, short
 from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.grid import FARTHEST, Bounds, overlap
-from flexroad.catalog.guard.kept_rasters import kept_raster
+from flexroad.catalog.guard.open_raster import kept_raster
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.catalog.tile import HEIGHTS, TOUCH_M

@@ -20,10 +20,8 @@ from rasterio.windows import Window
 
 from flexroad.catalog.crs import short
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.guard.kept_rasters import kept_raster
-from flexroad.catalog.guard.open_raster import ERRORS, has_own_blocks, open_raster
-from flexroad.catalog.guard.rejected import InputRejected, read_through
-from flexroad.catalog.guard.source_files import files_of
+from flexroad.catalog.guard.open_raster import ERRORS, has_own_blocks, kept_raster, open_raster
+from flexroad.catalog.guard.source_files import InputRejected, files_of, read_through
 from flexroad.catalog.scan.rasters import heights_fault
 from flexroad.catalog.scan.valid_cells import transparent
 from flexroad.catalog.storage.paths import Location, is_remote

@@ -28,9 +28,8 @@ from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.guard.open_vector import ERRORS, encoding_note, in_its_encoding, layer_info, vector_name
-from flexroad.catalog.guard.rejected import InputRejected
-from flexroad.catalog.guard.source_files import source_stat
-from flexroad.catalog.guard.spatial_index import has_complete_index
+from flexroad.catalog.guard.source_files import InputRejected, source_stat
+from flexroad.catalog.guard.vector_contents import has_complete_index
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.scan.vectors import bounds_of, listed
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import vertical
-from flexroad.catalog.guard.kept_rasters import kept_raster
+from flexroad.catalog.guard.open_raster import kept_raster
 from flexroad.catalog.scan.rasters import quiet
 from flexroad.tasks.io.raster import Unreadable, read_raster
 from flexroad.tasks.io.raster_header import header

@@ -17,7 +17,7 @@ import shapely
 
 from flexroad.catalog import Catalog, Grid, Tile
 from flexroad.catalog.scan import vectors
-from flexroad.catalog.sources import prepared
+from flexroad.tools.synthetic import prepared
 
 COLUMNS, ROWS, CELLS, CELL_M = 10, 2, 24, 5.0
 SIZE_M = CELLS * CELL_M

@@ -20,7 +20,7 @@ from pyproj.exceptions import ProjError
 from flexroad.catalog import LAYERS, Catalog, Tile
 from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import short, transformer
-from flexroad.catalog.scan.plateaus import plateau_notes
+from flexroad.catalog.scan.cell_values import plateau_notes
 from flexroad.catalog.storage.paths import Location, exists, read, remove, write
 from flexroad.catalog.text import count, write_reason
 from flexroad.catalog.tile import HEIGHTS

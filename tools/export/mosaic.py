@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from flexroad.catalog.crs import compound
 from flexroad.catalog.grid import MOST_CELLS, Bounds, Grid
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.storage.buckets import atomic_file
 from flexroad.catalog.storage.paths import Location, write
 from flexroad.catalog.storage.scratch import ScratchFolder
-from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import reason
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor

@@ -23,8 +23,8 @@ from typing import Any, Protocol
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.ids import safe_name
+from flexroad.catalog.storage.buckets import atomic_file
 from flexroad.catalog.storage.paths import Location, listing, parse_location, read, remove, stat, write
-from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds
 from flexroad.catalog.crs import in_plan, short
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.guard.rejected import InputRejected, head
-from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS
+from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, InputRejected, head
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import made_folder, output_file
 from flexroad.catalog.storage.paths import write

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog.guard.open_vector import GEOPACKAGES, SQLITE, vector_name
-from flexroad.catalog.guard.sqlite_contents import quoted
+from flexroad.catalog.guard.vector_contents import quoted
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift.features import (
     BATCH_BYTES,

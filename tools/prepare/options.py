@@ -17,7 +17,7 @@ import numpy as np
 
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.tile import MIN_COVER
 from flexroad.pipeline.config.options import INPUTS, RASTERS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import memory

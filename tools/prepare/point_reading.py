@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
 from flexroad.catalog import Bounds, CatalogError
-from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
-from flexroad.catalog.scan.point_clouds import CHUNK, Chunk, Cloud, chunks, survey_dates
-from flexroad.catalog.to_metres import MetricTransform
+from flexroad.catalog.scan.point_clouds import CHUNK, Chunk, Cloud, chunks
+from flexroad.catalog.tile import HIGHEST_M, LOWEST_M
+from flexroad.catalog.to_metres import Floats, MetricTransform
 from flexroad.pipeline.execute import Executor
 from flexroad.tools.prepare.options import check_extent
 from flexroad.tools.prepare.output import disk_errors, on_failure
@@ -30,6 +30,10 @@ from flexroad.tools.prepare.point_buckets import (
 
 Dates = tuple[datetime, datetime]
 """When the first and the last point were measured."""
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(seconds=10**9)
+"""The zero of adjusted standard GPS time (ASPRS LAS 1.4), without leap seconds."""
+FIRST_GPS = (datetime(1990, 1, 1, tzinfo=UTC) - GPS_EPOCH).total_seconds()
+WEEK_S = 604_800
 SHIFT, BYTE = 8, 255
 """Number of bits by which colours of 16 bits are moved to the right, and the greatest colour of 8 bits."""
 
@@ -170,7 +174,7 @@ def _read(job: _Job) -> _Part:
             plan, records = _records(chunk, job.frame, shift or 0)
         except CatalogError as error:
             raise CatalogError(f"{path}: {error}") from error
-        dates.append(None if chunk.gps is None else survey_dates(chunk.gps))
+        dates.append(None if chunk.gps is None else _survey_dates(chunk.gps))
         out_of_range += len(chunk.z) - len(records)
         if not len(records):
             continue
@@ -193,3 +197,17 @@ def _records(chunk: Chunk, frame: MetricTransform, shift: int) -> tuple[Integers
     if chunk.colour is not None:
         records["colour"] = np.minimum(chunk.colour[in_range] >> shift, BYTE)
     return np.stack([east, north]), records
+
+
+def _survey_dates(gps: Floats) -> Dates | None:
+    """Return the dates of the first and the last point, or None if no time can be one of a survey.
+
+    - `gps`: see `Chunk.gps`. Times of a week (0 to 604,800 s) are left out, as some files have them although
+      their header declares standard times; so are times before 1990 and in the future.
+    """
+    latest = (datetime.now(UTC) - GPS_EPOCH).total_seconds()
+    times = gps[np.isfinite(gps) & ((gps < 0) | (gps > WEEK_S)) & (gps > FIRST_GPS) & (gps < latest)]
+    if not len(times):
+        return None
+    first, last = (GPS_EPOCH + timedelta(seconds=float(time)) for time in (times.min(), times.max()))
+    return first, last

@@ -25,14 +25,13 @@ from rasterio.windows import Window
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
 from flexroad.catalog.crs import compound
 from flexroad.catalog.crs_checks import require_scale
-from flexroad.catalog.limits import MIN_COVER
-from flexroad.catalog.scan.cover import height_share
+from flexroad.catalog.scan.cell_values import height_share
 from flexroad.catalog.scan.rasters import opened, zoned
 from flexroad.catalog.scan.vectors import VectorFile, with_roads
 from flexroad.catalog.skipped import lines
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.text import some
-from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
+from flexroad.catalog.tile import HEIGHTS, MIN_COVER, ROAD_HEIGHT_BANDS
 from flexroad.catalog.tiling import cut
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, SerialExecutor

@@ -15,9 +15,9 @@ from flexroad.catalog.crs_checks import require_scale
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
-from flexroad.catalog.scan.mask_values import has_fractions, values_note
+from flexroad.catalog.scan.cell_values import has_fractions, values_note
 from flexroad.catalog.text import edges
+from flexroad.catalog.tile import HIGHEST_M, LOWEST_M
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.dsm_and_dtm import below_ground_note
 from flexroad.tasks.io.height_offset import offset_note

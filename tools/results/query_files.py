@@ -17,7 +17,7 @@ import shapely
 
 from flexroad.catalog.crs import in_plan, is_geographic, same, short
 from flexroad.catalog.guard.open_vector import ERRORS, encoding_note, in_its_encoding, vector_name
-from flexroad.catalog.guard.rejected import InputRejected
+from flexroad.catalog.guard.source_files import InputRejected
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import reason, shown
 from flexroad.pipeline.errors import ConfigError

@@ -14,7 +14,6 @@ import shapely
 from flexroad.catalog import Catalog, Grid, Layer, Tile
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.scan.vectors import opened, with_roads
-from flexroad.catalog.sources import prepared
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.errors import ConfigError
@@ -23,7 +22,7 @@ from flexroad.tasks.io.vectors import vector_date
 from flexroad.tools.prepare.from_mesh import POINTS, MeshOptions, prepare_mesh
 from flexroad.tools.prepare.options import PrepareOptions
 from flexroad.tools.prepare.output import on_failure
-from flexroad.tools.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
+from flexroad.tools.synthetic import SceneOptions, block, dsc3d, gerod, make_scene, prepared
 from flexroad.tools.synthetic.centrelines import CentreLine, centre_lines
 from flexroad.tools.synthetic.crossings import CrossingOptions, Crossings, make_crossings
 from flexroad.tools.synthetic.dsc3d import Place

@@ -10,16 +10,16 @@ import pytest
 import rasterio
 from rasterio.errors import RasterioError
 
-from flexroad.catalog.guard import kept_rasters
-from flexroad.catalog.guard.kept_rasters import kept_raster
-from flexroad.catalog.guard.rejected import InputRejected
+from flexroad.catalog.guard import open_raster
+from flexroad.catalog.guard.open_raster import kept_raster
+from flexroad.catalog.guard.source_files import InputRejected
 
 
 @pytest.fixture
 def kept(monkeypatch):
     """An empty set of open files."""
-    idle = kept_rasters._Idle()
-    monkeypatch.setattr(kept_rasters, "_idle", idle)
+    idle = open_raster._Idle()
+    monkeypatch.setattr(open_raster, "_idle", idle)
     return idle
 
 
@@ -38,8 +38,8 @@ def value_of(path):
 
 def test_file_that_is_read_twice_is_opened_once(kept, tmp_path, monkeypatch):
     path = write(tmp_path / "a.tif", 1)
-    opened, open_alone = [], kept_rasters.open_alone
-    monkeypatch.setattr(kept_rasters, "open_alone", lambda path: opened.append(path) or open_alone(path))
+    opened, open_alone = [], open_raster.open_alone
+    monkeypatch.setattr(open_raster, "open_alone", lambda path: opened.append(path) or open_alone(path))
     assert [value_of(path), value_of(path)] == [1, 1]
     assert opened == [path]
 
@@ -92,13 +92,13 @@ def test_damaged_file_is_not_kept(kept, tmp_path):
 
 
 def test_number_of_open_files_is_bounded(kept, tmp_path):
-    paths = [write(tmp_path / f"{i}.tif", i) for i in range(kept_rasters.MOST + 3)]
+    paths = [write(tmp_path / f"{i}.tif", i) for i in range(open_raster.MOST_KEPT + 3)]
     assert [value_of(path) for path in paths] == list(range(len(paths)))
     assert list(kept.files) == paths[3:]
     # Of the files written here: what earlier tests left open may be closed at any time.
     opened = [Path(file.path) for file in psutil.Process().open_files()]
     assert sorted(set(opened) & set(paths)) == sorted(paths[3:])
-    assert sum(path in paths for path in opened) == kept_rasters.MOST
+    assert sum(path in paths for path in opened) == open_raster.MOST_KEPT
 
 
 def test_file_that_is_in_use_is_opened_a_second_time(kept, tmp_path):

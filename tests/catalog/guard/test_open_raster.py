@@ -9,7 +9,7 @@ import pytest
 import rasterio
 
 from flexroad.catalog.guard.open_raster import open_raster
-from flexroad.catalog.guard.rejected import InputRejected
+from flexroad.catalog.guard.source_files import InputRejected
 from tests.make_rasters import UTM, write, write_xyz
 
 FLAT = np.full((32, 32), 7.0, np.float32)

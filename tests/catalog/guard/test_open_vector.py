@@ -15,7 +15,7 @@ from shapely import LineString
 
 from flexroad.catalog import CatalogError
 from flexroad.catalog.guard.open_vector import vector_name
-from flexroad.catalog.guard.rejected import InputRejected
+from flexroad.catalog.guard.source_files import InputRejected
 from flexroad.catalog.scan.vectors import opened
 from tests.make_rasters import UTM
 

@@ -10,7 +10,7 @@ from fsspec.registry import _registry
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.listed_files import StatCache
+from flexroad.catalog.storage.buckets import StatCache
 from flexroad.catalog.storage.paths import parse_location
 from tests.s3_server import Fault
 

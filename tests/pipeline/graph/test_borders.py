@@ -15,7 +15,7 @@ import rasterio
 
 from flexroad.catalog import Catalog, Grid, Layer, Tile
 from flexroad.catalog.borders import border_of
-from flexroad.catalog.sources import prepared, rasters
+from flexroad.catalog.sources import rasters
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.tile import REACH_M
 from flexroad.pipeline.config.loading import compose, load_config
@@ -29,6 +29,7 @@ from flexroad.tasks.border import ENDS, BorderStages
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import stage_module
 from flexroad.tasks.spline.lattice import Lattice
+from flexroad.tools.synthetic import prepared
 from flexroad.tools.synthetic.scenes import MADE, write_scenes
 
 PRODUCTION = load_config("production")

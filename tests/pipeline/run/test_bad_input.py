@@ -17,12 +17,12 @@ from affine import Affine
 from rasterio.warp import transform_bounds
 
 from flexroad.catalog import Catalog, Grid, Tile
-from flexroad.catalog.sources import prepared
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
+from flexroad.tools.synthetic import prepared
 from tests.command_line import PROCESS, Said, error_lines
 from tests.conftest import QUICK
 from tests.make_rasters import write

@@ -21,7 +21,7 @@ import rasterio
 from rasterio.merge import merge
 
 from flexroad.catalog import Catalog
-from flexroad.catalog.guard import kept_rasters, open_raster
+from flexroad.catalog.guard import open_raster
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.cli.dry_run import plan
 from flexroad.pipeline.config.loading import load_config
@@ -157,7 +157,7 @@ class absent_while_opened:
             finally:
                 hidden.rename(path)
 
-        self.patch = mock.patch.object(kept_rasters, "open_alone", opened)
+        self.patch = mock.patch.object(open_raster, "open_alone", opened)
 
     def __enter__(self):
         self.patch.start()
@@ -202,7 +202,7 @@ def test_raster_read_at_the_second_attempt_is_used(survey, scratch, tmp_path, mo
                 raise rasterio.errors.RasterioIOError("Read failed. See previous exception for details.")
         return plain(file)
 
-    monkeypatch.setattr(kept_rasters, "open_alone", opened)
+    monkeypatch.setattr(open_raster, "open_alone", opened)
     summary, _ = night(tmp_path / "run", catalog_of(survey))
     assert attempts
     assert summary.exit_code == 0

@@ -9,7 +9,7 @@ import rasterio
 from affine import Affine
 
 from flexroad.catalog import LAYERS, Catalog
-from flexroad.catalog.guard import kept_rasters
+from flexroad.catalog.guard import open_raster
 from flexroad.catalog.guard.open_raster import open_alone
 from flexroad.catalog.sources import rasters
 from flexroad.catalog.tile import faulty
@@ -130,7 +130,7 @@ def test_dsm_of_several_tiles_is_opened_once(tmp_path, monkeypatch):
         opened.append(path.name)
         return open_alone(path)
 
-    monkeypatch.setattr(kept_rasters, "open_alone", counted)
+    monkeypatch.setattr(open_raster, "open_alone", counted)
     assert not [
         f for f in expected_failures(catalog.tiles, load_config("paper"), ("dsm",)) if "height" in f.text
     ]

@@ -7,7 +7,6 @@ import pytest
 import rasterio
 
 from flexroad.catalog import Catalog
-from flexroad.catalog.sources.prepared import HEIGHTS, MASKS, PHOTO
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.load import Options, load
 from flexroad.tasks.roads.level_numbers import level_numbers
@@ -16,6 +15,7 @@ from flexroad.tools.synthetic import make_scene
 from flexroad.tools.synthetic.crossings import Crossings, make_crossings
 from flexroad.tools.synthetic.dsc3d import survey as survey_of_scenes
 from flexroad.tools.synthetic.gerod import survey
+from flexroad.tools.synthetic.prepared import HEIGHTS, MASKS, PHOTO
 from flexroad.tools.synthetic.scenes import write_scenes
 
 

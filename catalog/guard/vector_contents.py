@@ -1,7 +1,10 @@
-"""Checks of an SQLite file before GDAL sees it: views, computed columns, and stated numbers of features.
+"""Checks of what GDAL believes of a vector file: views, computed columns, numbers of features, and indexes.
 
-GDAL runs the queries of all views when it lists the layers, without any limit. Here each is run once by
-Python's SQLite, with limits. pyogrio reads as many features as the file states, and no more.
+GDAL runs the queries of all views of an SQLite file when it lists the layers, without any limit. Here each is
+run once by Python's SQLite, with limits. pyogrio reads as many features as the file states, and no more.
+
+GDAL does not return a feature that a spatial index lacks or has elsewhere. Programs leave such indexes that
+edit a GeoPackage without its triggers, or a Shapefile without the ``.qix`` beside it.
 """
 
 from __future__ import annotations
@@ -11,12 +14,18 @@ import json
 import re
 import shlex
 import sqlite3
+from collections.abc import Mapping
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
-from flexroad.catalog.guard.rejected import InputRejected
+import numpy as np
+
+from flexroad.catalog.grid import Bounds, union
+from flexroad.catalog.guard.source_files import InputRejected
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import FileStat
 from flexroad.catalog.text import one_line
 
@@ -78,7 +87,11 @@ def _fault(path: Path, state: FileStat) -> str:
                 "SELECT type, name FROM sqlite_master WHERE type IN ('table', 'view')"
             ).fetchall()
             for kind, name in names:
-                fault = _of_view(file, name, path, state) if kind == "view" else _of_table(file, name, path)
+                if kind == "table":
+                    fault = _of_table(file, name, path)
+                elif fault := _trial(file, name, STEPS + STEPS_PER_BYTE * state.size):
+                    remedy = _command(path, f"DROP VIEW {_bracketed(name)}")
+                    fault = f"{fault}; write its result to a table, or remove it: {remedy}"
                 if fault:
                     return fault
             return _of_counts(file, {name.lower() for kind, name in names if kind == "table"}, path)
@@ -119,16 +132,8 @@ def _of_counts(file: sqlite3.Connection, tables: set[str], path: Path) -> str:
     return ""
 
 
-def _of_view(file: sqlite3.Connection, name: str, path: Path, state: FileStat) -> str:
-    why = _trial(file, name, STEPS + STEPS_PER_BYTE * state.size)
-    if not why:
-        return ""
-    remedy = _command(path, f"DROP VIEW {_bracketed(name)}")
-    return f"has the view {name!r}, which {why}; write its result to a table, or remove it: {remedy}"
-
-
 def _trial(file: sqlite3.Connection, view: str, most_steps: int) -> str:
-    """Run the query of a view; return why it is not read, empty if it ends."""
+    """Run the query of a view; return that it is not read and why, empty if it ends."""
     others: list[str] = []
 
     def authorize(action: int, _: str | None, function: str | None, *__: str | None) -> int:
@@ -146,10 +151,12 @@ def _trial(file: sqlite3.Connection, view: str, most_steps: int) -> str:
             pass
     except sqlite3.Error as error:
         if others:
-            return f"calls the function {others[0]}"
+            return f"has the view {view!r}, which calls the function {others[0]}"
         if NO_ROWS.search(str(error)):
             return ""
-        return "does not end" if "interrupted" in str(error) else f"cannot be checked ({one_line(error)})"
+        endless = "interrupted" in str(error)
+        why = "does not end" if endless else f"cannot be checked ({one_line(error)})"
+        return f"has the view {view!r}, which {why}"
     finally:
         file.set_authorizer(None)
         file.set_progress_handler(None, 0)
@@ -164,3 +171,67 @@ def _command(path: Path, statement: str) -> str:
     """Return a shell command that changes an SQLite file; it needs nothing but Python."""
     connection = f"sqlite3.connect({json.dumps(str(path))}, isolation_level=None)"
     return f"python -c {shlex.quote(f'import sqlite3; {connection}.execute({json.dumps(statement)})')}"
+
+
+pyogrio = lazy("pyogrio")
+
+SQLITE = ("GPKG", "SQLite")
+"""GDAL's drivers of formats in SQLite."""
+EDITED = (*SQLITE, "ESRI Shapefile")
+"""Those of formats whose features programs change in place, so that index and bounds may be of other ones."""
+BOXES = np.dtype(
+    [("feature", np.int64), *((edge, np.float32) for edge in ("west", "east", "south", "north"))]
+)
+"""Rows of an R-tree of SQLite, which rounds boxes outwards."""
+
+
+def has_complete_index(file: str, info: Mapping[str, Any]) -> bool:
+    """Return whether each feature of a layer is in its index, within its box there.
+
+    - `info`: what pyogrio knows of the layer.
+    - result: also False of a view, whose index is the table's, and of a Shapefile: its index is not read
+      here.
+    """
+    if not info["capabilities"]["fast_spatial_filter"] or info["driver"] not in SQLITE:
+        return bool(info["capabilities"]["fast_spatial_filter"]) and info["driver"] not in EDITED
+    index = _boxes(Path(file.removeprefix("SQLITE:")), f"{info['layer_name']}_{info['geometry_name']}")
+    features, boxes = pyogrio.read_bounds(file, layer=info["layer_name"])
+    placed = np.isfinite(boxes).all(axis=0)
+    features, (west, south, east, north) = features[placed], boxes[:, placed]
+    order = np.argsort(index["feature"])
+    index = index[order]
+    at = np.searchsorted(index["feature"], features)
+    if at.size and at.max() >= index.size:
+        return False
+    found = index[at]
+    inside = (found["west"] <= west) & (found["south"] <= south)
+    inside &= (found["east"] >= east) & (found["north"] >= north)
+    return bool(((found["feature"] == features) & inside).all())
+
+
+def _boxes(path: Path, layer: str) -> np.ndarray[Any, Any]:
+    """Return the boxes of the R-tree of a table and column; none if there is no such one."""
+    names = f"rtree_{layer}".lower(), f"idx_{layer}".lower()
+    with opened(path) as data:
+        try:
+            tables = data.execute(
+                "SELECT name FROM sqlite_master WHERE lower(name) IN (?, ?)", names
+            ).fetchall()
+            return np.fromiter(data.execute(f"SELECT * FROM {quoted(tables[0][0])}"), BOXES)
+        except (sqlite3.Error, IndexError, ValueError):
+            return np.empty(0, BOXES)
+
+
+def real_bounds(file: str, info: Mapping[str, Any]) -> Bounds | None:
+    """Return the bounds of a layer with all of its features, None if it has none; `has_complete_index`."""
+    stated: Bounds | None = info["total_bounds"]
+    if info["driver"] not in EDITED:
+        return stated
+    _, boxes = pyogrio.read_bounds(file, layer=info["layer_name"])
+    boxes = boxes[:, np.isfinite(boxes).all(axis=0)]
+    if not boxes.size:
+        return stated
+    west, south = map(float, boxes[:2].min(axis=1))
+    east, north = map(float, boxes[2:].max(axis=1))
+    real = west, south, east, north
+    return union([real, stated]) if stated else real

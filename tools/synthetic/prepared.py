@@ -138,17 +138,12 @@ def _check(name: str, array: NDArray[Any], grid: Grid, tile_id: str) -> None:
         raise CatalogError(f"layer {name} of tile {tile_id} is {array.shape}, but its grid is {grid.shape}")
 
 
-def _bands(name: str, array: NDArray[Any]) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Return the bands of a file, ``(bands, H, W)``, and its creation options."""
-    if name == PHOTO:
-        return array, {"photometric": "RGB", "interleave": "pixel", "predictor": 2}
-    if name in HEIGHTS:
-        return array.astype(np.float32)[None], {"nodata": np.nan, "predictor": 3}
-    return (array != 0).astype(np.uint8)[None], {}
-
-
 def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping[str, str]) -> None:
-    bands, profile = _bands(name, array)
+    bands, profile = (array != 0).astype(np.uint8)[None], dict[str, Any]()
+    if name == PHOTO:
+        bands, profile = array, {"photometric": "RGB", "interleave": "pixel", "predictor": 2}
+    elif name in HEIGHTS:
+        bands, profile = array.astype(np.float32)[None], {"nodata": np.nan, "predictor": 3}
     count, height, width = bands.shape
     if name == PHOTO:
         grid = Grid(grid.crs, grid.west, grid.north, grid.width * grid.cell / width, width, height)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.listed_files import ListedFiles, StatCache
+from flexroad.catalog.storage.buckets import ListedFiles, StatCache
 from flexroad.catalog.storage.paths import FileStat
 
 PAGE, PAGES = 1000, 100

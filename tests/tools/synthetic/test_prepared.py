@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog import Catalog, CatalogError, Grid
-from flexroad.catalog.sources.prepared import with_neighbours, write_tile
 from flexroad.tasks.load import Options, load
+from flexroad.tools.synthetic.prepared import with_neighbours, write_tile
 
 GRID = Grid("EPSG:25832", 500_000.0, 5_600_250.0, 1.0, 25, 20)
 TAKEN = datetime(2024, 5, 1, 12, 30, tzinfo=timezone(timedelta(hours=2)))

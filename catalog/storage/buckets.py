@@ -1,15 +1,23 @@
-"""Files of buckets by folder and name, as listed: millions of them in a temporary database, not in memory."""
+"""Lists of the files in buckets, and local copies of files that grow, change in place, or are large.
+
+Millions of listed files are in a temporary database, not in memory. A bucket stores only complete files, so
+files that grow are written locally and uploaded. On disk the staged file is the file itself.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import sqlite3
 import tempfile
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from flexroad.catalog.storage.paths import FileStat, Location, entries_of, stat
+from flexroad.catalog.storage.outputs import atomic_path
+from flexroad.catalog.storage.paths import FileStat, Location, entries_of, read, stat, write
+from flexroad.catalog.storage.scratch import ScratchFolder
 
 
 class ListedFiles:
@@ -71,3 +79,67 @@ class StatCache:
         if where not in self._files:
             self._files[where] = stat(where)
         return self._files[where]
+
+
+PUT_S = 60.0
+"""Shortest time between two uploads (s)."""
+
+
+class StagedFile:
+    """A local copy of a file in a bucket that is uploaded from time to time.
+
+    Its `path` is the local file to read and write. Unless it is ``writable``, changes are not uploaded.
+    """
+
+    def __init__(self, where: Location, writable: bool = True) -> None:
+        self.where = where
+        self.writable = writable
+        self._folder: ScratchFolder | None = None
+        if isinstance(where, Path):
+            self.path = where
+        else:
+            self._folder = ScratchFolder()
+            self.path = Path(self._folder.name) / where.name
+        self._put = time.monotonic()
+        self._pause = PUT_S
+
+    def fetch(self) -> None:
+        """Download the file; do nothing if it does not exist."""
+        if self._folder:
+            with contextlib.suppress(FileNotFoundError):
+                self.path.write_bytes(read(self.where))
+
+    def sync_if_due(self) -> None:
+        """Upload the file if the last upload is long enough ago."""
+        if self._folder and time.monotonic() - self._put > self._pause:
+            self.put()
+
+    def put(self) -> None:
+        """Upload the file."""
+        if self.writable and self._folder and self.path.exists():
+            start = time.monotonic()
+            write(self.where, self.path.read_bytes())
+            self._put = time.monotonic()
+            # A run database may be large: spend at most a twentieth of the time on uploads.
+            self._pause = max(PUT_S, 20 * (self._put - start))
+
+    def close(self) -> None:
+        """Delete the local copy."""
+        if self._folder:
+            self._folder.cleanup()
+
+
+@contextlib.contextmanager
+def atomic_file(where: Location, flushed: bool = False) -> Iterator[Path]:
+    """Yield a local file to write; at the end of the block, move or upload it to ``where``.
+
+    With ``flushed`` the content is on the disk before the file has its name.
+    """
+    if not isinstance(where, Path):
+        with ScratchFolder() as folder:
+            local = Path(folder) / where.name
+            yield local
+            write(where, local.read_bytes())
+        return
+    with atomic_path(where, flushed) as temporary:
+        yield temporary
