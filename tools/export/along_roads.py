@@ -29,9 +29,12 @@ from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.export import opencrg, opendrive
 from flexroad.tools.export import reference_line as lines
-from flexroad.tools.export.along_line import (
+from flexroad.tools.export.georeference import LocalFrame
+from flexroad.tools.export.network import Network, network
+from flexroad.tools.export.profiles import (
     HeightAt,
     HeightGrid,
+    Profiles,
     across,
     elevation_error,
     grid_error,
@@ -41,21 +44,18 @@ from flexroad.tools.export.along_line import (
     profile_error,
     profiles,
 )
-from flexroad.tools.export.local_frame import LocalFrame
-from flexroad.tools.export.network import Network, network
-from flexroad.tools.export.pieces import (
+from flexroad.tools.export.reference_line import ReferenceLine
+from flexroad.tools.export.source import Options, Source
+from flexroad.tools.export.tile_outputs import (
     MARKERS,
     SMOOTH,
     Encode,
-    Piece,
-    Row,
+    ManifestRow,
+    TileOutput,
     steps_left_out,
-    write_pieces,
+    write_outputs,
     write_whole,
 )
-from flexroad.tools.export.profiles import Profiles
-from flexroad.tools.export.reference_line import ReferenceLine
-from flexroad.tools.export.source import Options, Source
 
 VERSION = 8
 """Of the roads themselves: their division, lines, grids and errors."""
@@ -194,7 +194,7 @@ def write_crg(
     """Write an OpenCRG file per road and the report; return the summary."""
     roads = network(source, options)
     work = Work(roads.frame, source.vertical)
-    rows, _ = write_units(opencrg.VERSION, crg_piece, work, roads, tiles, folder, executor)
+    rows, _ = write_units(opencrg.VERSION, crg_output, work, roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
     error, steps = summary["crg_max_mm"], steps_left_out(_metres(summary["crg_steps_max_mm"]))
     surface = SMOOTH if steps else "the surface"
@@ -209,7 +209,7 @@ def write_xodr(
     roads = network(source, options)
     crg = "../crg/" if "crg" in options.formats else None
     work = Work(roads.frame, source.vertical, options.left_hand, crg)
-    rows, key = write_units(opendrive.VERSION, xodr_piece, work, roads, tiles, folder, executor)
+    rows, key = write_units(opendrive.VERSION, xodr_output, work, roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
     edges = np.array([road["bounds"] for row in rows for road in row["roads"]])
     bounds = (*edges[:, :2].min(axis=0), *edges[:, 2:].max(axis=0))
@@ -248,7 +248,7 @@ def write_units(
     tiles: Iterable[FinishedTile],
     folder: Location,
     executor: Executor,
-) -> tuple[list[Row], str]:
+) -> tuple[list[ManifestRow], str]:
     """Write the files of each route; return their rows, in order, and a fingerprint of all of them."""
     whole = sha256(f"{version} {VERSION} {work}".encode())
 
@@ -258,11 +258,11 @@ def write_units(
             yield unit
 
     versions = version * 1000 + VERSION
-    rows = write_pieces(counted(), folder, versions, encode, work, executor)
+    rows = write_outputs(counted(), folder, versions, encode, work, executor)
     return sorted(rows, key=lambda row: int(row["route"])), whole.hexdigest()
 
 
-def crg_piece(unit: RouteUnit, work: Work) -> Piece:
+def crg_output(unit: RouteUnit, work: Work) -> TileOutput:
     """Return the OpenCRG files of a route."""
     roads, problem = _roads(unit, work)
     heights = work.vertical or "as in the run"
@@ -273,10 +273,10 @@ def crg_piece(unit: RouteUnit, work: Work) -> Piece:
         )
         for road, grid, _, _ in roads
     }
-    return Piece(files, _route_row(unit, roads, problem))
+    return TileOutput(files, _route_row(unit, roads, problem))
 
 
-def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
+def xodr_output(unit: RouteUnit, work: Work) -> TileOutput:
     """Return the roads of a route as XML of OpenDRIVE."""
     roads, problem = _roads(unit, work)
     texts = list[bytes]()
@@ -286,14 +286,14 @@ def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
         texts.append(
             opendrive.encode(opendrive.Road(str(road), grid.line, fitted, crg, decks), work.left_hand)
         )
-    return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, roads, problem))
+    return TileOutput({_fragment(unit.number): b"".join(texts)}, _route_row(unit, roads, problem))
 
 
 def _fragment(route: int) -> str:
     return f"{MARKERS}/{route}.xml"
 
 
-def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Profiles, Row]], str]:
+def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Profiles, ManifestRow]], str]:
     """Return numbers, grids, profiles and rows of a route's roads, and why it has none."""
     height, step = unit.height(work), unit.step(work)
     line, problem = reference_line(unit)
@@ -317,7 +317,9 @@ def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
     return line, f"shorter than {options.min_length_m:g} m" if line is None else ""
 
 
-def _route_row(unit: RouteUnit, roads: list[tuple[int, HeightGrid, Profiles, Row]], problem: str) -> Row:
+def _route_row(
+    unit: RouteUnit, roads: list[tuple[int, HeightGrid, Profiles, ManifestRow]], problem: str
+) -> ManifestRow:
     if not roads and not problem:
         problem = "no part of it has a surface for long enough"
     return {"route": unit.number, "roads": [row for *_, row in roads], "problem": problem}
@@ -325,7 +327,7 @@ def _route_row(unit: RouteUnit, roads: list[tuple[int, HeightGrid, Profiles, Row
 
 def row(
     road: int, grid: HeightGrid, height: HeightAt, step: HeightAt, fitted: Profiles, tile_step: float
-) -> Row:
+) -> ManifestRow:
     """Return a road's row of the report.
 
     - `height`, `step`: the surface without steps, and how much higher that with steps is, in the line's
@@ -375,7 +377,7 @@ def _metres(length_mm: float | None) -> float | None:
     return None if length_mm is None else length_mm / 1000
 
 
-def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
+def report(folder: Location, rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
     """Write the report of the roads, if it is new; return the summary for the manifest."""
     every = [road for row in rows for road in row["roads"]]
     if not every:
@@ -390,7 +392,7 @@ def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
     }
 
 
-def tile_faults(roads: list[Row]) -> list[str]:
+def tile_faults(roads: list[ManifestRow]) -> list[str]:
     """Return a line that names the roads on tiles that do not meet; empty if all tiles do."""
     name = "tile_steps_max_mm"
     apart = sorted((road for road in roads if road[name] > 1000 * LARGEST_M), key=lambda road: -road[name])
@@ -406,7 +408,7 @@ def tile_faults(roads: list[Row]) -> list[str]:
     return [f"{count(len(apart), 'road')} {verb} on tiles that do not meet ({listed}{more})"]
 
 
-def lane_notes(rows: list[Row]) -> list[str]:
+def lane_notes(rows: list[ManifestRow]) -> list[str]:
     """Return notes on roads with lanes of unusual width, and on those divided into lanes by their width."""
     every = [road for row in rows for road in row["roads"]]
     assumed = [road for road in every if road["lanes_assumed"]]
@@ -423,13 +425,13 @@ def lane_notes(rows: list[Row]) -> list[str]:
     return notes
 
 
-def _has_unusual_lanes(road: Row) -> bool:
+def _has_unusual_lanes(road: ManifestRow) -> bool:
     """Return whether lanes are too wide, or several too narrow."""
     width = road["width_m"] / road["lanes"]
     return bool(width > opendrive.WIDEST_M or (road["lanes"] > 1 and width < opendrive.NARROWEST_M))
 
 
-def totals(rows: list[Row], roads: Network) -> dict[str, Any]:
+def totals(rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
     """Return number, length and flags of the roads, and what was left out of centre lines on the tiles."""
     length = sum(road["length_m"] for row in rows for road in row["roads"])
     flagged = {str(road["id"]): road["flags"] for row in rows for road in row["roads"] if road["flags"]}
@@ -460,7 +462,7 @@ def write_new(where: Location, data: bytes) -> None:
         write(where, data)
 
 
-def _table(rows: list[Row]) -> bytes:
+def _table(rows: list[ManifestRow]) -> bytes:
     file = io.StringIO(newline="")
     if rows:
         table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
@@ -469,15 +471,15 @@ def _table(rows: list[Row]) -> bytes:
     return file.getvalue().encode()
 
 
-def _known(roads: list[Row], key: str) -> list[Row]:
+def _known(roads: list[ManifestRow], key: str) -> list[ManifestRow]:
     return [road for road in roads if road[key] is not None]
 
 
-def _largest(roads: list[Row], key: str) -> float | None:
+def _largest(roads: list[ManifestRow], key: str) -> float | None:
     return max((road[key] for road in _known(roads, key)), default=None)
 
 
-def _mean(roads: list[Row], key: str) -> float | None:
+def _mean(roads: list[ManifestRow], key: str) -> float | None:
     """Return the mean over the length of the roads."""
     known = _known(roads, key)
     length = sum(road["length_m"] for road in known)

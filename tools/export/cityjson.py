@@ -20,7 +20,6 @@ from flexroad.tasks.types import Mesh
 
 VERSION = 1
 NAME = ".city.jsonl"
-MEDIA_TYPE = "application/city+json-seq"
 
 SCALE_M = 0.001
 """Unit of the vertices (m): a coordinate is exact to half of it."""

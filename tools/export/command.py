@@ -23,7 +23,7 @@ from flexroad.pipeline.run.progress import StepProgress
 from flexroad.pipeline.run.tile_steps import REMEDY
 from flexroad.tools.export.driver import check_formats
 from flexroad.tools.export.driver import export as write
-from flexroad.tools.export.ellipsoidal import Datum
+from flexroad.tools.export.georeference import Datum
 from flexroad.tools.export.source import Options, select
 
 app = group()

@@ -34,7 +34,6 @@ from flexroad.tasks.types import Bools, Floats, Mesh
 VERSION = 1
 NAME = ".xml"
 NAME_COMPRESSED = ".xml.gz"
-MEDIA_TYPE = "application/xml"
 
 DECIMALS = 4
 """Decimals of coordinates (m): they are rounded to 0.05 mm."""

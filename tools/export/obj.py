@@ -22,10 +22,6 @@ VERSION = 2
 NAME = ".obj"
 NAME_MATERIALS = ".mtl"
 NAME_TEXTURE = ".jpg"
-NAME_SIDECAR = "_obj.json"
-NAME_PRJ = ".prj"
-MEDIA_TYPE = "model/obj"
-MEDIA_TYPE_MATERIALS = "model/mtl"
 
 AXES = "x east, y north, relative to origin; z height; metres"
 DECIMALS = 4

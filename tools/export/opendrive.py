@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 VERSION = 3
 NAME = ".xodr"
-MEDIA_TYPE = "application/xml"
 
 # CARLA and esmini read no <offset>: x and y are those of the projection.
 HEADER = """\
@@ -75,7 +74,7 @@ def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, nam
     """Write roads, one after the other, to a file.
 
     - `roads`: roads with different ids, each of `encode`.
-    - `proj`: the roads' coordinate system as a PROJ string (`tools.export.local_frame.LocalFrame.proj`).
+    - `proj`: the roads' coordinate system as a PROJ string (`tools.export.georeference.LocalFrame.proj`).
     - `bounds`: west, south, east and north of the roads (m, in that system).
     - `name`: name of the database.
     """

@@ -32,8 +32,7 @@ from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.products.glb import Texture
 from flexroad.tools.export.aerial import Aerial
-from flexroad.tools.export.ellipsoidal import Datum
-from flexroad.tools.export.georeference import Georeference
+from flexroad.tools.export.georeference import Datum, Georeference
 
 Image = lazy("PIL.Image")
 

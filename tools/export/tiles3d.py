@@ -17,11 +17,9 @@ import numpy as np
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.types import Floats
-from flexroad.tools.export.ellipsoidal import Ellipsoidal, geocentric
+from flexroad.tools.export.georeference import Ellipsoidal, geocentric
 
 VERSION = 3
-NAME = ".json"
-MEDIA_TYPE = "application/json"
 ASSET = {"version": "1.1", "generator": "FlexRoad"}
 MARGIN_M = 1.0
 """Height added below and above a tile's box (m): bounding volumes must contain all vertices."""

@@ -23,13 +23,12 @@ from flexroad.tasks.options import Options
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.centrelines import MAIN, MARGIN_M, SIDE, CentreLine
 from flexroad.tools.synthetic.network import Plan
-from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.objects import Car, Crown
-from flexroad.tools.synthetic.options import SOUTH_M, WEST_M
 from flexroad.tools.synthetic.population import Objects, Trace
 from flexroad.tools.synthetic.scene import DTM_BLUR_M, Scene, terrain_model
 from flexroad.tools.synthetic.spoilers import Canvas, surface_model
 from flexroad.tools.synthetic.surfaces import CROSSFALL, Relief, relief, smoothstep
+from flexroad.tools.synthetic.world import SOUTH_M, WEST_M, generator
 
 SPACING_M = 200.0
 """Distance between the crossings of the main road (m)."""

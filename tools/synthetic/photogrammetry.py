@@ -13,9 +13,9 @@ from flexroad.catalog.lazy import lazy
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.prepare.mesh.sample import TexturedMesh
 from flexroad.tools.synthetic.dsc3d import Place, Reconstruction, reconstruct
-from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.orthophoto import orthophoto
 from flexroad.tools.synthetic.scene import Scene, make_scene
+from flexroad.tools.synthetic.world import generator
 
 PIL = lazy("PIL")
 pv = lazy("pyvista")

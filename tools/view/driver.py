@@ -41,9 +41,9 @@ from flexroad.tasks.roads.rasterise import Options as RoadOptions
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats
-from flexroad.tools.export.centre_lines import read_centre_lines
-from flexroad.tools.export.pieces import Piece, write_pieces
+from flexroad.tools.export.network import read_centre_lines
 from flexroad.tools.export.source import TileItem, layer_state
+from flexroad.tools.export.tile_outputs import TileOutput, write_outputs
 from flexroad.tools.view import encoding
 
 shapely = lazy("shapely")
@@ -113,7 +113,7 @@ def write_viewer(
     look = Look(run.origin, roads)
     finished = track(_finished(run, done, variant), "writing tiles", len(done))
     with ended(finished):
-        rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
+        rows = list(write_outputs(finished, out, VERSION, script, look, executor))
     for file in built_files():
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())
@@ -289,7 +289,7 @@ class Look:
     """Selection of the road lines."""
 
 
-def piece(item: TileItem, look: Look) -> Piece:
+def script(item: TileItem, look: Look) -> TileOutput:
     """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks."""
     tile = item.tile
     source, notes = tile.tile, list[str]()
@@ -325,7 +325,7 @@ def piece(item: TileItem, look: Look) -> Piece:
         _lines(source, look.roads, notes),
     )
     name = f"tiles/{safe_name(tile.id)}{encoding.NAME_TILE}"
-    return Piece(
+    return TileOutput(
         {name: encoding.encode_tile(scene)},
         {"tile": tile.id, "notes": notes, "picture": seen, "places": places},
     )

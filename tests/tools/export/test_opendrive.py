@@ -11,7 +11,7 @@ import pytest
 from flexroad.tasks.levels.along_route import Structure
 from flexroad.tasks.roads.routes import CentreLine, Route
 from flexroad.tools.export import opendrive
-from flexroad.tools.export.along_line import HeightAt, elevation_error, height_grid, profile_error, profiles
+from flexroad.tools.export.profiles import HeightAt, elevation_error, height_grid, profile_error, profiles
 from flexroad.tools.export.reference_line import Options as LineOptions
 from flexroad.tools.export.reference_line import ReferenceLine, reference_line
 from tests.read_opendrive import numbers, plan, polynomial, quality_issues

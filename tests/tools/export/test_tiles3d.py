@@ -11,7 +11,7 @@ from pyproj import Transformer
 
 from flexroad.tasks.meshing.relief import Relief, sheet
 from flexroad.tasks.products import glb
-from flexroad.tools.export.ellipsoidal import Datum, Ellipsoidal, geocentric
+from flexroad.tools.export.georeference import Datum, Ellipsoidal, geocentric
 from flexroad.tools.export.tiles3d import (
     around,
     east_north_up,

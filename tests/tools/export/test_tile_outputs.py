@@ -5,7 +5,7 @@ import json
 import pytest
 
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.tools.export import cityjson, landxml, pieces
+from flexroad.tools.export import cityjson, landxml, tile_outputs
 from flexroad.tools.export.driver import BEGUN, export
 from flexroad.tools.export.source import Options, select
 
@@ -18,13 +18,13 @@ each = pytest.mark.parametrize("name", JOINED)
 @pytest.fixture
 def encoded(monkeypatch):
     """The ids of the tiles that workers have encoded."""
-    ids, write = [], pieces._write
+    ids, write = [], tile_outputs._write
 
     def noted(job):
         ids.append(job.tile.id)
         return write(job)
 
-    monkeypatch.setattr(pieces, "_write", noted)
+    monkeypatch.setattr(tile_outputs, "_write", noted)
     return ids
 
 
@@ -74,7 +74,7 @@ def test_whole_file_is_written_once_and_replaces_one_of_another_name(tmp_path):
 
     for name in ("first.xodr", "first.xodr", "second.xodr"):
         (tmp_path / "xodr").mkdir(exist_ok=True)
-        pieces.write_whole(tmp_path / "xodr" / name, "key", {}, fill)
+        tile_outputs.write_whole(tmp_path / "xodr" / name, "key", {}, fill)
     assert len(filled) == 2
     assert [path.name for path in (tmp_path / "xodr").iterdir()] == ["second.xodr"]
 
@@ -103,7 +103,7 @@ def test_parts_of_an_interrupted_export_are_used(made_city, tmp_path, name, enco
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(pieces, "atomic_file", interrupted)
+        patch.setattr(tile_outputs, "atomic_file", interrupted)
         with pytest.raises(KeyboardInterrupt):
             write(made_city, tmp_path, name)
     assert encoded == list(made_city.done)

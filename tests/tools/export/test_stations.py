@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from flexroad.tasks.roads.routes import CentreLine, Route
-from flexroad.tools.export.along_line import stations
 from flexroad.tools.export.reference_line import Options, ReferenceLine, reference_line
+from flexroad.tools.export.road_lines import stations
 
 
 def line(*points: tuple[float, float], width: float = 6.0) -> ReferenceLine:
