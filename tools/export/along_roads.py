@@ -67,7 +67,6 @@ SUMMARY = (
 )
 """Errors in the summary: means over the length of the roads, largest ones over all."""
 REPORT = "roads.csv"
-NO_ROAD = "no road lies on the tiles"
 MOST_NAMED = 3
 """Number of roads that a message names."""
 SHOWN_M = 10.0
@@ -122,14 +121,6 @@ class RouteUnit:
         """The surfaces of its tiles."""
         return TileSampler(self.tiles)
 
-    def height(self, work: Work) -> HeightAt:
-        """Return the surface without steps in the local frame."""
-        return self._local(work, steps=False)
-
-    def step(self, work: Work) -> HeightAt:
-        """Return the height of the surface with steps above it, in the local frame."""
-        return self._local(work, steps=True)
-
     def tile_step(self, line: ReferenceLine, v: Floats, inside: Bools, work: Work) -> float:
         """Return the largest step between the tiles below a road (m); 0 on one tile.
 
@@ -157,7 +148,8 @@ class RouteUnit:
     def _levels(self) -> RouteLevels | None:
         return RouteLevels.of(self.route)
 
-    def _local(self, work: Work, steps: bool) -> HeightAt:
+    def height(self, work: Work, steps: bool = False) -> HeightAt:
+        """Return, in the local frame, the surface without steps, or how much higher the one with steps is."""
         return lambda x, y: self.sampler.on_road(*work.frame.to_run(x, y), self.levels(x, y), steps)
 
     def flags(self, line: ReferenceLine, work: Work) -> str:
@@ -258,8 +250,12 @@ def write_units(
             yield unit
 
     versions = version * 1000 + VERSION
-    rows = write_outputs(counted(), folder, versions, encode, work, executor)
-    return sorted(rows, key=lambda row: int(row["route"])), whole.hexdigest()
+    outputs = write_outputs(counted(), folder, versions, encode, work, executor)
+    rows = sorted(outputs, key=lambda row: int(row["route"]))
+    if not any(row["roads"] for row in rows):
+        why = f"no road could be written: {rows[0]['problem']}, and so on" if rows else None
+        raise ConfigError(why or "no road lies on the tiles")
+    return rows, whole.hexdigest()
 
 
 def crg_output(unit: RouteUnit, work: Work) -> TileOutput:
@@ -273,7 +269,7 @@ def crg_output(unit: RouteUnit, work: Work) -> TileOutput:
         )
         for road, grid, _, _ in roads
     }
-    return TileOutput(files, _route_row(unit, roads, problem))
+    return TileOutput(files, route_row(unit, [row for *_, row in roads], problem))
 
 
 def xodr_output(unit: RouteUnit, work: Work) -> TileOutput:
@@ -283,10 +279,10 @@ def xodr_output(unit: RouteUnit, work: Work) -> TileOutput:
     for road, grid, fitted, _ in roads:
         crg = None if work.crg is None else f"{work.crg}{road}{opencrg.NAME}"
         decks = structures(unit.levels_on(grid.line.x, grid.line.y), grid.line.s)
-        texts.append(
-            opendrive.encode(opendrive.Road(str(road), grid.line, fitted, crg, decks), work.left_hand)
-        )
-    return TileOutput({_fragment(unit.number): b"".join(texts)}, _route_row(unit, roads, problem))
+        texts.append(opendrive.encode(str(road), grid.line, fitted, crg, decks, work.left_hand))
+    return TileOutput(
+        {_fragment(unit.number): b"".join(texts)}, route_row(unit, [row for *_, row in roads], problem)
+    )
 
 
 def _fragment(route: int) -> str:
@@ -295,7 +291,7 @@ def _fragment(route: int) -> str:
 
 def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Profiles, ManifestRow]], str]:
     """Return numbers, grids, profiles and rows of a route's roads, and why it has none."""
-    height, step = unit.height(work), unit.step(work)
+    height, step = unit.height(work), unit.height(work, steps=True)
     line, problem = reference_line(unit)
     parts = [] if line is None else lines.usable(line, height(line.x, line.y), lines.Options())
     roads = []
@@ -317,12 +313,11 @@ def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
     return line, f"shorter than {options.min_length_m:g} m" if line is None else ""
 
 
-def _route_row(
-    unit: RouteUnit, roads: list[tuple[int, HeightGrid, Profiles, ManifestRow]], problem: str
-) -> ManifestRow:
+def route_row(unit: RouteUnit, roads: list[ManifestRow], problem: str) -> ManifestRow:
+    """Return the row of a route: its roads, and why it has none."""
     if not roads and not problem:
         problem = "no part of it has a surface for long enough"
-    return {"route": unit.number, "roads": [row for *_, row in roads], "problem": problem}
+    return {"route": unit.number, "roads": roads, "problem": problem}
 
 
 def row(
@@ -380,11 +375,15 @@ def _metres(length_mm: float | None) -> float | None:
 def report(folder: Location, rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
     """Write the report of the roads, if it is new; return the summary for the manifest."""
     every = [road for row in rows for road in row["roads"]]
-    if not every:
-        raise ConfigError(f"no road could be written: {rows[0]['problem']}, and so on" if rows else NO_ROAD)
-    write_new(
-        folder / REPORT, _table([{k: v for k, v in road.items() if k not in INTERNAL} for road in every])
-    )
+    text = io.StringIO(newline="")
+    columns = [name for name in every[0] if name not in INTERNAL]
+    table = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    table.writeheader()
+    table.writerows({name: no_formula(value) for name, value in road.items()} for road in every)
+    data, file = text.getvalue().encode(), folder / REPORT
+    known = stat(file)
+    if known is None or known.size != len(data) or read(file) != data:
+        write(file, data)
     return {
         **totals(rows, roads),
         **{name: (_mean if "_mean_" in name else _largest)(every, name) for name in SUMMARY},
@@ -412,7 +411,12 @@ def lane_notes(rows: list[ManifestRow]) -> list[str]:
     """Return notes on roads with lanes of unusual width, and on those divided into lanes by their width."""
     every = [road for row in rows for road in row["roads"]]
     assumed = [road for road in every if road["lanes_assumed"]]
-    unusual = [road for road in every if _has_unusual_lanes(road)]
+    lane_m = [road["width_m"] / road["lanes"] for road in every]
+    unusual = [
+        road
+        for road, width in zip(every, lane_m, strict=True)
+        if width > opendrive.WIDEST_M or (road["lanes"] > 1 and width < opendrive.NARROWEST_M)
+    ]
     notes = []
     for roads, text in (
         (assumed, "so wide that its lanes are assumed; give the number of lanes"),
@@ -423,12 +427,6 @@ def lane_notes(rows: list[ManifestRow]) -> list[str]:
             named = f"road {widest['id']}: {widest['width_m']:g} m, {count(widest['lanes'], 'lane')}"
             notes.append(f"{count(len(roads), 'road')} {text} ({named})")
     return notes
-
-
-def _has_unusual_lanes(road: ManifestRow) -> bool:
-    """Return whether lanes are too wide, or several too narrow."""
-    width = road["width_m"] / road["lanes"]
-    return bool(width > opendrive.WIDEST_M or (road["lanes"] > 1 and width < opendrive.NARROWEST_M))
 
 
 def totals(rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
@@ -453,22 +451,6 @@ def with_line(figures: Mapping[str, Any], error: str = "") -> dict[str, Any]:
     if figures["left_out_areas"]:
         text += f", {count(figures['left_out_areas'], 'area')} without centre line left out"
     return {**figures, "summary": f"{text}; {error}" if error else text}
-
-
-def write_new(where: Location, data: bytes) -> None:
-    """Write a small file unless it has this content."""
-    known = stat(where)
-    if known is None or known.size != len(data) or read(where) != data:
-        write(where, data)
-
-
-def _table(rows: list[ManifestRow]) -> bytes:
-    file = io.StringIO(newline="")
-    if rows:
-        table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        table.writeheader()
-        table.writerows({name: no_formula(value) for name, value in row.items()} for row in rows)
-    return file.getvalue().encode()
 
 
 def _known(roads: list[ManifestRow], key: str) -> list[ManifestRow]:

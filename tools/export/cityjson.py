@@ -8,8 +8,7 @@ from the origin in the header.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,31 +27,6 @@ LOD = "2"
 AUTHORITY = "https://www.opengis.net/def/crs/EPSG/0/"
 
 Whole = NDArray[np.int64]
-
-
-def write(
-    file: IO[bytes],
-    tiles: Iterable[tuple[str, Mesh]],
-    system: str,
-    origin: tuple[float, float, float],
-    vertical: str | None = None,
-) -> int:
-    """Write the meshes of all tiles to one file; return the number of tiles.
-
-    - `file`: open for writing.
-    - `tiles`: tile ids, which are unique, and meshes; one mesh is in memory at a time.
-    - `system`: CRS of the meshes.
-    - `origin`: easting, northing and height that the vertices are relative to (m).
-    - `vertical`: CRS of the heights, if known.
-    """
-    file.write(header(system, origin, vertical))
-    count = 0
-    for tile_id, mesh in tiles:
-        if not crs.same(mesh.crs, system):
-            raise TaskError(f"{tile_id}: mesh in {crs.short(mesh.crs)}, the file is in {crs.short(system)}")
-        file.write(features(tile_id, mesh, origin, vertical))
-        count += 1
-    return count
 
 
 def header(system: str, origin: tuple[float, float, float], vertical: str | None = None) -> bytes:

@@ -15,12 +15,11 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.signals import INTERRUPTED
-from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.cli.stdio import echo, end_for_steps
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.run.progress import StepProgress
-from flexroad.pipeline.run.tile_steps import REMEDY
 from flexroad.tools.export.driver import check_formats
 from flexroad.tools.export.driver import export as write
 from flexroad.tools.export.georeference import Datum
@@ -115,11 +114,7 @@ def export(
     for name in names:
         _say(name, written[name], folder / name)
     faults = [f"{name}: {line}" for name in names for line in written[name].get("faults", ())]
-    for line in faults:
-        echo(f"{'note' if allow_steps else 'error'}: {line}; {REMEDY}", err=True)
-    if faults and not allow_steps:
-        echo("the files are written; --allow-steps takes them as they are", err=True)
-        raise typer.Exit(1)
+    end_for_steps(faults, allow_steps)
 
 
 def _say(name: str, written: dict[str, Any], folder: Location) -> None:

@@ -35,7 +35,7 @@ from flexroad.tools.export import (
 )
 from flexroad.tools.export.georeference import Georeference
 from flexroad.tools.export.network import network
-from flexroad.tools.export.source import Options, Source, TileItem, photographed, texture_of
+from flexroad.tools.export.source import Options, Source, TileItem, layer_state, texture_of
 from flexroad.tools.export.tile_outputs import (
     Encode,
     ManifestRow,
@@ -66,25 +66,10 @@ def cityjson_part(tile: FinishedTile, place: Georeference) -> TileOutput:
     return TileOutput({part_name(tile.id): lines}, {"height_error_m": _error_m(tile, cityjson.SCALE_M)})
 
 
-def obj_output(tile: FinishedTile, place: Georeference) -> TileOutput:
+def obj_output(
+    tile: FinishedTile, place: Georeference, materials: str = MATERIALS, photo: Bounds | None = None
+) -> TileOutput:
     """Return the mesh as OBJ, and its place as JSON and, for GIS programs, as ``.prj``."""
-    return _obj(tile, place, MATERIALS, None)
-
-
-def draped_obj_output(item: TileItem, place: Georeference) -> TileOutput:
-    """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
-    tile, name = item.tile, safe_name(item.id)
-    image = texture_of(tile)
-    materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
-    output = _obj(tile, place, materials, image.bounds if image else None)
-    if image is None:
-        return TileOutput(
-            {**output.files, materials: obj.encode_materials()}, output.row | {"note": NO_PHOTO}
-        )
-    return TileOutput({**output.files, materials: obj.encode_materials(photo), photo: image.jpeg}, output.row)
-
-
-def _obj(tile: FinishedTile, place: Georeference, materials: str, photo: Bounds | None) -> TileOutput:
     mesh, name = tile.mesh, safe_name(tile.id)
     files = {
         f"{name}{obj.NAME}": obj.encode(mesh, materials, place, photo),
@@ -92,6 +77,19 @@ def _obj(tile: FinishedTile, place: Georeference, materials: str, photo: Bounds 
         f"{name}.prj": place.prj(),
     }
     return TileOutput(files, {"height_error_m": _error_m(tile, 10**-obj.DECIMALS)})
+
+
+def draped_obj_output(item: TileItem, place: Georeference) -> TileOutput:
+    """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
+    tile, name = item.tile, safe_name(item.id)
+    image = texture_of(tile)
+    materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
+    output = obj_output(tile, place, materials, image.bounds if image else None)
+    if image is None:
+        return TileOutput(
+            {**output.files, materials: obj.encode_materials()}, output.row | {"note": NO_PHOTO}
+        )
+    return TileOutput({**output.files, materials: obj.encode_materials(photo), photo: image.jpeg}, output.row)
 
 
 def _error_m(tile: FinishedTile, unit_m: float) -> float:
@@ -210,8 +208,8 @@ def write_obj(
         write(folder / MATERIALS, obj.encode_materials())
         return _write_each(obj.VERSION, obj_output, source, tiles, folder, options, executor)
     remove(folder / MATERIALS)
-    items, encode = map(photographed, tiles), draped_obj_output
-    return figures(write_outputs(items, folder, obj.VERSION, encode, source.place, executor))
+    items = (TileItem(tile, f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}") for tile in tiles)
+    return figures(write_outputs(items, folder, obj.VERSION, draped_obj_output, source.place, executor))
 
 
 def _write_each(

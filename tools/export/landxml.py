@@ -169,21 +169,6 @@ def _part_surface(mesh: Mesh, faces: Bools, points: Floats, row: NDArray[np.int3
     return PartSurface(text, corners.astype(np.int32), rim, limits)
 
 
-def write(
-    file: IO[bytes],
-    meshes: Iterable[Mesh],
-    project: Project,
-    folder: Path | None = None,
-    compress: bool = False,
-) -> None:
-    """Write the meshes of all tiles to one file: `part` of each, then `join`.
-
-    - `meshes`: in any order, all in one CRS; each is read once. Memory is least if neighbours follow each
-      other.
-    """
-    join(file, (part(mesh, project.joined) for mesh in meshes), project, folder, compress)
-
-
 def join(
     file: IO[bytes],
     parts_of_meshes: Iterable[Part],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -84,7 +84,12 @@ def network(source: Source, options: Options) -> Network:
     local = [replace(line, points=np.column_stack(frame.to_local(*line.points.T))) for line in lines]
     routes = tuple(routing.routes(local))
     shapes = [shapely.LineString(np.column_stack(frame.to_run(*route.points.T))) for route in routes]
-    touched = tuple(_touched(routes, shapes, boxes))
+    tree = shapely.STRtree(boxes)
+    reach = (max(part.width_m for part in route.parts) / 2 + SIDE_M for route in routes)
+    touched = tuple(
+        np.sort(tree.query(line, predicate="dwithin", distance=away))
+        for line, away in zip(shapes, reach, strict=True)
+    )
     lengths = tuple(map(float, shapely.length(shapely.intersection(shapes, ground))))
     return Network(
         frame, routes, touched, lengths, found.areas, found.notes, any(line.level for line in lines)
@@ -170,15 +175,6 @@ def _frame(source: Source) -> LocalFrame:
     selected = [tile for tile in source.run.catalog.usable if tile.id in left_out]
     west, south, east, north = union([tile.grid.bounds for tile in (*source.tiles, *selected)])
     return LocalFrame.around(source.crs, (west + east) / 2, (south + north) / 2)
-
-
-def _touched(
-    routes: tuple[Route, ...], shapes: list[shapely.LineString], boxes: NDArray[np.object_]
-) -> Iterator[NDArray[np.intp]]:
-    tree = shapely.STRtree(boxes)
-    for route, line in zip(routes, shapes, strict=True):
-        reach = max(part.width_m for part in route.parts) / 2 + SIDE_M
-        yield np.sort(tree.query(line, predicate="dwithin", distance=reach))
 
 
 @dataclass(frozen=True)

@@ -139,35 +139,25 @@ class HeightGrid:
     """``(n, m)``, m; NaN beyond the surface, and beyond a gap in it: no row has NaN between heights."""
 
 
-def height_grid(
-    line: ReferenceLine, height: HeightAt, v_increment_m: float = 0.25, margin_m: float = 1.0
-) -> HeightGrid:
-    """Return the heights of a surface beside a line, to ``margin_m`` beside its widest place.
+def height_grid(line: ReferenceLine, height: HeightAt, margin_m: float = 1.0) -> HeightGrid:
+    """Return the heights of a surface beside a part of a line that `reference_line.usable` returns.
 
-    In narrow bends the margin is smaller, so that the grid does not fold.
-
-    - `line`: a part of a line that `reference_line.usable` returns.
-    - `height`: the surface in the line's coordinates.
-    - `v_increment_m`: distance across, a multiple of 1 mm (m).
-    - `margin_m`: width beside the carriageway, on either side (m).
+    - `margin_m`: width beside the carriageway at its widest place (m), less in narrow bends, so that the grid
+      does not fold.
     """
-    v = across(line, v_increment_m, margin_m)
-    return HeightGrid(line, v, without_gaps(v, height(*line.beside(v))))
-
-
-def across(line: ReferenceLine, v_increment_m: float = 0.25, margin_m: float = 1.0) -> Floats:
-    """Return the distances from a line at which `height_grid` has heights."""
-    step = v_increment_m
-    right, left = line.reach(float(line.width.max()) / 2 + margin_m)
-    return np.arange(-round(right // step), round(left // step) + 1, dtype=np.float64) * step
-
-
-def without_gaps(v: Floats, heights: Floats) -> Floats:
-    """Return the heights that reach from the line without a gap: readers of OpenCRG refuse gaps in a row."""
-    middle, known = int(np.argmin(np.abs(v))), np.isfinite(heights)
+    v = across(line, 0.25, margin_m)
+    heights, middle = height(*line.beside(v)), int(np.argmin(np.abs(v)))
+    # Readers of OpenCRG refuse gaps in a row.
+    known = np.isfinite(heights)
     right = np.logical_and.accumulate(known[:, middle::-1], axis=1)[:, ::-1]
     left = np.logical_and.accumulate(known[:, middle:], axis=1)
-    return np.where(np.hstack([right, left[:, 1:]]), heights, np.nan)
+    return HeightGrid(line, v, np.where(np.hstack([right, left[:, 1:]]), heights, np.nan))
+
+
+def across(line: ReferenceLine, step: float, margin_m: float) -> Floats:
+    """Return distances from a line, ``step`` apart (m), to ``margin_m`` beside its widest place."""
+    right, left = line.reach(float(line.width.max()) / 2 + margin_m)
+    return np.arange(-round(right // step), round(left // step) + 1, dtype=np.float64) * step
 
 
 def grid_error(grid: HeightGrid, height: HeightAt) -> tuple[float, float]:

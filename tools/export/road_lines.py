@@ -18,7 +18,6 @@ from flexroad.catalog.crs import compound
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location, read
 from flexroad.catalog.storage.scratch import ScratchFolder
-from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
@@ -27,11 +26,11 @@ from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.types import Floats
 from flexroad.tools.export import reference_line as lines
 from flexroad.tools.export.along_roads import (
-    NO_ROAD,
     RouteUnit,
     Work,
     millimetres,
     reference_line,
+    route_row,
     tile_faults,
     totals,
     with_line,
@@ -163,9 +162,6 @@ def write_lines(
     roads = network(source, options)
     work = Work(roads.frame, source.vertical)
     rows, key = write_units(VERSION, lines_output, work, roads, tiles, folder, executor)
-    found = sum(len(row["roads"]) for row in rows)
-    if not found:
-        raise ConfigError(f"no road could be written: {rows[0]['problem']}, and so on" if rows else NO_ROAD)
     crs = compound(source.crs, source.vertical) if source.vertical else source.crs
 
     date = max(tile.datetime for tile in source.tiles).astimezone(UTC)
@@ -178,24 +174,20 @@ def write_lines(
             copyfile(file, local)
 
     write_whole(folder / f"{source.run.path.name}{NAME}", key, {}, fill)
-    steps = max((road["steps_max_m"] for row in rows for road in row["roads"]), default=0.0)
-    left_out = steps_left_out(steps)
     every = [road for row in rows for road in row["roads"]]
-    tile_steps = max(road["tile_steps_max_mm"] for road in every)
-    return with_line(
-        {
-            **totals(rows, roads),
-            "steps_max_m": round(steps, 6),
-            "tile_steps_max_mm": tile_steps,
-            "faults": tile_faults(every),
-        },
-        f"along {SMOOTH}{left_out}" if left_out else "",
-    )
+    steps = max(road["steps_max_m"] for road in every)
+    left_out = steps_left_out(steps)
+    figures = totals(rows, roads) | {
+        "steps_max_m": round(steps, 6),
+        "tile_steps_max_mm": max(road["tile_steps_max_mm"] for road in every),
+        "faults": tile_faults(every),
+    }
+    return with_line(figures, f"along {SMOOTH}{left_out}" if left_out else "")
 
 
 def lines_output(unit: RouteUnit, work: Work) -> TileOutput:
     """Return the roads of a route as arrays; a road ends where the surface does."""
-    height, step = unit.height(work), unit.step(work)
+    height, step = unit.height(work), unit.height(work, steps=True)
     line, problem = reference_line(unit)
     known = np.empty(0) if line is None else height(line.x, line.y)
     parts = [] if line is None else lines.parts(line, np.isfinite(known), lines.Options())
@@ -213,12 +205,10 @@ def lines_output(unit: RouteUnit, work: Work) -> TileOutput:
             segments["level"] = levels.astype(np.int32)
         rows.append(own)
         arrays |= {f"{number}.{name}": values for name, values in segments.items()}
-    if not rows and not problem:
-        problem = "no part of it has a surface for long enough"
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     files = {_file(unit.number): buffer.getvalue()} if rows else {}
-    return TileOutput(files, {"route": unit.number, "roads": rows, "problem": problem})
+    return TileOutput(files, route_row(unit, rows, problem))
 
 
 def _file(route: int) -> str:

@@ -134,7 +134,9 @@ class _Data:
         add, (p, q) = self.add, nurbs.degree
         knots_u, knots_v = _distinct(nurbs.knots_u), _distinct(nurbs.knots_v)
         weights = nurbs.points[..., 3]
-        points = [[self.point(point) for point in row] for row in nurbs.points]
+        points = [
+            [add(f"CARTESIAN_POINT('',{_reals(each[:3].tolist())})") for each in row] for row in nurbs.points
+        ]
         vertices = {
             (row, col): add(f"VERTEX_POINT('',{points[row][col]})") for row in (0, -1) for col in (0, -1)
         }
@@ -154,10 +156,6 @@ class _Data:
         bound = add(f"FACE_OUTER_BOUND('',{loop},.T.)")
         surface = self.surface((p, q), knots_u, knots_v, points, weights)
         return add(f"ADVANCED_FACE('',({bound}),{surface},.T.)")
-
-    def point(self, point: Floats) -> str:
-        """Add a control point."""
-        return self.add(f"CARTESIAN_POINT('',{_reals(point[:3].tolist())})")
 
     def edge(
         self, start: str, end: str, degree: int, knots: Knots, points: Sequence[str], weights: Floats

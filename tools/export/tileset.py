@@ -147,18 +147,10 @@ def branch_output(branch: Branch, place: Place) -> TileOutput:
 
 
 def row_of(
-    name: str, cell: tuple[int, int], placed: tiles3d.Placed, error_m: float, photo: bool
+    name: str, cell: tuple[int, int], placed: dict[str, Any], error_m: float, photo: bool
 ) -> ManifestRow:
     """Return the row of a tile or coarse mesh, without its record."""
-    return {
-        "id": name,
-        "cell": cell,
-        "uri": placed.uri,
-        "transform": placed.transform,
-        "region": placed.region,
-        "error_m": error_m,
-        "photo": photo,
-    }
+    return {"id": name, "cell": cell, **placed, "error_m": error_m, "photo": photo}
 
 
 def _read(folder: Location, row: ManifestRow) -> tuple[Relief, Aerial]:
@@ -189,13 +181,8 @@ class Node:
         """Return its entry in the tileset of its block."""
         children = [child.entry(self) for child in self.children]
         extras = {"vertical_error_m": self.row["vertical_m"]} if self.children else {}
-        outer = parent._placed if parent else None
-        return tiles3d.tile(self._placed, self.row["error_m"], outer, children, **extras)
-
-    @property
-    def _placed(self) -> tiles3d.Placed:
-        row = self.row
-        return tiles3d.Placed(f"../{row['uri']}", tuple(row["transform"]), tuple(row["region"]), 0.0)
+        content = self.row | {"uri": f"../{self.row['uri']}"}
+        return tiles3d.tile(content, self.row["error_m"], parent.row if parent else None, children, **extras)
 
 
 def write_tilesets(
@@ -212,7 +199,7 @@ def write_tilesets(
     nodes = [Node(row) for row in write_outputs(leaves, folder, VERSION, encode, place, executor)]
     nodes.sort(key=lambda node: str(node.row["id"]))
     bare = [node.row["id"] for node in nodes if node.row["bare"]]
-    children, named = [], set[str]()
+    children, written = [], set[str]()
     for block in blocks(nodes, folder, place, executor):
         column, line = _cell(block, len(LEVELS) - 1)
         name, entry = f"blocks/{column}_{line}.json", block.entry()
@@ -220,15 +207,17 @@ def write_tilesets(
         write(folder / name, _encoded(tiles3d.tileset(entry, tiles3d.extent_m(volume["region"]))))
         error_m = block.row["error_m"]
         children.append({"boundingVolume": volume, "geometricError": error_m, "content": {"uri": name}})
-        named.add(name)
+        written.add(name)
     for name in listing(folder / "blocks"):
-        if f"blocks/{name}" not in named:
+        if f"blocks/{name}" not in written:
             remove(folder / "blocks" / name)
     whole = tiles3d.extent_m(tiles3d.around([child["boundingVolume"]["region"] for child in children]))
     extras = {"crs": source.crs, "datum": options.datum.text}
     tileset = tiles3d.tileset(tiles3d.group(children, whole), whole, **extras)
     write(folder / "tileset.json", _encoded(tileset))
-    return {"notes": [_without_photo(bare)] if bare else []}
+    named = ", ".join(bare[:NAMED]) + (", ..." if len(bare) > NAMED else "")
+    note = f"{count(len(bare), 'tile')} without an orthophoto, in plain colours: {named}"
+    return {"notes": [note] if bare else []}
 
 
 def blocks(nodes: Sequence[Node], folder: Location, place: Place, executor: Executor) -> list[Node]:
@@ -320,11 +309,6 @@ def _glb(tile: FinishedTile, own: bool, place: Place, texture: glb.Texture | Non
         return data
     normals = mesh_normals(tile.mesh, tile.surface)
     return glb.encode(tile.mesh, (*place.origin, 0.0), texture, normals, tile.id)
-
-
-def _without_photo(ids: Sequence[str]) -> str:
-    named = ", ".join(ids[:NAMED]) + (", ..." if len(ids) > NAMED else "")
-    return f"{count(len(ids), 'tile')} without an orthophoto, in plain colours: {named}"
 
 
 def _encoded(content: dict[str, Any]) -> bytes:

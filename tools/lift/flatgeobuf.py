@@ -23,7 +23,7 @@ from flexroad.tools.lift.features import (
     wanted_levels,
     with_zero,
 )
-from flexroad.tools.lift.shapes import of_wkb, to_wkb
+from flexroad.tools.lift.shapes import COLLECTION, NAMES, POINT, of_wkb, to_wkb
 from flexroad.tools.lift.types import Frame, Lifted, Options, RunSurface
 
 pyogrio = lazy("pyogrio")
@@ -32,20 +32,8 @@ if TYPE_CHECKING:
 else:
     pa = lazy("pyarrow")
 
-NOUN = "feature"
-"""What a row of the report is."""
-STEPS = True
-"""Whether heights have the steps beside roads."""
 SUFFIXES = (".fgb",)
-KINDS = (
-    "Point",
-    "LineString",
-    "Polygon",
-    "MultiPoint",
-    "MultiLineString",
-    "MultiPolygon",
-    "GeometryCollection",
-)
+KINDS = NAMES[POINT : COLLECTION + 1]
 """Types of layers that GDAL writes with z; those of layers with several types it does not."""
 
 

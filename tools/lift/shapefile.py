@@ -40,10 +40,6 @@ from flexroad.tools.lift.types import Frame, Lifted, Options, RunSurface
 
 pyogrio = lazy("pyogrio")
 
-NOUN = "feature"
-"""What a row of the report is."""
-STEPS = True
-"""Whether heights have the steps beside roads."""
 SUFFIXES = (".shp",)
 KEPT = (*(end for end in SHAPEFILE_PARTS if end not in (".shx", ".dbf")), ".qpj", ".qml", ".sld", ".shp.xml")
 """Files that are copied: projection, encoding, indices, styles, description."""
@@ -128,7 +124,7 @@ def _lifted(source: Path, out: Path, run: RunSurface, options: Options) -> Itera
                 f"has geometries of the type {code}, which is none of points, lines and polygons; write "
                 "them as such with ogr2ogr -nlt"
             )
-        copy = _Copy(shapes, index, code % 10, code > 10, header)
+        copy = _Copy(shapes, index, code % 10, header)
         for records, levels in _batches(source, file):
             features = []
             for record, level in zip(records, levels, strict=True):
@@ -231,7 +227,7 @@ def _shape(data: bytes, of_file: int) -> Shape | None:
 class _Copy:
     """The files ``.shp`` and ``.shx`` that are written."""
 
-    def __init__(self, shapes: BinaryIO, index: BinaryIO, code: int, z_or_m: bool, header: bytes) -> None:
+    def __init__(self, shapes: BinaryIO, index: BinaryIO, code: int, header: bytes) -> None:
         self.shapes, self.index, self.code, self.header = shapes, index, 10 + code, header
         self.count, self.at = 0, 100
         self.low, self.high = np.full(2, np.inf), np.full(2, -np.inf)

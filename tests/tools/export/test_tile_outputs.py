@@ -37,12 +37,14 @@ def test_files_are_those_of_the_meshes(made_city, tmp_path):
     export(chosen, tmp_path, JOINED, Options(), SerialExecutor())
     meshes = [(tile.id, tile.mesh) for tile in chosen.finished()]
     with (tmp_path / "expected").open("wb") as file:
-        cityjson.write(file, meshes, chosen.crs, (*chosen.origin, 0.0), chosen.vertical)
+        about = (*chosen.origin, 0.0), chosen.vertical
+        file.write(cityjson.header(chosen.crs, *about))
+        file.writelines(cityjson.features(name, mesh, *about) for name, mesh in meshes)
     assert (tmp_path / "cityjson" / "city.city.jsonl").read_bytes() == (tmp_path / "expected").read_bytes()
     written = max(tile.datetime for tile in chosen.tiles)
     project = landxml.Project("city", written, chosen.vertical, joined=False)
     with (tmp_path / "expected").open("wb") as file:
-        landxml.write(file, [mesh for _, mesh in meshes], project)
+        landxml.join(file, (landxml.part(mesh, joined=False) for _, mesh in meshes), project)
     assert (tmp_path / "landxml" / "city.xml").read_bytes() == (tmp_path / "expected").read_bytes()
 
 
