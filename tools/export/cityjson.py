@@ -64,9 +64,6 @@ def features(
     they have no area.
 
     - `tile_id`: id of the tile, from which the ids of the city objects are made.
-    - `mesh`: the mesh of the tile. Faces are counter-clockwise from above.
-    - `origin`: that of the header (m).
-    - `vertical`: CRS of the heights, if known.
     """
     # The origins are whole metres and are subtracted first: large coordinates would lose digits.
     points = mesh.vertices + np.subtract(mesh.origin, origin)

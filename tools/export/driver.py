@@ -58,11 +58,7 @@ def export(
     track: Track = untracked,
     notify: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Write the formats, each into a folder of its name, and the manifest last; return the manifest.
-
-    - `track`: shows the progress: takes the tiles of a format, its name and their number.
-    - `notify`: receives one line about what the user may not expect.
-    """
+    """Write the formats, each into a folder of its name, and the manifest last; return the manifest."""
     chosen = check_formats(formats, options)
     options = replace(options, formats=frozenset(chosen))
     if options.drape and all(tile.layer("dop") is None for tile in source.tiles):
@@ -176,7 +172,6 @@ def check_formats(names: Sequence[str], options: Options) -> dict[str, Format]:
 def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[str], None]) -> Iterator[None]:
     """Make the folder and hold its lock; a context manager.
 
-    - `formats`: the formats to write, each into a folder of its name.
     - `notify`: receives one line when the lock of a dead process is taken over.
     """
     for folder in (run.path, run.store):

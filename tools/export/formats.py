@@ -38,7 +38,6 @@ from flexroad.tools.export.network import network
 from flexroad.tools.export.source import Options, Source, TileItem, layer_state, texture_of
 from flexroad.tools.export.tile_outputs import (
     Encode,
-    ManifestRow,
     TileOutput,
     figures,
     part_name,
@@ -117,20 +116,16 @@ def step_output(tile: FinishedTile, place: Georeference) -> TileOutput:
     if not isinstance(surface, NurbsSurface):
         raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
     bounds, beyond_m2 = covered(tile.road)
-    about = {"bounds": list(bounds), "beyond_survey_m2": beyond_m2, "steps_max_m": _steps_m(tile)}
+    steps_m = _steps_m(tile)
+    about = {"bounds": list(bounds), "beyond_survey_m2": beyond_m2, "steps_max_m": steps_m}
     files = {
         f"{name}{step.NAME}": step.encode(surface, bounds, tile.id, source.datetime, place),
         f"{name}{step.NAME_SIDECAR}": place.sidecar(step.AXES, **about),
     }
-    return TileOutput(files, _smooth_row(tile, bounds, beyond_m2))
-
-
-def _smooth_row(tile: FinishedTile, bounds: Bounds, beyond_m2: float) -> ManifestRow:
-    """Return the largest step that a surface leaves out, and a note if it ends with the survey or goes on."""
-    parts = [CUT] if bounds != tile.tile.grid.bounds else []
-    parts += [BEYOND] if beyond_m2 else []
-    parts += [OF_LEVEL_0] if tile.surface.levels else []
-    return {"steps_max_m": _steps_m(tile)} | ({"note": "; ".join(parts)} if parts else {})
+    notes = [CUT] if bounds != source.grid.bounds else []
+    notes += [BEYOND] if beyond_m2 else []
+    notes += [OF_LEVEL_0] if surface.levels else []
+    return TileOutput(files, {"steps_max_m": steps_m} | ({"note": "; ".join(notes)} if notes else {}))
 
 
 def _steps_m(tile: FinishedTile) -> float:

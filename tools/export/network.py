@@ -194,7 +194,6 @@ def read_centre_lines(
 
     - `source`: vector files; equal lines of several files are one.
     - `bounds`: west, south, east and north (m, in ``crs``).
-    - `crs`: CRS of the result.
     - `levels`: whether to read levels. Roads below level 0 are then kept, whatever ``options.tunnels`` says.
     """
     names = (*rasterise.columns(options), *NAMES, *DIRECTIONS, JUNCTION)

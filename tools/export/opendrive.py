@@ -58,10 +58,7 @@ def encode(
 ) -> bytes:
     """Return one road as XML, for `write`.
 
-    - `name`: its id.
     - `crg`: name of the OpenCRG file of the same line, relative to the OpenDRIVE file; None if it has none.
-    - `structures`: its bridges and tunnels.
-    - `left_hand`: whether traffic keeps left.
     """
     ends, lengths = line.pieces
     element = ET.Element("road", _attributes(name=printable(line.name), length=lengths[-1], id=name))
@@ -93,7 +90,6 @@ def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, nam
     - `roads`: roads with different ids, each of `encode`.
     - `proj`: the roads' coordinate system as a PROJ string (`tools.export.georeference.LocalFrame.proj`).
     - `bounds`: west, south, east and north of the roads (m, in that system).
-    - `name`: name of the database.
     """
     west, south, east, north = map(float, bounds)
     quoted = quoteattr(printable(name))

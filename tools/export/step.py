@@ -52,11 +52,8 @@ def encode(surface: NurbsSurface, bounds: Bounds, name: str, written: datetime, 
 
     Coordinates have all digits of their float64 numbers. Equal inputs give equal bytes.
 
-    - `surface`: the surface of a tile.
     - `bounds`: west, south, east and north of the part, as the tile's core (m). The part ends with the
       surface's domain where that is smaller.
-    - `name`: name of the product, as the tile id.
-    - `written`: date and time of the file, which the format requires.
     - `place`: what coordinates are relative to; its height is 0.
     """
     nurbs, rational = patch(surface, bounds, place.origin[:2])
@@ -258,7 +255,6 @@ def cut(surface: NurbsSurface, bounds: Bounds) -> NurbsSurface:
 def patch(surface: NurbsSurface, bounds: Bounds, origin: tuple[float, float]) -> tuple[ExactNurbs, bool]:
     """Return the part of a surface within bounds as a NURBS with control points in space; exact.
 
-    - `bounds`: west, south, east and north of the part (m).
     - `origin`: easting and northing that the control points are relative to (m).
     - `patch`: with the degree of the surface if all weights are equal, which are 1 then; else as by `exact`.
     - `rational`: whether the weights differ.

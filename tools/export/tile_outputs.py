@@ -197,8 +197,6 @@ def write_whole(file: Location, key: str, row: ManifestRow, fill: Callable[[Path
     Its former one, if it had another name, is removed.
 
     - `key`: fingerprint of its content and name.
-    - `row`: kept in its mark.
-    - `fill`: writes the file to a local path.
     """
     folder = file.parent
     former = _Mark.read(_whole_marker(folder))
@@ -231,7 +229,6 @@ def write_joined(
 
     The figures of all tiles are returned.
 
-    - `tiles`: all tiles of the source.
     - `encode`: makes the output of a tile, whose only file has the name of `part_name`; runs in the workers.
     - `options`: given to ``encode``; with the name of the file, also all that ``join`` depends on.
     """

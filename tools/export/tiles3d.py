@@ -41,11 +41,9 @@ def placed(
     origin) to those from the Earth's centre (m). The region is west, south, east, north (radians), lowest and
     highest height above the ellipsoid (m).
 
-    - `uri`: path of the GLB, relative to the tileset.
     - `heights`: lowest and highest height of the mesh (m).
     - `origin`: easting and northing of the run's origin (m), which the coordinates of its GLB files are
       relative to.
-    - `conversion`: from the CRS and the heights of the run to WGS 84.
     """
     west, south, east, north = bounds
     low, high = heights[0] - MARGIN_M, heights[1] + MARGIN_M
@@ -66,9 +64,6 @@ def placed(
 def sheet_placed(uri: str, points: Floats, conversion: Ellipsoidal) -> tuple[dict[str, Any], Floats]:
     """Return where a mesh is whose points are all converted, and its points in the frame of its tile.
 
-    - `uri`: path of the GLB, relative to the tileset.
-    - `points` ``(V, 3)``: easting, northing and height (m).
-    - `conversion`: from the CRS and the heights of the run to WGS 84.
     - result: its transform is from east, north and up at the middle of the points.
     - result ``(V, 3)``: the points in that frame (m): small numbers, which float32 holds to 0.2 mm at 4 km.
     """
@@ -103,12 +98,9 @@ def tile(
 ) -> dict[str, Any]:
     """Return the entry of a tile.
 
-    - `content`: its mesh, as of `placed`.
     - `error_m`: error of showing it instead of the finest tiles (m).
     - `parent`: the mesh of the tile of which it is a child: the transform of a tile applies to its children,
       too.
-    - `children`: the entries of tiles that replace it.
-    - `extras`: what else is known of the tile.
     """
     matrix = np.reshape(content["transform"], (4, 4)).T
     if parent:

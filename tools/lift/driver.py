@@ -150,14 +150,13 @@ def lift(
 ) -> LiftedFile:
     """Write a file with the heights of a run.
 
-    - `ground`: the run.
     - `source`, `out`: the file, and where its copy is written: both are complete files of the same format.
     - `crs`, `offset`: CRS of the file, and what is added to its coordinates (m), if the file does not say
       them.
     - `report`: a CSV with a row per road or feature; places above limits are in a GeoPackage beside it.
     """
     _require_outputs(source, out, report)
-    with _explained(source):
+    try:
         module = _format(source)
         _require_suffix(module, source, out)
         named = module.frame(source)
@@ -175,6 +174,8 @@ def lift(
             in_run.require_heights()
             files = _move(Path(scratch), out)
             _remove_parts(out, files)
+    except (TaskError, InputRejected) as error:
+        raise ConfigError(f"{source} {error}") from error
     if report is not None:
         files += _write_report(rows, report, in_run)
     seen = in_run.seen
@@ -243,15 +244,6 @@ def _named(out: Path, scratch: Path) -> Iterator[None]:
         if error.filename is not None and scratch not in Path(error.filename).parents:
             raise
         raise OSError(error.errno, error.strerror or str(error), str(out)) from error
-
-
-@contextmanager
-def _explained(source: Path) -> Iterator[None]:
-    """Name the file in errors of reading it."""
-    try:
-        yield
-    except (TaskError, InputRejected) as error:
-        raise ConfigError(f"{source} {error}") from error
 
 
 def _move(scratch: Path, out: Path) -> tuple[Path, ...]:

@@ -137,7 +137,9 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
     of_links = _Linked(source, heights)
     with xml_text.opened(source) as file, xml_text.written(out) as copy:
         parts = map(_read, xml_text.parts(file, {"road"}))
-        for part, found in with_heights(parts, _places, heights):
+        for part, found in with_heights(
+            parts, lambda each: each.places() if isinstance(each, Road) else None, heights
+        ):
             if isinstance(part, Road):
                 assert found is not None
                 part = _lifted(part, found, options, of_links)
@@ -145,10 +147,6 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
             copy.write(text)
             if row is not None:
                 yield row
-
-
-def _places(part: Road | tuple[bytes, Lifted | None]) -> tuple[Floats, Floats] | None:
-    return part.places() if isinstance(part, Road) else None
 
 
 def _read(part: bytes | Part) -> Road | tuple[bytes, Lifted | None]:

@@ -230,7 +230,6 @@ def with_heights(
     """Yield each part, in its order, with the heights of its points: a run reads each tile once per batch.
 
     - `points`: returns x and y of the points of a part, ``(n,)`` each; None if it needs no heights.
-    - `heights`: heights of a run.
     """
     batch, size = list[tuple[T, tuple[Floats, Floats] | None]](), 0
     for part in parts:

@@ -73,12 +73,11 @@ class _Change:
 
 def changes(streets: Sequence[Street], seed: int, mean: float) -> tuple[_Change, ...]:
     """Return the changes of some streets, ``mean`` per street on average."""
-    return tuple(change for street in streets for change in _of(street, seed, mean)) if mean > 0 else ()
-
-
-def _of(street: Street, seed: int, mean: float) -> list[_Change]:
-    rng = generator(seed, "works", *street.key)
-    return [_drawn(street, str(rng.choice(KINDS)), rng) for _ in range(rng.poisson(mean))]
+    found = list[_Change]()
+    for street in streets if mean > 0 else ():
+        rng = generator(seed, "works", *street.key)
+        found += [_drawn(street, str(rng.choice(KINDS)), rng) for _ in range(rng.poisson(mean))]
+    return tuple(found)
 
 
 def _drawn(street: Street, kind: str, rng: np.random.Generator) -> _Change:

@@ -202,7 +202,7 @@ def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any
         "height": [north - south for _, south, _, north in bounds],
         "state": states,
         "stale": stale,
-        "flags": [_flags(row) for row in rows],
+        "flags": [[flag for flag in (row.get("flags") or "").split(", ") if flag] for row in rows],
         "error": errors,
         "measures": known,
     }
@@ -230,10 +230,6 @@ def _error(status: TileStatus) -> str:
     failures = status.last_record.failures if status.failed and status.last_record else ()
     lines = dict.fromkeys(f"{f.line}{f' [{f.file}]' if f.file else ''}" for f in failures)
     return "; ".join(lines)
-
-
-def _flags(row: dict[str, Any]) -> list[str]:
-    return [flag for flag in (row.get("flags") or "").split(", ") if flag]
 
 
 def _figure(value: Any) -> float | None:
@@ -311,7 +307,7 @@ def script(item: TileItem, look: Look) -> TileOutput:
         places = {flag: list(place) for flag, place in tile.flag_places.items()}
         small = encoding.picture(height, road, data.core.cell)
         seen = base64.b64encode(small).decode("ascii")
-    scene = encoding.TileScene(
+    encoded = encoding.encode_tile(
         tile.id,
         glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
@@ -326,7 +322,7 @@ def script(item: TileItem, look: Look) -> TileOutput:
     )
     name = f"tiles/{safe_name(tile.id)}{encoding.NAME_TILE}"
     return TileOutput(
-        {name: encoding.encode_tile(scene)},
+        {name: encoded},
         {"tile": tile.id, "notes": notes, "picture": seen, "places": places},
     )
 
