@@ -31,7 +31,6 @@ ELLIPSOIDS = {"GRS 1980": "GRS80", "WGS 84": "WGS84"}
 """Ellipsoids that programs take as that of GNSS, with PROJ's names."""
 GEOGRAPHIC, GEOCENTRIC = "EPSG:4979", "EPSG:4978"
 """WGS 84 as longitude, latitude and ellipsoidal height, and as coordinates from the Earth's centre."""
-Kind = Literal["crs", "geoid", "offset"]
 
 
 @dataclass(frozen=True)
@@ -161,7 +160,7 @@ def _geodetic(crs: str) -> CRS:
 class Datum:
     """How heights of a run become heights above the ellipsoid."""
 
-    kind: Kind
+    kind: Literal["crs", "geoid", "offset"]
     value: str
     """The vertical CRS (EPSG:7837), the file of a geoid (GTX or GeoTIFF), or a number of metres."""
 

@@ -1,4 +1,4 @@
-"""What the formats have in common: heights of all levels at points, options, and the rows of the report."""
+"""What the formats have in common: the surface of a run for a file, options, and the rows of the report."""
 
 from __future__ import annotations
 
