@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import IO, Any
 
 import typer
@@ -22,6 +22,15 @@ def echo(line: str, err: bool = False) -> None:
     Standard error shows no credentials of addresses. Data on standard output stays as it is.
     """
     typer.echo(printable(without_credentials(line) if err else line), err=err)
+
+
+def end_for_steps(faults: Sequence[str], allowed: bool) -> None:
+    """Print where tiles do not meet; end with exit code 1 unless ``--allow-steps`` is given."""
+    for line in faults:
+        echo(f"{'note' if allowed else 'error'}: {line}", err=True)
+    if faults and not allowed:
+        echo("the files are written; --allow-steps takes them as they are", err=True)
+        raise typer.Exit(1)
 
 
 def echo_document(text: str) -> None:

@@ -24,8 +24,8 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.spline.stepped import without_steps
 from flexroad.tools.export.driver import export
-from flexroad.tools.export.ellipsoidal import Datum
 from flexroad.tools.export.formats import FORMATS
+from flexroad.tools.export.georeference import Datum
 from flexroad.tools.export.source import Options, select
 from tests.read_exports import OFFSET_M, off_surface, spline_heights, true_heights, vertices
 from tests.read_opendrive import quality_issues

@@ -46,11 +46,7 @@ def of_classes(
 ) -> Aerial:
     """Return an image of a mesh with one colour for road and one for terrain.
 
-    - `points` ``(V, 3)``: easting, northing and height (m).
-    - `faces` ``(F, 3)``: indices of points.
-    - `road` ``(F,)``: the faces that are road.
     - `colours`: red, green and blue of road and of terrain, 0 to 255.
-    - `bounds`: west, south, east and north of the image (m).
     - `pixel_m`: largest size of a pixel (m).
     """
     rows, columns = shape(bounds, pixel_m)

@@ -29,9 +29,12 @@ from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.export import opencrg, opendrive
 from flexroad.tools.export import reference_line as lines
-from flexroad.tools.export.along_line import (
+from flexroad.tools.export.georeference import LocalFrame
+from flexroad.tools.export.network import Network, network
+from flexroad.tools.export.profiles import (
     HeightAt,
     HeightGrid,
+    Profiles,
     across,
     elevation_error,
     grid_error,
@@ -41,21 +44,18 @@ from flexroad.tools.export.along_line import (
     profile_error,
     profiles,
 )
-from flexroad.tools.export.local_frame import LocalFrame
-from flexroad.tools.export.network import Network, network
-from flexroad.tools.export.pieces import (
+from flexroad.tools.export.reference_line import ReferenceLine
+from flexroad.tools.export.source import Options, Source
+from flexroad.tools.export.tile_outputs import (
     MARKERS,
     SMOOTH,
     Encode,
-    Piece,
-    Row,
+    ManifestRow,
+    TileOutput,
     steps_left_out,
-    write_pieces,
+    write_outputs,
     write_whole,
 )
-from flexroad.tools.export.profiles import Profiles
-from flexroad.tools.export.reference_line import ReferenceLine
-from flexroad.tools.export.source import Options, Source
 
 VERSION = 8
 """Of the roads themselves: their division, lines, grids and errors."""
@@ -67,7 +67,6 @@ SUMMARY = (
 )
 """Errors in the summary: means over the length of the roads, largest ones over all."""
 REPORT = "roads.csv"
-NO_ROAD = "no road lies on the tiles"
 MOST_NAMED = 3
 """Number of roads that a message names."""
 SHOWN_M = 10.0
@@ -122,14 +121,6 @@ class RouteUnit:
         """The surfaces of its tiles."""
         return TileSampler(self.tiles)
 
-    def height(self, work: Work) -> HeightAt:
-        """Return the surface without steps in the local frame."""
-        return self._local(work, steps=False)
-
-    def step(self, work: Work) -> HeightAt:
-        """Return the height of the surface with steps above it, in the local frame."""
-        return self._local(work, steps=True)
-
     def tile_step(self, line: ReferenceLine, v: Floats, inside: Bools, work: Work) -> float:
         """Return the largest step between the tiles below a road (m); 0 on one tile.
 
@@ -157,7 +148,8 @@ class RouteUnit:
     def _levels(self) -> RouteLevels | None:
         return RouteLevels.of(self.route)
 
-    def _local(self, work: Work, steps: bool) -> HeightAt:
+    def height(self, work: Work, steps: bool = False) -> HeightAt:
+        """Return, in the local frame, the surface without steps, or how much higher the one with steps is."""
         return lambda x, y: self.sampler.on_road(*work.frame.to_run(x, y), self.levels(x, y), steps)
 
     def flags(self, line: ReferenceLine, work: Work) -> str:
@@ -194,7 +186,7 @@ def write_crg(
     """Write an OpenCRG file per road and the report; return the summary."""
     roads = network(source, options)
     work = Work(roads.frame, source.vertical)
-    rows, _ = write_units(opencrg.VERSION, crg_piece, work, roads, tiles, folder, executor)
+    rows, _ = write_units(opencrg.VERSION, crg_output, work, roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
     error, steps = summary["crg_max_mm"], steps_left_out(_metres(summary["crg_steps_max_mm"]))
     surface = SMOOTH if steps else "the surface"
@@ -209,7 +201,7 @@ def write_xodr(
     roads = network(source, options)
     crg = "../crg/" if "crg" in options.formats else None
     work = Work(roads.frame, source.vertical, options.left_hand, crg)
-    rows, key = write_units(opendrive.VERSION, xodr_piece, work, roads, tiles, folder, executor)
+    rows, key = write_units(opendrive.VERSION, xodr_output, work, roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
     edges = np.array([road["bounds"] for row in rows for road in row["roads"]])
     bounds = (*edges[:, :2].min(axis=0), *edges[:, 2:].max(axis=0))
@@ -248,7 +240,7 @@ def write_units(
     tiles: Iterable[FinishedTile],
     folder: Location,
     executor: Executor,
-) -> tuple[list[Row], str]:
+) -> tuple[list[ManifestRow], str]:
     """Write the files of each route; return their rows, in order, and a fingerprint of all of them."""
     whole = sha256(f"{version} {VERSION} {work}".encode())
 
@@ -258,11 +250,15 @@ def write_units(
             yield unit
 
     versions = version * 1000 + VERSION
-    rows = write_pieces(counted(), folder, versions, encode, work, executor)
-    return sorted(rows, key=lambda row: int(row["route"])), whole.hexdigest()
+    outputs = write_outputs(counted(), folder, versions, encode, work, executor)
+    rows = sorted(outputs, key=lambda row: int(row["route"]))
+    if not any(row["roads"] for row in rows):
+        why = f"no road could be written: {rows[0]['problem']}, and so on" if rows else None
+        raise ConfigError(why or "no road lies on the tiles")
+    return rows, whole.hexdigest()
 
 
-def crg_piece(unit: RouteUnit, work: Work) -> Piece:
+def crg_output(unit: RouteUnit, work: Work) -> TileOutput:
     """Return the OpenCRG files of a route."""
     roads, problem = _roads(unit, work)
     heights = work.vertical or "as in the run"
@@ -273,29 +269,29 @@ def crg_piece(unit: RouteUnit, work: Work) -> Piece:
         )
         for road, grid, _, _ in roads
     }
-    return Piece(files, _route_row(unit, roads, problem))
+    return TileOutput(files, route_row(unit, [row for *_, row in roads], problem))
 
 
-def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
+def xodr_output(unit: RouteUnit, work: Work) -> TileOutput:
     """Return the roads of a route as XML of OpenDRIVE."""
     roads, problem = _roads(unit, work)
     texts = list[bytes]()
     for road, grid, fitted, _ in roads:
         crg = None if work.crg is None else f"{work.crg}{road}{opencrg.NAME}"
         decks = structures(unit.levels_on(grid.line.x, grid.line.y), grid.line.s)
-        texts.append(
-            opendrive.encode(opendrive.Road(str(road), grid.line, fitted, crg, decks), work.left_hand)
-        )
-    return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, roads, problem))
+        texts.append(opendrive.encode(str(road), grid.line, fitted, crg, decks, work.left_hand))
+    return TileOutput(
+        {_fragment(unit.number): b"".join(texts)}, route_row(unit, [row for *_, row in roads], problem)
+    )
 
 
 def _fragment(route: int) -> str:
     return f"{MARKERS}/{route}.xml"
 
 
-def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Profiles, Row]], str]:
+def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Profiles, ManifestRow]], str]:
     """Return numbers, grids, profiles and rows of a route's roads, and why it has none."""
-    height, step = unit.height(work), unit.step(work)
+    height, step = unit.height(work), unit.height(work, steps=True)
     line, problem = reference_line(unit)
     parts = [] if line is None else lines.usable(line, height(line.x, line.y), lines.Options())
     roads = []
@@ -317,15 +313,16 @@ def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
     return line, f"shorter than {options.min_length_m:g} m" if line is None else ""
 
 
-def _route_row(unit: RouteUnit, roads: list[tuple[int, HeightGrid, Profiles, Row]], problem: str) -> Row:
+def route_row(unit: RouteUnit, roads: list[ManifestRow], problem: str) -> ManifestRow:
+    """Return the row of a route: its roads, and why it has none."""
     if not roads and not problem:
         problem = "no part of it has a surface for long enough"
-    return {"route": unit.number, "roads": [row for *_, row in roads], "problem": problem}
+    return {"route": unit.number, "roads": roads, "problem": problem}
 
 
 def row(
     road: int, grid: HeightGrid, height: HeightAt, step: HeightAt, fitted: Profiles, tile_step: float
-) -> Row:
+) -> ManifestRow:
     """Return a road's row of the report.
 
     - `height`, `step`: the surface without steps, and how much higher that with steps is, in the line's
@@ -375,14 +372,18 @@ def _metres(length_mm: float | None) -> float | None:
     return None if length_mm is None else length_mm / 1000
 
 
-def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
+def report(folder: Location, rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
     """Write the report of the roads, if it is new; return the summary for the manifest."""
     every = [road for row in rows for road in row["roads"]]
-    if not every:
-        raise ConfigError(f"no road could be written: {rows[0]['problem']}, and so on" if rows else NO_ROAD)
-    write_new(
-        folder / REPORT, _table([{k: v for k, v in road.items() if k not in INTERNAL} for road in every])
-    )
+    text = io.StringIO(newline="")
+    columns = [name for name in every[0] if name not in INTERNAL]
+    table = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    table.writeheader()
+    table.writerows({name: no_formula(value) for name, value in road.items()} for road in every)
+    data, file = text.getvalue().encode(), folder / REPORT
+    known = stat(file)
+    if known is None or known.size != len(data) or read(file) != data:
+        write(file, data)
     return {
         **totals(rows, roads),
         **{name: (_mean if "_mean_" in name else _largest)(every, name) for name in SUMMARY},
@@ -390,7 +391,7 @@ def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
     }
 
 
-def tile_faults(roads: list[Row]) -> list[str]:
+def tile_faults(roads: list[ManifestRow]) -> list[str]:
     """Return a line that names the roads on tiles that do not meet; empty if all tiles do."""
     name = "tile_steps_max_mm"
     apart = sorted(
@@ -408,11 +409,16 @@ def tile_faults(roads: list[Row]) -> list[str]:
     return [f"{count(len(apart), 'road')} {verb} on tiles that do not meet ({listed}{more})"]
 
 
-def lane_notes(rows: list[Row]) -> list[str]:
+def lane_notes(rows: list[ManifestRow]) -> list[str]:
     """Return notes on roads with lanes of unusual width, and on those divided into lanes by their width."""
     every = [road for row in rows for road in row["roads"]]
     assumed = [road for road in every if road["lanes_assumed"]]
-    unusual = [road for road in every if _has_unusual_lanes(road)]
+    lane_m = [road["width_m"] / road["lanes"] for road in every]
+    unusual = [
+        road
+        for road, width in zip(every, lane_m, strict=True)
+        if width > opendrive.WIDEST_M or (road["lanes"] > 1 and width < opendrive.NARROWEST_M)
+    ]
     notes = []
     for roads, text in (
         (assumed, "so wide that its lanes are assumed; give the number of lanes"),
@@ -425,13 +431,7 @@ def lane_notes(rows: list[Row]) -> list[str]:
     return notes
 
 
-def _has_unusual_lanes(road: Row) -> bool:
-    """Return whether lanes are too wide, or several too narrow."""
-    width = road["width_m"] / road["lanes"]
-    return bool(width > opendrive.WIDEST_M or (road["lanes"] > 1 and width < opendrive.NARROWEST_M))
-
-
-def totals(rows: list[Row], roads: Network) -> dict[str, Any]:
+def totals(rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
     """Return number, length and flags of the roads, and what was left out of centre lines on the tiles."""
     length = sum(road["length_m"] for row in rows for road in row["roads"])
     flagged = {str(road["id"]): road["flags"] for row in rows for road in row["roads"] if road["flags"]}
@@ -455,31 +455,15 @@ def with_line(figures: Mapping[str, Any], error: str = "") -> dict[str, Any]:
     return {**figures, "summary": f"{text}; {error}" if error else text}
 
 
-def write_new(where: Location, data: bytes) -> None:
-    """Write a small file unless it has this content."""
-    known = stat(where)
-    if known is None or known.size != len(data) or read(where) != data:
-        write(where, data)
-
-
-def _table(rows: list[Row]) -> bytes:
-    file = io.StringIO(newline="")
-    if rows:
-        table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        table.writeheader()
-        table.writerows({name: no_formula(value) for name, value in row.items()} for row in rows)
-    return file.getvalue().encode()
-
-
-def _known(roads: list[Row], key: str) -> list[Row]:
+def _known(roads: list[ManifestRow], key: str) -> list[ManifestRow]:
     return [road for road in roads if road[key] is not None]
 
 
-def _largest(roads: list[Row], key: str) -> float | None:
+def _largest(roads: list[ManifestRow], key: str) -> float | None:
     return max((road[key] for road in _known(roads, key)), default=None)
 
 
-def _mean(roads: list[Row], key: str) -> float | None:
+def _mean(roads: list[ManifestRow], key: str) -> float | None:
     """Return the mean over the length of the roads."""
     known = _known(roads, key)
     length = sum(road["length_m"] for road in known)

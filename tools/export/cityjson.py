@@ -8,8 +8,7 @@ from the origin in the header.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,6 @@ from flexroad.tasks.types import Mesh
 
 VERSION = 1
 NAME = ".city.jsonl"
-MEDIA_TYPE = "application/city+json-seq"
 
 SCALE_M = 0.001
 """Unit of the vertices (m): a coordinate is exact to half of it."""
@@ -29,31 +27,6 @@ LOD = "2"
 AUTHORITY = "https://www.opengis.net/def/crs/EPSG/0/"
 
 Whole = NDArray[np.int64]
-
-
-def write(
-    file: IO[bytes],
-    tiles: Iterable[tuple[str, Mesh]],
-    system: str,
-    origin: tuple[float, float, float],
-    vertical: str | None = None,
-) -> int:
-    """Write the meshes of all tiles to one file; return the number of tiles.
-
-    - `file`: open for writing.
-    - `tiles`: tile ids, which are unique, and meshes; one mesh is in memory at a time.
-    - `system`: CRS of the meshes.
-    - `origin`: easting, northing and height that the vertices are relative to (m).
-    - `vertical`: CRS of the heights, if known.
-    """
-    file.write(header(system, origin, vertical))
-    count = 0
-    for tile_id, mesh in tiles:
-        if not crs.same(mesh.crs, system):
-            raise TaskError(f"{tile_id}: mesh in {crs.short(mesh.crs)}, the file is in {crs.short(system)}")
-        file.write(features(tile_id, mesh, origin, vertical))
-        count += 1
-    return count
 
 
 def header(system: str, origin: tuple[float, float, float], vertical: str | None = None) -> bytes:
@@ -91,9 +64,6 @@ def features(
     they have no area.
 
     - `tile_id`: id of the tile, from which the ids of the city objects are made.
-    - `mesh`: the mesh of the tile. Faces are counter-clockwise from above.
-    - `origin`: that of the header (m).
-    - `vertical`: CRS of the heights, if known.
     """
     # The origins are whole metres and are subtracted first: large coordinates would lose digits.
     points = mesh.vertices + np.subtract(mesh.origin, origin)

@@ -15,7 +15,7 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.signals import INTERRUPTED
-from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.cli.stdio import echo, end_for_steps
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
@@ -23,7 +23,7 @@ from flexroad.pipeline.run.points import STEP_REMEDY
 from flexroad.pipeline.run.progress import StepProgress
 from flexroad.tools.export.driver import check_formats
 from flexroad.tools.export.driver import export as write
-from flexroad.tools.export.ellipsoidal import Datum
+from flexroad.tools.export.georeference import Datum
 from flexroad.tools.export.source import Options, select
 
 app = group()
@@ -114,12 +114,8 @@ def export(
     written = {name: manifest["formats"][name] for name in names}
     for name in names:
         _say(name, written[name], folder / name)
-    faults = [f"{name}: {line}" for name in names for line in written[name].get("faults", ())]
-    for line in faults:
-        echo(f"{'note' if allow_steps else 'error'}: {line}; {STEP_REMEDY}", err=True)
-    if faults and not allow_steps:
-        echo("the files are written; --allow-steps takes them as they are", err=True)
-        raise typer.Exit(1)
+    faults = [f"{name}: {line}; {STEP_REMEDY}" for name in names for line in written[name].get("faults", ())]
+    end_for_steps(faults, allow_steps)
 
 
 def _say(name: str, written: dict[str, Any], folder: Location) -> None:

@@ -36,7 +36,7 @@ from flexroad.pipeline.run.record import Run, check_own
 from flexroad.pipeline.run.status import Track, ended, untracked
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.export.formats import FORMATS, Format
-from flexroad.tools.export.source import Options, Source, check_photos
+from flexroad.tools.export.source import Options, Source
 
 SAME = ("variant", "crs", "tiles", "results")
 """Entries of the manifest that two exports into one folder have in common if both are of the same results."""
@@ -58,15 +58,13 @@ def export(
     track: Track = untracked,
     notify: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Write the formats, each into a folder of its name, and the manifest last; return the manifest.
-
-    - `track`: shows the progress: takes the tiles of a format, its name and their number.
-    - `notify`: receives one line about what the user may not expect.
-    """
+    """Write the formats, each into a folder of its name, and the manifest last; return the manifest."""
     chosen = check_formats(formats, options)
     options = replace(options, formats=frozenset(chosen))
-    if options.drape:
-        check_photos(source.tiles)
+    if options.drape and all(tile.layer("dop") is None for tile in source.tiles):
+        raise ConfigError(
+            "--drape needs an orthophoto (layer dop), and no exported tile has one; leave out --drape"
+        )
     for kind in chosen.values():
         if kind.check:
             kind.check(source, options)
@@ -174,7 +172,6 @@ def check_formats(names: Sequence[str], options: Options) -> dict[str, Format]:
 def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[str], None]) -> Iterator[None]:
     """Make the folder and hold its lock; a context manager.
 
-    - `formats`: the formats to write, each into a folder of its name.
     - `notify`: receives one line when the lock of a dead process is taken over.
     """
     for folder in (run.path, run.store):
@@ -195,19 +192,13 @@ def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[st
 
 def _begun(out: Location, formats: Collection[str]) -> set[str]:
     """Return the formats of the folder that this or an earlier export has written or begun."""
-    own = _formats(out)
-    if own is None and exists(out / MANIFEST):
+    begun = exists(out / BEGUN)
+    if not begun and exists(out / MANIFEST):
         raise ConfigError(f"{out / MANIFEST} is not of an export; choose another folder with -o")
-    earlier = own or set()
+    earlier = set(read(out / BEGUN).decode(errors="replace").split()) if begun else set()
     for name in sorted({*formats} - earlier):
         check_own(out / name, lambda: False, "an export", "-o")
     return {*earlier, *formats}
-
-
-def _formats(out: Location) -> set[str] | None:
-    """Return the formats of earlier exports into the folder, None if there was none."""
-    begun = out / BEGUN
-    return set(read(begun).decode(errors="replace").split()) if exists(begun) else None
 
 
 def remove_unfinished(folder: Location, below: bool = False) -> None:

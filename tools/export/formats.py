@@ -25,7 +25,6 @@ from flexroad.tools.export import (
     along_roads,
     cityjson,
     landxml,
-    lines,
     mosaic,
     obj,
     opencrg,
@@ -36,8 +35,15 @@ from flexroad.tools.export import (
 )
 from flexroad.tools.export.georeference import Georeference
 from flexroad.tools.export.network import network
-from flexroad.tools.export.pieces import Encode, Piece, Row, figures, part_name, write_joined, write_pieces
-from flexroad.tools.export.source import Options, Source, TileItem, photographed, texture_of
+from flexroad.tools.export.source import Options, Source, TileItem, layer_state, texture_of
+from flexroad.tools.export.tile_outputs import (
+    Encode,
+    TileOutput,
+    figures,
+    part_name,
+    write_joined,
+    write_outputs,
+)
 
 MATERIALS = "materials.mtl"
 """Name of the file of materials that all OBJ files share."""
@@ -47,42 +53,42 @@ CUT = "surface cut to the rectangle that the survey covers"
 NO_PHOTO = "no orthophoto, in plain colours"
 
 
-def landxml_part(tile: FinishedTile, project: landxml.Project) -> Piece:
+def landxml_part(tile: FinishedTile, project: landxml.Project) -> TileOutput:
     """Return the part of a LandXML file."""
     part = landxml.part(tile.mesh, project.joined).encode()
-    return Piece({part_name(tile.id): part}, {"height_error_m": _error_m(tile, 10**-landxml.DECIMALS)})
+    return TileOutput({part_name(tile.id): part}, {"height_error_m": _error_m(tile, 10**-landxml.DECIMALS)})
 
 
-def cityjson_part(tile: FinishedTile, place: Georeference) -> Piece:
+def cityjson_part(tile: FinishedTile, place: Georeference) -> TileOutput:
     """Return the lines of a CityJSON file."""
     lines = cityjson.features(tile.id, tile.mesh, place.origin, place.vertical)
-    return Piece({part_name(tile.id): lines}, {"height_error_m": _error_m(tile, cityjson.SCALE_M)})
+    return TileOutput({part_name(tile.id): lines}, {"height_error_m": _error_m(tile, cityjson.SCALE_M)})
 
 
-def obj_piece(tile: FinishedTile, place: Georeference) -> Piece:
+def obj_output(
+    tile: FinishedTile, place: Georeference, materials: str = MATERIALS, photo: Bounds | None = None
+) -> TileOutput:
     """Return the mesh as OBJ, and its place as JSON and, for GIS programs, as ``.prj``."""
-    return _obj(tile, place, MATERIALS, None)
-
-
-def draped_obj_piece(item: TileItem, place: Georeference) -> Piece:
-    """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
-    tile, name = item.tile, safe_name(item.id)
-    image = texture_of(tile)
-    materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
-    piece = _obj(tile, place, materials, image.bounds if image else None)
-    if image is None:
-        return Piece({**piece.files, materials: obj.encode_materials()}, piece.row | {"note": NO_PHOTO})
-    return Piece({**piece.files, materials: obj.encode_materials(photo), photo: image.jpeg}, piece.row)
-
-
-def _obj(tile: FinishedTile, place: Georeference, materials: str, photo: Bounds | None) -> Piece:
     mesh, name = tile.mesh, safe_name(tile.id)
     files = {
         f"{name}{obj.NAME}": obj.encode(mesh, materials, place, photo),
         f"{name}.json": place.sidecar(obj.AXES),
         f"{name}.prj": place.prj(),
     }
-    return Piece(files, {"height_error_m": _error_m(tile, 10**-obj.DECIMALS)})
+    return TileOutput(files, {"height_error_m": _error_m(tile, 10**-obj.DECIMALS)})
+
+
+def draped_obj_output(item: TileItem, place: Georeference) -> TileOutput:
+    """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
+    tile, name = item.tile, safe_name(item.id)
+    image = texture_of(tile)
+    materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
+    output = obj_output(tile, place, materials, image.bounds if image else None)
+    if image is None:
+        return TileOutput(
+            {**output.files, materials: obj.encode_materials()}, output.row | {"note": NO_PHOTO}
+        )
+    return TileOutput({**output.files, materials: obj.encode_materials(photo), photo: image.jpeg}, output.row)
 
 
 def _error_m(tile: FinishedTile, unit_m: float) -> float:
@@ -104,26 +110,22 @@ def _error_m(tile: FinishedTile, unit_m: float) -> float:
     return float(np.nanmax(np.abs(errors), initial=0.0))
 
 
-def step_piece(tile: FinishedTile, place: Georeference) -> Piece:
+def step_output(tile: FinishedTile, place: Georeference) -> TileOutput:
     """Return the surface as STEP, cut to what the survey covers of the tile, and its place as JSON."""
     surface, source, name = tile.surface, tile.tile, safe_name(tile.id)
     if not isinstance(surface, NurbsSurface):
         raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
     bounds, beyond_m2 = covered(tile.road)
-    about = {"bounds": list(bounds), "beyond_survey_m2": beyond_m2, "steps_max_m": _steps_m(tile)}
+    steps_m = _steps_m(tile)
+    about = {"bounds": list(bounds), "beyond_survey_m2": beyond_m2, "steps_max_m": steps_m}
     files = {
         f"{name}{step.NAME}": step.encode(surface, bounds, tile.id, source.datetime, place),
         f"{name}{step.NAME_SIDECAR}": place.sidecar(step.AXES, **about),
     }
-    return Piece(files, _smooth_row(tile, bounds, beyond_m2))
-
-
-def _smooth_row(tile: FinishedTile, bounds: Bounds, beyond_m2: float) -> Row:
-    """Return the largest step that a surface leaves out, and a note if it ends with the survey or goes on."""
-    parts = [CUT] if bounds != tile.tile.grid.bounds else []
-    parts += [BEYOND] if beyond_m2 else []
-    parts += [OF_LEVEL_0] if tile.surface.levels else []
-    return {"steps_max_m": _steps_m(tile)} | ({"note": "; ".join(parts)} if parts else {})
+    notes = [CUT] if bounds != source.grid.bounds else []
+    notes += [BEYOND] if beyond_m2 else []
+    notes += [OF_LEVEL_0] if surface.levels else []
+    return TileOutput(files, {"steps_max_m": steps_m} | ({"note": "; ".join(notes)} if notes else {}))
 
 
 def _steps_m(tile: FinishedTile) -> float:
@@ -199,10 +201,10 @@ def write_obj(
     """Write each mesh as OBJ: all with one file of materials, or each with its own and a photo."""
     if not options.drape:
         write(folder / MATERIALS, obj.encode_materials())
-        return _write_each(obj.VERSION, obj_piece, source, tiles, folder, options, executor)
+        return _write_each(obj.VERSION, obj_output, source, tiles, folder, options, executor)
     remove(folder / MATERIALS)
-    items, encode = map(photographed, tiles), draped_obj_piece
-    return figures(write_pieces(items, folder, obj.VERSION, encode, source.place, executor))
+    items = (TileItem(tile, f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}") for tile in tiles)
+    return figures(write_outputs(items, folder, obj.VERSION, draped_obj_output, source.place, executor))
 
 
 def _write_each(
@@ -215,7 +217,7 @@ def _write_each(
     executor: Executor,
 ) -> dict[str, Any]:
     """Write a format that has files of its own for each tile."""
-    return figures(write_pieces(tiles, folder, version, encode, source.place, executor))
+    return figures(write_outputs(tiles, folder, version, encode, source.place, executor))
 
 
 def _along_roads(title: str, version: int, write: Write) -> Format:
@@ -233,10 +235,12 @@ FORMATS = {
         "CityJSONSeq 2.0, for city models", write_cityjson, cityjson.VERSION, 0.001, of_meshes=True
     ),
     "obj": Format("OBJ, for modelling", write_obj, obj.VERSION, 0.0001, of_meshes=True),
-    "step": Format("STEP AP214, for CAD", partial(_write_each, step.VERSION, step_piece), step.VERSION, 1e-9),
+    "step": Format(
+        "STEP AP214, for CAD", partial(_write_each, step.VERSION, step_output), step.VERSION, 1e-9
+    ),
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
     "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
     "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),
-    "lines": _along_roads("Road lines as GeoPackage, for GIS", road_lines.VERSION, lines.write_lines),
+    "lines": _along_roads("Road lines as GeoPackage, for GIS", road_lines.VERSION, road_lines.write_lines),
 }
 """By the name on the command line."""

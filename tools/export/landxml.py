@@ -34,7 +34,6 @@ from flexroad.tasks.types import Bools, Floats, Mesh
 VERSION = 1
 NAME = ".xml"
 NAME_COMPRESSED = ".xml.gz"
-MEDIA_TYPE = "application/xml"
 
 DECIMALS = 4
 """Decimals of coordinates (m): they are rounded to 0.05 mm."""
@@ -145,7 +144,6 @@ class Part:
 def part(mesh: Mesh, joined: bool = True) -> Part:
     """Return what a mesh gives to a file: all of it but the numbers of its points.
 
-    - `mesh`: the mesh of one tile.
     - `joined`: whether it shares the vertices at its border with its neighbours (`Project.joined`).
     """
     levels = tuple((number, part(mesh.at(number), joined)) for number in mesh.numbers[1:])
@@ -170,21 +168,6 @@ def _part_surface(mesh: Mesh, faces: Bools, points: Floats, row: NDArray[np.int3
     return PartSurface(text, corners.astype(np.int32), rim, limits)
 
 
-def write(
-    file: IO[bytes],
-    meshes: Iterable[Mesh],
-    project: Project,
-    folder: Path | None = None,
-    compress: bool = False,
-) -> None:
-    """Write the meshes of all tiles to one file: `part` of each, then `join`.
-
-    - `meshes`: in any order, all in one CRS; each is read once. Memory is least if neighbours follow each
-      other.
-    """
-    join(file, (part(mesh, project.joined) for mesh in meshes), project, folder, compress)
-
-
 def join(
     file: IO[bytes],
     parts_of_meshes: Iterable[Part],
@@ -197,13 +180,10 @@ def join(
     Points are "northing easting height", absolute, in metres, rounded to 0.05 mm. Faces are counter-clockwise
     from above. A class without faces has no surface. Equal inputs give equal bytes.
 
-    - `file`: open for writing.
     - `parts_of_meshes`: in any order, all in one CRS; each is read once. Memory is least if neighbours follow
       each other.
-    - `project`: name, time and vertical CRS.
     - `folder`: folder of the temporary files, which need as much space as the uncompressed file; by default
       that of the system.
-    - `compress`: whether the file is compressed with gzip.
     """
     with ExitStack() as stack:
 
@@ -245,7 +225,6 @@ def _collect(
     """Add the faces of all parts to the surfaces of their level; return the meshes' CRS.
 
     - `surfaces`: road and ground of each level; those of further levels are added.
-    - `surfaces_of`: makes those of a level.
     """
     system = ""
     open_vertices: dict[int, dict[Place, _OpenVertex]] = {}

@@ -84,7 +84,9 @@ def write_mosaics(
     """Write one raster per quantity over all tiles; with a level, return it for the manifest."""
     grid = whole_grid([tile.grid for tile in source.tiles], options.resolution_m)
     level, number = options.level, 0
-    with _drafts(folder) as drafts:
+    # Drafts need the most space: they are beside the files, or on the local disk for a bucket.
+    with ScratchFolder(folder if isinstance(folder, Path) else None) as scratch:
+        drafts = Path(scratch)
         limits = {"GDAL_CACHEMAX": CACHE_BYTES, "CPL_TMPDIR": str(drafts)}
         with _gdal(folder, **limits), ExitStack() as opened:
             rasters = [opened.enter_context(_draft(drafts, layer, grid, source)) for layer in LAYERS]
@@ -101,13 +103,6 @@ def write_mosaics(
     if level is None:
         return None
     return {"level": level} | ({} if number else {"notes": [f"no tile has a road of level {level}"]})
-
-
-@contextmanager
-def _drafts(folder: Location) -> Iterator[Path]:
-    """Yield a temporary folder beside the files, as they need the most space; of a bucket, a local one."""
-    with ScratchFolder(folder if isinstance(folder, Path) else None) as name:
-        yield Path(name)
 
 
 @contextmanager

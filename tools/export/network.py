@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -20,18 +21,30 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import types
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.roads import rasterise
+from flexroad.tasks.io.vectors import Query, encoding_notes, read_near
+from flexroad.tasks.roads import level_numbers, rasterise, widths
 from flexroad.tasks.roads import routes as routing
+from flexroad.tasks.roads.attributes import has_value
 from flexroad.tasks.roads.routes import CentreLine, Route
 from flexroad.tasks.segment import vector
-from flexroad.tools.export.centre_lines import CentreLines, read_centre_lines
-from flexroad.tools.export.local_frame import LocalFrame
+from flexroad.tools.export.georeference import LocalFrame
 from flexroad.tools.export.source import Options, Source
 
 BEYOND_M = 25.0
 """Centre lines are cut this far beyond the tiles (m), so that their smoothing at the limit is the same."""
 SIDE_M = 3.0
 """Width beside a road for which surfaces are needed, beyond that of its lines and grids (m)."""
+NAMES = ("name", "fullname", "stt_naam", "nam", "ref")
+"""Columns with a road's name or number: OSM, TIGER, NWB, ATKIS; the first with a value wins."""
+DIRECTIONS = ("oneway", "one_way", "rijrichtng")
+"""Columns with the direction of traffic: OSM, other tables, NWB."""
+FORWARD = ("yes", "true", "1", "1.0", "f", "h", "ft")
+"""Values of traffic only from the first point to the last: OSM, its shapefiles (F), NWB (H)."""
+AGAINST = ("-1", "-1.0", "reverse", "t", "tf")
+"""Values of traffic only from the last point to the first; OSM's shapefiles and NWB have T."""
+ONE_WAY_CLASSES = ("motorway",)
+"""Classes of OSM that are one-way unless a tag says otherwise."""
+JUNCTION, ROUNDABOUTS = "junction", ("roundabout", "circular")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +84,12 @@ def network(source: Source, options: Options) -> Network:
     local = [replace(line, points=np.column_stack(frame.to_local(*line.points.T))) for line in lines]
     routes = tuple(routing.routes(local))
     shapes = [shapely.LineString(np.column_stack(frame.to_run(*route.points.T))) for route in routes]
-    touched = tuple(_touched(routes, shapes, boxes))
+    tree = shapely.STRtree(boxes)
+    reach = (max(part.width_m for part in route.parts) / 2 + SIDE_M for route in routes)
+    touched = tuple(
+        np.sort(tree.query(line, predicate="dwithin", distance=away))
+        for line, away in zip(shapes, reach, strict=True)
+    )
     lengths = tuple(map(float, shapely.length(shapely.intersection(shapes, ground))))
     return Network(
         frame, routes, touched, lengths, found.areas, found.notes, any(line.level for line in lines)
@@ -159,10 +177,73 @@ def _frame(source: Source) -> LocalFrame:
     return LocalFrame.around(source.crs, (west + east) / 2, (south + north) / 2)
 
 
-def _touched(
-    routes: tuple[Route, ...], shapes: list[shapely.LineString], boxes: NDArray[np.object_]
-) -> Iterator[NDArray[np.intp]]:
-    tree = shapely.STRtree(boxes)
-    for route, line in zip(routes, shapes, strict=True):
-        reach = max(part.width_m for part in route.parts) / 2 + SIDE_M
-        yield np.sort(tree.query(line, predicate="dwithin", distance=reach))
+@dataclass(frozen=True)
+class CentreLines:
+    """The centre lines near a place."""
+
+    lines: tuple[CentreLine, ...]
+    areas: int
+    """Number of road polygons, which have no centre line and are left out."""
+    notes: tuple[str, ...] = ()
+
+
+def read_centre_lines(
+    source: types.Source, bounds: Bounds, crs: str, options: rasterise.Options, levels: bool = False
+) -> CentreLines:
+    """Return the centre lines whose boxes touch an area.
+
+    - `source`: vector files; equal lines of several files are one.
+    - `bounds`: west, south, east and north (m, in ``crs``).
+    - `levels`: whether to read levels. Roads below level 0 are then kept, whatever ``options.tunnels`` says.
+    """
+    names = (*rasterise.columns(options), *NAMES, *DIRECTIONS, JUNCTION)
+    names += level_numbers.COLUMNS if levels else ()
+    found: dict[bytes, CentreLine] = {}
+    areas, notes = 0, list[str]()
+    for path in source.paths:
+        layer = options.layer or source.sublayer
+        table = read_near(Query(path, layer, options.where, names, source.crs, crs), bounds)
+        part = from_table(table, options, levels)
+        found |= {line.points.tobytes(): line for line in part.lines}
+        areas += part.areas
+        notes += (*encoding_notes(table, path), *part.notes)
+    return CentreLines(tuple(found.values()), areas, tuple(dict.fromkeys(notes)))
+
+
+def from_table(table: Any, options: rasterise.Options, levels: bool = False) -> CentreLines:
+    """Return the centre lines of a table of features, whose columns are in lower case."""
+    table, classes, numbers, unread = rasterise.selected(table, options, levels)
+    members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
+    shapes, member = shapely.get_parts(members, return_index=True)
+    row, kinds = row[member], shapely.get_type_id(shapes)
+    is_line = np.isin(kinds, (1, 2)) & (shapely.length(shapes) > 0)
+    rows, row_of = np.unique(row[is_line], return_inverse=True)
+    table, classes, numbers = table.iloc[rows], classes[rows], numbers[rows]
+    width, notes = widths.widths(table, classes, options)
+    lanes = [int(number) if np.isfinite(number) else None for number in widths.lanes(table, options)]
+    way, name = _direction(table, classes), _texts(table, NAMES)
+    lines = []
+    for shape, k in zip(shapes[is_line], row_of, strict=True):
+        points = shapely.get_coordinates(shape)
+        line = CentreLine(points, float(width[k]), lanes[k], bool(way[k]), name[k], int(numbers[k]))
+        lines.append(line.reverse if way[k] < 0 else line)
+    return CentreLines(tuple(lines), int((kinds == 3).sum()), (*unread, *notes))
+
+
+def _direction(table: Any, classes: NDArray[np.object_]) -> NDArray[np.int8]:
+    """Return 1, -1 or 0 per row: traffic only along the line, only against it, or both."""
+    values = [value.lower() for value in _texts(table, DIRECTIONS)]
+    implied = np.isin(classes, ONE_WAY_CLASSES)
+    implied |= np.isin([value.lower() for value in _texts(table, (JUNCTION,))], ROUNDABOUTS)
+    known: Mapping[str, int] = {**dict.fromkeys(FORWARD, 1), **dict.fromkeys(AGAINST, -1), "": 2}
+    given = np.array([known.get(value, 0) for value in values], np.int8)
+    return np.where(given == 2, implied, given).astype(np.int8)
+
+
+def _texts(table: Any, names: tuple[str, ...]) -> list[str]:
+    """Return the first value of each row, as text; empty if no column has one."""
+    texts = [""] * len(table)
+    for name in names:
+        for k, value in enumerate(table.get(name, ())):
+            texts[k] = texts[k] or (str(value).strip() if has_value(value) else "")
+    return texts

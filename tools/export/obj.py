@@ -22,10 +22,6 @@ VERSION = 2
 NAME = ".obj"
 NAME_MATERIALS = ".mtl"
 NAME_TEXTURE = ".jpg"
-NAME_SIDECAR = "_obj.json"
-NAME_PRJ = ".prj"
-MEDIA_TYPE = "model/obj"
-MEDIA_TYPE_MATERIALS = "model/mtl"
 
 AXES = "x east, y north, relative to origin; z height; metres"
 DECIMALS = 4
@@ -42,9 +38,7 @@ def encode(mesh: Mesh, materials: str, place: Georeference, photo: Bounds | None
     Coordinates are rounded to 0.05 mm, texture coordinates to 5e-8 of the image. Faces are counter-clockwise
     from above. A class without faces has no group.
 
-    - `mesh`: the mesh of one tile.
     - `materials`: name of the file of `encode_materials`, without a folder.
-    - `place`: what coordinates are relative to.
     - `photo`: west, south, east and north of the outer edges of the image that the materials name (m); None
       if they name none.
     """

@@ -11,11 +11,10 @@ import numpy as np
 
 from flexroad.catalog.text import printable
 from flexroad.tasks.errors import TaskError
-from flexroad.tools.export.along_line import HeightGrid
+from flexroad.tools.export.profiles import HeightGrid
 
 VERSION = 1
 NAME = ".crg"
-MEDIA_TYPE = "application/octet-stream"
 
 LINE = 72
 """Longest line of the header."""

@@ -8,8 +8,7 @@ has the surface itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, BinaryIO
 from xml.etree import ElementTree as ET
 from xml.sax.saxutils import quoteattr
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 
 VERSION = 3
 NAME = ".xodr"
-MEDIA_TYPE = "application/xml"
 
 # CARLA and esmini read no <offset>: x and y are those of the projection.
 HEADER = """\
@@ -50,22 +48,37 @@ SAME_SLOPE = 1e-9
 """Slopes of the width that differ by less belong to one piece."""
 
 
-@dataclass(frozen=True, eq=False)
-class Road:
-    """One road of a file."""
+def encode(
+    name: str,
+    line: ReferenceLine,
+    profiles: Profiles,
+    crg: str | None = None,
+    structures: Sequence[Structure] = (),
+    left_hand: bool = False,
+) -> bytes:
+    """Return one road as XML, for `write`.
 
-    id: str
-    line: ReferenceLine
-    profiles: Profiles
-    crg: str | None = None
-    """Name of the OpenCRG file of the same line, relative to the OpenDRIVE file; None if it has none."""
-    structures: tuple[Structure, ...] = ()
-    """Its bridges and tunnels."""
-
-
-def encode(road: Road, left_hand: bool = False) -> bytes:
-    """Return one road as XML, for `write`; with ``left_hand`` traffic keeps left."""
-    element = _road(road, left_hand)
+    - `crg`: name of the OpenCRG file of the same line, relative to the OpenDRIVE file; None if it has none.
+    """
+    ends, lengths = line.pieces
+    element = ET.Element("road", _attributes(name=printable(line.name), length=lengths[-1], id=name))
+    element.set("junction", "-1")
+    element.set("rule", "LHT" if left_hand else "RHT")
+    plan = ET.SubElement(element, "planView")
+    for piece in zip(ends[:-1], ends[1:], lengths[:-1], lengths[1:], strict=True):
+        plan.append(_geometry(line.curve, *map(float, piece)))
+    elevation, lateral = ET.SubElement(element, "elevationProfile"), ET.SubElement(element, "lateralProfile")
+    for parent, tag, pieces in (
+        (elevation, "elevation", profiles.elevation),
+        (lateral, "superelevation", profiles.superelevation),
+    ):
+        for piece in pieces:
+            ET.SubElement(parent, tag, _attributes(**dict(zip("sabcd", piece, strict=True))))
+    element.append(_lanes(line, left_hand))
+    if structures:
+        element.append(_objects(name, structures))
+    if crg is not None:
+        ET.SubElement(ET.SubElement(element, "surface"), "CRG", crg_reference(line, crg, lengths[-1]))
     ET.indent(element, level=1)
     text: bytes = ET.tostring(element, "utf-8")
     return b"  " + text + b"\n"
@@ -75,9 +88,8 @@ def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, nam
     """Write roads, one after the other, to a file.
 
     - `roads`: roads with different ids, each of `encode`.
-    - `proj`: the roads' coordinate system as a PROJ string (`tools.export.local_frame.LocalFrame.proj`).
+    - `proj`: the roads' coordinate system as a PROJ string (`tools.export.georeference.LocalFrame.proj`).
     - `bounds`: west, south, east and north of the roads (m, in that system).
-    - `name`: name of the database.
     """
     west, south, east, north = map(float, bounds)
     quoted = quoteattr(printable(name))
@@ -102,38 +114,13 @@ def lane_count(line: ReferenceLine) -> int:
     return sides if width / sides >= NARROWEST_M else 1
 
 
-def _road(road: Road, left_hand: bool) -> ET.Element:
-    ends, lengths = road.line.pieces
-    element = ET.Element("road", _attributes(name=printable(road.line.name), length=lengths[-1], id=road.id))
-    element.set("junction", "-1")
-    element.set("rule", "LHT" if left_hand else "RHT")
-    plan = ET.SubElement(element, "planView")
-    for piece in zip(ends[:-1], ends[1:], lengths[:-1], lengths[1:], strict=True):
-        plan.append(_geometry(road.line.curve, *map(float, piece)))
-    elevation, lateral = ET.SubElement(element, "elevationProfile"), ET.SubElement(element, "lateralProfile")
-    for parent, tag, pieces in (
-        (elevation, "elevation", road.profiles.elevation),
-        (lateral, "superelevation", road.profiles.superelevation),
-    ):
-        for piece in pieces:
-            ET.SubElement(parent, tag, _attributes(**dict(zip("sabcd", piece, strict=True))))
-    element.append(_lanes(road.line, left_hand))
-    if road.structures:
-        element.append(_objects(road))
-    if road.crg is not None:
-        ET.SubElement(
-            ET.SubElement(element, "surface"), "CRG", crg_reference(road.line, road.crg, lengths[-1])
-        )
-    return element
-
-
-def _objects(road: Road) -> ET.Element:
+def _objects(road: str, structures: Sequence[Structure]) -> ET.Element:
     """Return the bridges and tunnels; the schema wants tunnels first, and a material of bridges."""
     objects = ET.Element("objects")
-    for number, part in sorted(enumerate(road.structures, 1), key=lambda each: each[1].level > 0):
+    for number, part in sorted(enumerate(structures, 1), key=lambda each: each[1].level > 0):
         kind = ("bridge", "concrete") if part.level > 0 else ("tunnel", "standard")
         places = _attributes(s=part.start, length=part.end - part.start)
-        ET.SubElement(objects, kind[0], {"id": f"{road.id}_{number}", "type": kind[1], **places})
+        ET.SubElement(objects, kind[0], {"id": f"{road}_{number}", "type": kind[1], **places})
     return objects
 
 

@@ -1,20 +1,28 @@
-"""Profiles along roads: elevation and superelevation as cubic pieces of OpenDRIVE, within a tolerance.
+"""Heights along a reference line: on a grid as OpenCRG has them, and as profiles of OpenDRIVE.
 
 Each cross-section of a road becomes a straight line: its height on the reference line, and its slope. Along
-the road both become cubic pieces, which go on from piece to piece with one value and one slope. What a road
-has beside that (crown, ruts, kerbs, bumps) is missed.
+the road both become cubic pieces within a tolerance, which go on from piece to piece with one value and one
+slope. What a road has beside that (crown, ruts, kerbs, bumps) is missed.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.export.reference_line import ReferenceLine
+
+HeightAt = Callable[[Floats, Floats], Floats]
+"""Heights (m) of the surface at x and y of the reference line's coordinates; NaN where it has none."""
+TOLERANCE_M = 0.0005
+"""Largest distance of a profile from the straight lines that fit the cross-sections (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,3 +126,126 @@ def _cubic_fits(s: Floats, z: Floats, slope: Floats, a: int, b: int, tolerance: 
         if not math.fabs(z[a] + along * (slope[a] + along * (c + along * d)) - z[i]) <= tolerance:
             return False
     return True
+
+
+@dataclass(frozen=True, eq=False)
+class HeightGrid:
+    """Heights beside the points of a reference line."""
+
+    line: ReferenceLine
+    v: Floats
+    """Distances from the line, ``(m,)``, m; ascending by equal steps, positive to the left."""
+    heights: Floats
+    """``(n, m)``, m; NaN beyond the surface, and beyond a gap in it: no row has NaN between heights."""
+
+
+def height_grid(line: ReferenceLine, height: HeightAt, margin_m: float = 1.0) -> HeightGrid:
+    """Return the heights of a surface beside a part of a line that `reference_line.usable` returns.
+
+    - `margin_m`: width beside the carriageway at its widest place (m), less in narrow bends, so that the grid
+      does not fold.
+    """
+    v = across(line, 0.25, margin_m)
+    heights, middle = height(*line.beside(v)), int(np.argmin(np.abs(v)))
+    # Readers of OpenCRG refuse gaps in a row.
+    known = np.isfinite(heights)
+    right = np.logical_and.accumulate(known[:, middle::-1], axis=1)[:, ::-1]
+    left = np.logical_and.accumulate(known[:, middle:], axis=1)
+    return HeightGrid(line, v, np.where(np.hstack([right, left[:, 1:]]), heights, np.nan))
+
+
+def across(line: ReferenceLine, step: float, margin_m: float) -> Floats:
+    """Return distances from a line, ``step`` apart (m), to ``margin_m`` beside its widest place."""
+    right, left = line.reach(float(line.width.max()) / 2 + margin_m)
+    return np.arange(-round(right // step), round(left // step) + 1, dtype=np.float64) * step
+
+
+def grid_error(grid: HeightGrid, height: HeightAt) -> tuple[float, float]:
+    """Return how far bilinear interpolation misses a surface in the middle of cells: median, largest (m)."""
+    x, y = grid.line.beside((grid.v[:-1] + grid.v[1:]) / 2)
+    z = grid.heights
+    middle = (z[:-1, :-1] + z[1:, :-1] + z[:-1, 1:] + z[1:, 1:]) / 4
+    missed = np.abs(middle - height((x[:-1] + x[1:]) / 2, (y[:-1] + y[1:]) / 2))
+    missed = missed[np.isfinite(missed)]
+    if not len(missed):
+        return np.nan, np.nan
+    return float(np.median(missed)), float(missed.max())
+
+
+def profiles(grid: HeightGrid) -> Profiles:
+    """Return the profiles that fit the heights of the carriageway by least squares.
+
+    Where the surface ends across the road, a cross-section is compared with the nearest complete one: a line
+    through a part of it alone would have the slope of that side of the crown. Cross-sections with less than
+    two heights do not count; what is between their neighbours is used.
+    """
+    s, v = grid.line.s, grid.v
+    crown, inside = _crown(grid, on_carriageway(grid))
+    found = np.stack(straight_lines(v, grid.heights - crown, inside))
+    known = np.isfinite(found[1])
+    height, slope = (
+        (np.interp(s, s[known], row[known]) for row in found) if known.any() else np.zeros_like(found)
+    )
+    reach = max(float(np.abs(v).max()), 1.0)
+    return Profiles(_pieces(s, height, TOLERANCE_M), _pieces(s, np.arctan(slope), TOLERANCE_M / reach))
+
+
+def _pieces(s: Floats, values: Floats, tolerance: float) -> Floats:
+    return cubic_pieces(s, values, CubicSpline(s, values)(s, 1), tolerance)
+
+
+def profile_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
+    """Return how far profiles miss the heights of the carriageway: mean, largest (m); NaN if it has none."""
+    return _missed(grid, profiles.at(grid.line.s[:, None], grid.v))
+
+
+def elevation_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
+    """Return the same as `profile_error` for a reader that takes the elevation alone, across a level road."""
+    level = value_at(profiles.elevation, grid.line.s[:, None])
+    return _missed(grid, np.broadcast_to(level, grid.heights.shape))
+
+
+def largest_steps(grid: HeightGrid, step: HeightAt) -> tuple[float, float]:
+    """Return the largest step up or down at the nodes of a grid, and at those of the carriageway (m).
+
+    NaN if no node has a height.
+    """
+    steps = np.abs(step(*grid.line.beside(grid.v)))
+    known, inside = steps[np.isfinite(steps)], steps[on_carriageway(grid)]
+    everywhere, carriageway = (float(part.max()) if len(part) else np.nan for part in (known, inside))
+    return everywhere, carriageway
+
+
+def _missed(grid: HeightGrid, fitted: Floats) -> tuple[float, float]:
+    missed = np.abs(fitted - grid.heights)[on_carriageway(grid)]
+    if not len(missed):
+        return np.nan, np.nan
+    return float(missed.mean()), float(missed.max())
+
+
+def on_carriageway(grid: HeightGrid) -> Bools:
+    """Return the nodes with a height between the edges of the carriageway, ``(n, m)``."""
+    return _between_edges(grid) & np.isfinite(grid.heights)
+
+
+def _between_edges(grid: HeightGrid) -> Bools:
+    return np.asarray(np.abs(grid.v) - grid.line.width[:, None] / 2 < 1e-6)
+
+
+def _crown(grid: HeightGrid, inside: Bools) -> tuple[Floats, Bools]:
+    """Return how far the nearest complete row is from its straight line, for rows that are cut, and where.
+
+    The rows of the second array are those of ``inside``, without places where the nearest row has no height.
+    """
+    crown = np.zeros(grid.heights.shape)
+    cut = (inside != _between_edges(grid)).any(axis=1)
+    complete, (rows,) = np.flatnonzero(~cut), np.nonzero(cut)
+    if not len(complete) or not len(rows):
+        return crown, inside
+    nearest = complete[np.rint(np.interp(rows, complete, np.arange(len(complete)))).astype(int)]
+    height, slope = straight_lines(grid.v, grid.heights[nearest], inside[nearest])
+    straight = height[:, None] + slope[:, None] * grid.v
+    crown[rows] = np.where(inside[nearest], grid.heights[nearest] - straight, 0.0)
+    common = inside.copy()
+    common[rows] &= inside[nearest]
+    return crown, common

@@ -152,7 +152,7 @@ def reference_line(route: Route, options: Options) -> ReferenceLine | None:
         curve = _curve(_smoothed(points, options, share * options.max_offset_m), shorter * options.piece_m)
         parameter = _equally_spaced(curve, options.increment_m)
         x, y = curve(parameter).T
-        offset_m = float(_away(points, x, y).max())
+        offset_m = float(shapely.distance(shapely.LineString(points), shapely.points(x, y)).max())
         if offset_m <= options.max_offset_m:
             break
     if len(parameter) - 1 < options.min_length_m / options.increment_m:
@@ -196,11 +196,6 @@ def parts(line: ReferenceLine, inside: Bools, options: Options) -> list[Referenc
 
 def _along(points: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-
-
-def _away(points: Floats, x: Floats, y: Floats) -> Floats:
-    """Return the distances of points from a polyline."""
-    return np.asarray(shapely.distance(shapely.LineString(points), shapely.points(x, y)))
 
 
 def _curve(smooth: Floats, piece_m: float) -> scipy.interpolate.PPoly:

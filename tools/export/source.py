@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,8 +32,7 @@ from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.products.glb import Texture
 from flexroad.tools.export.aerial import Aerial
-from flexroad.tools.export.ellipsoidal import Datum
-from flexroad.tools.export.georeference import Georeference
+from flexroad.tools.export.georeference import Datum, Georeference
 
 Image = lazy("PIL.Image")
 
@@ -189,19 +188,6 @@ def select(
         raise ConfigError(f"{location} has tiles in {len(systems)} CRSs; select tiles of one with --bbox")
     left_out = tuple(tile.id for tile in wanted if tile.id not in done)
     return Source(run, variant, tiles, left_out, tuple(done[tile.id] for tile in tiles))
-
-
-def check_photos(tiles: Iterable[Tile]) -> None:
-    """Check that one tile at least has an orthophoto."""
-    if all(tile.layer("dop") is None for tile in tiles):
-        raise ConfigError(
-            "--drape needs an orthophoto (layer dop), and no exported tile has one; leave out --drape"
-        )
-
-
-def photographed(tile: FinishedTile) -> TileItem:
-    """Return a finished tile whose files have its photo."""
-    return TileItem(tile, f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}")
 
 
 def texture_of(tile: FinishedTile) -> Texture | None:

@@ -9,19 +9,16 @@ Coarse meshes are too large for that, as the Earth is curved. All their points a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.types import Floats
-from flexroad.tools.export.ellipsoidal import Ellipsoidal, geocentric
+from flexroad.tools.export.georeference import Ellipsoidal, geocentric
 
 VERSION = 3
-NAME = ".json"
-MEDIA_TYPE = "application/json"
 ASSET = {"version": "1.1", "generator": "FlexRoad"}
 MARGIN_M = 1.0
 """Height added below and above a tile's box (m): bounding volumes must contain all vertices."""
@@ -31,36 +28,22 @@ RADIUS_M = 6_378_137.0
 """Of the Earth (m), for lengths of angles."""
 
 
-@dataclass(frozen=True)
-class Placed:
-    """A tile's mesh on the Earth."""
-
-    uri: str
-    """Path of the GLB, relative to the tileset."""
-    transform: tuple[float, ...]
-    """Affine matrix, 4 x 4 by columns, from the run's coordinates (east, north, up from its origin) to those
-    from the Earth's centre (m)."""
-    region: tuple[float, ...]
-    """West, south, east, north (radians), lowest and highest height above the ellipsoid (m)."""
-    residual_m: float
-    """Largest distance of the transform from the exact conversion at the fitted points (m)."""
-
-
 def placed(
     uri: str,
     bounds: Bounds,
     heights: tuple[float, float],
     origin: tuple[float, float],
     conversion: Ellipsoidal,
-) -> Placed:
-    """Return where a tile's mesh is on the Earth.
+) -> dict[str, Any]:
+    """Return where a tile's mesh is on the Earth: entries of its row.
 
-    - `uri`: path of the GLB, relative to the tileset.
-    - `bounds`: west, south, east and north of the tile (m).
+    The transform is an affine matrix, 4 x 4 by columns, from the run's coordinates (east, north, up from its
+    origin) to those from the Earth's centre (m). The region is west, south, east, north (radians), lowest and
+    highest height above the ellipsoid (m).
+
     - `heights`: lowest and highest height of the mesh (m).
     - `origin`: easting and northing of the run's origin (m), which the coordinates of its GLB files are
       relative to.
-    - `conversion`: from the CRS and the heights of the run to WGS 84.
     """
     west, south, east, north = bounds
     low, high = heights[0] - MARGIN_M, heights[1] + MARGIN_M
@@ -73,26 +56,23 @@ def placed(
     middle, centre = local.mean(axis=0), exact.mean(axis=0)
     linear = np.linalg.lstsq(local - middle, exact - centre, rcond=None)[0].T
     shift = centre - linear @ middle
-    residual = np.linalg.norm(local @ linear.T + shift - exact, axis=1).max()
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, shift
-    return Placed(uri, _columns(matrix), _region(longitude, latitude, height), float(residual))
+    return {"uri": uri, "transform": _columns(matrix), "region": _region(longitude, latitude, height)}
 
 
-def sheet_placed(uri: str, points: Floats, conversion: Ellipsoidal) -> tuple[Placed, Floats]:
+def sheet_placed(uri: str, points: Floats, conversion: Ellipsoidal) -> tuple[dict[str, Any], Floats]:
     """Return where a mesh is whose points are all converted, and its points in the frame of its tile.
 
-    - `uri`: path of the GLB, relative to the tileset.
-    - `points` ``(V, 3)``: easting, northing and height (m).
-    - `conversion`: from the CRS and the heights of the run to WGS 84.
-    - result: its transform is from east, north and up at the middle of the points, and has no error.
+    - result: its transform is from east, north and up at the middle of the points.
     - result ``(V, 3)``: the points in that frame (m): small numbers, which float32 holds to 0.2 mm at 4 km.
     """
     longitude, latitude, height = conversion.geographic(*points.T)
     middle = [float(axis.min() + axis.max()) / 2 for axis in (longitude, latitude, height)]
     matrix = east_north_up(*middle)
     local = (geocentric(longitude, latitude, height) - matrix[:3, 3]) @ matrix[:3, :3]
-    return Placed(uri, _columns(matrix), _region(longitude, latitude, height), 0.0), local
+    region = _region(longitude, latitude, height)
+    return {"uri": uri, "transform": _columns(matrix), "region": region}, local
 
 
 def east_north_up(longitude: float, latitude: float, height: float) -> Floats:
@@ -110,33 +90,30 @@ def east_north_up(longitude: float, latitude: float, height: float) -> Floats:
 
 
 def tile(
-    content: Placed,
+    content: Mapping[str, Any],
     error_m: float,
-    parent: Placed | None = None,
+    parent: Mapping[str, Any] | None = None,
     children: Sequence[dict[str, Any]] = (),
     **extras: Any,
 ) -> dict[str, Any]:
     """Return the entry of a tile.
 
-    - `content`: its mesh.
     - `error_m`: error of showing it instead of the finest tiles (m).
     - `parent`: the mesh of the tile of which it is a child: the transform of a tile applies to its children,
       too.
-    - `children`: the entries of tiles that replace it.
-    - `extras`: what else is known of the tile.
     """
-    matrix = np.reshape(content.transform, (4, 4)).T
+    matrix = np.reshape(content["transform"], (4, 4)).T
     if parent:
-        outer = np.reshape(parent.transform, (4, 4)).T
+        outer = np.reshape(parent["transform"], (4, 4)).T
         matrix[:3, 3] -= outer[:3, 3]
         # The outer frame is rigid.
         matrix[:3] = outer[:3, :3].T @ matrix[:3]
-    regions = [content.region, *(child["boundingVolume"]["region"] for child in children)]
+    regions = [content["region"], *(child["boundingVolume"]["region"] for child in children)]
     entry = {
         "boundingVolume": {"region": around(regions)},
         "geometricError": error_m,
         "transform": _columns(matrix),
-        "content": {"uri": content.uri},
+        "content": {"uri": content["uri"]},
     }
     if children:
         entry |= {"refine": "REPLACE", "children": list(children)}

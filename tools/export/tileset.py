@@ -36,9 +36,9 @@ from flexroad.tasks.meshing.relief import Relief
 from flexroad.tasks.products import glb
 from flexroad.tools.export import aerial, tiles3d
 from flexroad.tools.export.aerial import Aerial
-from flexroad.tools.export.ellipsoidal import Datum, Ellipsoidal
-from flexroad.tools.export.pieces import Piece, Row, write_pieces
+from flexroad.tools.export.georeference import Datum, Ellipsoidal
 from flexroad.tools.export.source import Options, Source, TileItem, aerial_of, layer_state, texture_of
+from flexroad.tools.export.tile_outputs import ManifestRow, TileOutput, write_outputs
 
 RECORDS, MESHES = ".coarse", "coarse"
 """Folders of records, and of GLB files."""
@@ -96,7 +96,7 @@ class Branch:
     level: Level
     cell: tuple[int, int]
     """Column and row of its area, in sides of the finest level."""
-    parts: tuple[Row, ...]
+    parts: tuple[ManifestRow, ...]
     """Rows of the tiles or coarse meshes that it replaces from afar."""
     folder: str
 
@@ -112,7 +112,7 @@ class Branch:
         return sha256(f"{self.level} {made_of}".encode()).hexdigest()
 
 
-def record(name: str, ground: Relief, image: Aerial) -> tuple[dict[str, bytes], Row]:
+def record(name: str, ground: Relief, image: Aerial) -> tuple[dict[str, bytes], ManifestRow]:
     """Return a record as file, and the part of a row that refers to it."""
     arrays: Mapping[str, Any] = {
         "bounds": np.array(ground.bounds),
@@ -128,7 +128,7 @@ def record(name: str, ground: Relief, image: Aerial) -> tuple[dict[str, bytes], 
     return {path: data}, {"record": path, "digest": sha256(data).hexdigest()}
 
 
-def branch_piece(branch: Branch, place: Place) -> Piece:
+def branch_output(branch: Branch, place: Place) -> TileOutput:
     """Return the GLB file of a coarse mesh, its record, and its row."""
     folder, level = parse_location(branch.folder), branch.level
     parts = [_read(folder, row) for row in branch.parts]
@@ -143,23 +143,17 @@ def branch_piece(branch: Branch, place: Place) -> Piece:
     error_m = max(ground.error_m, SHARP * level.pixel_m, *(row["error_m"] for row in branch.parts))
     files, referred = record(branch.id, ground, image)
     row = row_of(branch.id, branch.cell, placed, error_m, photo) | {"vertical_m": ground.error_m}
-    return Piece({uri: data, **files}, row | referred)
+    return TileOutput({uri: data, **files}, row | referred)
 
 
-def row_of(name: str, cell: tuple[int, int], placed: tiles3d.Placed, error_m: float, photo: bool) -> Row:
+def row_of(
+    name: str, cell: tuple[int, int], placed: dict[str, Any], error_m: float, photo: bool
+) -> ManifestRow:
     """Return the row of a tile or coarse mesh, without its record."""
-    return {
-        "id": name,
-        "cell": cell,
-        "uri": placed.uri,
-        "transform": placed.transform,
-        "region": placed.region,
-        "error_m": error_m,
-        "photo": photo,
-    }
+    return {"id": name, "cell": cell, **placed, "error_m": error_m, "photo": photo}
 
 
-def _read(folder: Location, row: Row) -> tuple[Relief, Aerial]:
+def _read(folder: Location, row: ManifestRow) -> tuple[Relief, Aerial]:
     data = read(folder / row["record"])
     try:
         if sha256(data).hexdigest() != row["digest"]:
@@ -180,20 +174,15 @@ def _read(folder: Location, row: Row) -> tuple[Relief, Aerial]:
 class Node:
     """A tile or a coarse mesh, with what replaces it."""
 
-    row: Row
+    row: ManifestRow
     children: tuple[Node, ...] = ()
 
     def entry(self, parent: Node | None = None) -> dict[str, Any]:
         """Return its entry in the tileset of its block."""
         children = [child.entry(self) for child in self.children]
         extras = {"vertical_error_m": self.row["vertical_m"]} if self.children else {}
-        outer = parent._placed if parent else None
-        return tiles3d.tile(self._placed, self.row["error_m"], outer, children, **extras)
-
-    @property
-    def _placed(self) -> tiles3d.Placed:
-        row = self.row
-        return tiles3d.Placed(f"../{row['uri']}", tuple(row["transform"]), tuple(row["region"]), 0.0)
+        content = self.row | {"uri": f"../{self.row['uri']}"}
+        return tiles3d.tile(content, self.row["error_m"], parent.row if parent else None, children, **extras)
 
 
 def write_tilesets(
@@ -206,11 +195,11 @@ def write_tilesets(
     assert options.datum is not None  # the command checks it
     place = Place(str(source.run.path), source.crs, source.origin, options.datum)
     leaves = (_leaf(tile, options.drape) for tile in tiles)
-    encode = partial(leaf_piece, drape=options.drape)
-    nodes = [Node(row) for row in write_pieces(leaves, folder, VERSION, encode, place, executor)]
+    encode = partial(leaf_output, drape=options.drape)
+    nodes = [Node(row) for row in write_outputs(leaves, folder, VERSION, encode, place, executor)]
     nodes.sort(key=lambda node: str(node.row["id"]))
     bare = [node.row["id"] for node in nodes if node.row["bare"]]
-    children, named = [], set[str]()
+    children, written = [], set[str]()
     for block in blocks(nodes, folder, place, executor):
         column, line = _cell(block, len(LEVELS) - 1)
         name, entry = f"blocks/{column}_{line}.json", block.entry()
@@ -218,15 +207,17 @@ def write_tilesets(
         write(folder / name, _encoded(tiles3d.tileset(entry, tiles3d.extent_m(volume["region"]))))
         error_m = block.row["error_m"]
         children.append({"boundingVolume": volume, "geometricError": error_m, "content": {"uri": name}})
-        named.add(name)
+        written.add(name)
     for name in listing(folder / "blocks"):
-        if f"blocks/{name}" not in named:
+        if f"blocks/{name}" not in written:
             remove(folder / "blocks" / name)
     whole = tiles3d.extent_m(tiles3d.around([child["boundingVolume"]["region"] for child in children]))
     extras = {"crs": source.crs, "datum": options.datum.text}
     tileset = tiles3d.tileset(tiles3d.group(children, whole), whole, **extras)
     write(folder / "tileset.json", _encoded(tileset))
-    return {"notes": [_without_photo(bare)] if bare else []}
+    named = ", ".join(bare[:NAMED]) + (", ..." if len(bare) > NAMED else "")
+    note = f"{count(len(bare), 'tile')} without an orthophoto, in plain colours: {named}"
+    return {"notes": [note] if bare else []}
 
 
 def blocks(nodes: Sequence[Node], folder: Location, place: Place, executor: Executor) -> list[Node]:
@@ -258,7 +249,7 @@ def _raised(
         below[name] = tuple(parts)
         rows = tuple(part.row for part in parts)
         branches.append(Branch(name, LEVELS[number], parts[0].row["cell"], rows, str(folder)))
-    for row in write_pieces(branches, folder, VERSION, branch_piece, place, executor, f"level{number}"):
+    for row in write_outputs(branches, folder, VERSION, branch_output, place, executor, f"level{number}"):
         raised.append(Node(row, below[row["id"]]))
     return sorted(raised, key=lambda node: _cell(node, number))
 
@@ -281,7 +272,7 @@ def _choice(tile: FinishedTile, drape: bool) -> tuple[bool, bool]:
     return textured or not drape, textured or drape
 
 
-def leaf_piece(leaf: TileItem, place: Place, drape: bool) -> Piece:
+def leaf_output(leaf: TileItem, place: Place, drape: bool) -> TileOutput:
     """Return the GLB file of a tile, a record for coarse meshes, and its row.
 
     With ``drape`` its mesh has the orthophoto, even if that of the run has none.
@@ -306,7 +297,7 @@ def leaf_piece(leaf: TileItem, place: Place, drape: bool) -> Piece:
     west, south, east, north = grid.bounds
     cell = math.floor((west + east) / 2 / side), math.floor((south + north) / 2 / side)
     row = row_of(tile.id, cell, placed, 0.0, bool(texture)) | {"bare": draped and not texture}
-    return Piece({uri: _glb(tile, own, place, texture), **files}, row | referred)
+    return TileOutput({uri: _glb(tile, own, place, texture), **files}, row | referred)
 
 
 def _glb(tile: FinishedTile, own: bool, place: Place, texture: glb.Texture | None) -> bytes:
@@ -318,11 +309,6 @@ def _glb(tile: FinishedTile, own: bool, place: Place, texture: glb.Texture | Non
         return data
     normals = mesh_normals(tile.mesh, tile.surface)
     return glb.encode(tile.mesh, (*place.origin, 0.0), texture, normals, tile.id)
-
-
-def _without_photo(ids: Sequence[str]) -> str:
-    named = ", ".join(ids[:NAMED]) + (", ..." if len(ids) > NAMED else "")
-    return f"{count(len(ids), 'tile')} without an orthophoto, in plain colours: {named}"
 
 
 def _encoded(content: dict[str, Any]) -> bytes:

@@ -12,7 +12,7 @@ import typer
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
-from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.cli.stdio import echo, end_for_steps
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.points import LARGEST_STEP_M, STEP_REMEDY, length_text
@@ -90,8 +90,6 @@ def lift(
         echo(f"note: {note}", err=True)
     if result.tile_step_m > LARGEST_STEP_M:
         by = length_text(result.tile_step_m)
-        kind = "note" if allow_steps else "error"
-        echo(f"{kind}: {file}: it lies on tiles that do not meet, by up to {by}; {STEP_REMEDY}", err=True)
-    if result.tile_step_m > LARGEST_STEP_M and not allow_steps:
-        echo("the file is written; --allow-steps takes it as it is", err=True)
-        raise typer.Exit(1)
+        end_for_steps(
+            [f"{file}: it lies on tiles that do not meet, by up to {by}; {STEP_REMEDY}"], allow_steps
+        )

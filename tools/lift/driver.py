@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
-from flexroad.catalog import Bounds
-from flexroad.catalog.crs import in_plan, short
-from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, InputRejected, head
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import made_folder, output_file
@@ -30,13 +24,12 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import passing
-from flexroad.pipeline.run.points import Heights, length_text, to_crs
+from flexroad.pipeline.run.points import length_text
 from flexroad.pipeline.run.sampler import RunSampler, required_crs
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import flag_names
-from flexroad.tasks.types import Floats
 from flexroad.tools.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text
-from flexroad.tools.lift.types import Frame, Lifted, Options
+from flexroad.tools.lift.types import Frame, Lifted, Options, RunSurface, plan_crs
 
 if TYPE_CHECKING:
     import geopandas
@@ -45,8 +38,10 @@ else:
 
 XML_FORMATS: dict[str, ModuleType] = {"OpenDRIVE": opendrive, "net": sumo, "osm": osm}
 """Formats by the name of the outermost element."""
+NOUNS: dict[ModuleType, str] = {opendrive: "road", sumo: "edge", osm: "way"}
+"""What a row of the report is; of other formats, a feature."""
 VECTORS: tuple[ModuleType, ...] = (geopackage, geojson, flatgeobuf, shapefile)
-"""Formats of features; each has its ``SUFFIXES``, and ``begins`` tells it by the first bytes of a file."""
+"""Formats of features. Their heights have the steps beside roads, ``begins`` tells one by its first bytes."""
 KINDS = (
     "OpenDRIVE (.xodr), a network of SUMO (.net.xml), OSM (.osm), a GeoPackage, GeoJSON, FlatGeobuf or "
     "Shapefile"
@@ -58,8 +53,6 @@ PACKED = {
 """What to do with files that are not read, by their first bytes."""
 DISTANCES = {"elevation_m": "", "superelevation_m": " with superelevation"}
 """Distances from the surface in the summary, and what they are with."""
-NEAR_M = 5.0
-"""Distance up to which consecutive points are of one line (m); lines have a height every metre or less."""
 PLACES = ".gpkg"
 """Places above limits are in a file beside the report, of the same name with this suffix."""
 
@@ -156,14 +149,13 @@ def lift(
 ) -> LiftedFile:
     """Write a file with the heights of a run.
 
-    - `ground`: the run.
     - `source`, `out`: the file, and where its copy is written: both are complete files of the same format.
     - `crs`, `offset`: CRS of the file, and what is added to its coordinates (m), if the file does not say
       them.
     - `report`: a CSV with a row per road or feature; places above limits are in a GeoPackage beside it.
     """
     _require_outputs(source, out, report)
-    with _explained(source):
+    try:
         module = _format(source)
         _require_suffix(module, source, out)
         named = module.frame(source)
@@ -172,8 +164,8 @@ def lift(
             place = Frame(place.crs, *offset)
         if place.crs is None:
             raise TaskError("carries no CRS; give it with --crs, such as --crs EPSG:25832")
-        in_run = _InRun(
-            ground, _plan(place.crs), place, required_crs(ground), module.STEPS, crs is not None, _Seen()
+        in_run = RunSurface(
+            ground, plan_crs(place.crs), place, required_crs(ground), module in VECTORS, crs is not None
         )
         with made_folder(out.absolute().parent), ScratchFolder(out.absolute().parent) as scratch:
             with _named(out, Path(scratch)):
@@ -181,103 +173,12 @@ def lift(
             in_run.require_heights()
             files = _move(Path(scratch), out)
             _remove_parts(out, files)
+    except (TaskError, InputRejected) as error:
+        raise ConfigError(f"{source} {error}") from error
     if report is not None:
         files += _write_report(rows, report, in_run)
     seen = in_run.seen
-    return LiftedFile(rows, files, len(seen.earlier), module.NOUN, options, seen.tile_step_m)
-
-
-@dataclass(eq=False)
-class _Seen:
-    """What has been looked up in a run for a file."""
-
-    known: int = 0
-    """Number of points with a height."""
-    bounds: Floats = field(default_factory=lambda: np.array([np.inf, np.inf, -np.inf, -np.inf]))
-    """Of all points, in the CRS of the run."""
-    earlier: set[str] = field(default_factory=set)
-    tile_step_m: float = 0.0
-    """Largest step between tiles on its lines."""
-
-
-@dataclass(frozen=True, eq=False)
-class _InRun:
-    """The surface of a run at coordinates of a file (`RunSurface`)."""
-
-    ground: RunSampler
-    crs: str
-    place: Frame
-    run_crs: str
-    steps: bool
-    given: bool
-    """Whether the user gave the CRS."""
-    seen: _Seen
-
-    def in_crs(self, crs: str | None, layer: str) -> _InRun:
-        """Return the surface for a layer with its own CRS; a CRS that the user gave goes first."""
-        if self.given:
-            return self
-        if crs is None:
-            raise TaskError(
-                f"has the layer {layer} without a CRS; give it with --crs, such as --crs EPSG:25832"
-            )
-        return replace(self, crs=_plan(crs))
-
-    @cached_property
-    def bounds(self) -> Bounds:
-        """West, south, east and north of the tiles of the run (m, in its CRS)."""
-        tiles = np.array([tile.grid.bounds for tile in self.ground.run.catalog.usable])
-        west, south = tiles[:, :2].min(axis=0).tolist()
-        east, north = tiles[:, 2:].max(axis=0).tolist()
-        return west, south, east, north
-
-    def to_run(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return easting and northing (m) in the CRS of the run."""
-        place, x, y = self.place, np.asarray(x), np.asarray(y)
-        ahead, left = math.cos(place.turn), math.sin(place.turn)
-        with np.errstate(invalid="ignore"):
-            east, north = x * ahead - y * left + place.x, x * left + y * ahead + place.y
-        return to_crs(east, north, self.crs, self.run_crs)
-
-    def __call__(self, x: Floats, y: Floats) -> Heights:
-        """Return heights of all levels at coordinates of the file; NaN without a surface."""
-        return self.at(*self.to_run(x, y))
-
-    def at(self, easting: Floats, northing: Floats) -> Heights:
-        """Return heights of all levels at points in the CRS of the run."""
-        found, earlier = self.ground.heights(easting, northing, self.steps)
-        found = replace(found, z=found.z - self.place.z)
-        seen = self.seen
-        seen.earlier.update(earlier)
-        step = self.ground.largest_tile_step(easting, northing, NEAR_M)
-        seen.tile_step_m = max(seen.tile_step_m, step)
-        seen.known += int(np.isfinite(found.z).any(axis=0).sum())
-        inside = np.isfinite(easting) & np.isfinite(northing)
-        if inside.any():
-            part = np.array([[values.min(), values.max()] for values in (easting[inside], northing[inside])])
-            seen.bounds[:2] = np.minimum(seen.bounds[:2], part[:, 0])
-            seen.bounds[2:] = np.maximum(seen.bounds[2:], part[:, 1])
-        return found
-
-    def errors(self, easting: Floats, northing: Floats, numbers: NDArray[np.int8]) -> Floats:
-        """Return the estimated errors (m) at points on levels, in the CRS of the run."""
-        return self.ground.errors(easting, northing, numbers)[0]
-
-    def require_heights(self) -> None:
-        """Raise an error if no point has had a height."""
-        if self.seen.known:
-            return
-        if not np.isfinite(self.seen.bounds).all():
-            raise TaskError("has no road or feature with coordinates")
-        raise TaskError(
-            f"does not lie on the finished tiles: it lies in {_box(self.seen.bounds)}, they in "
-            f"{_box(self.bounds)} ({short(self.run_crs)}); correct its CRS with --crs and --offset"
-        )
-
-
-def _box(bounds: Sequence[float] | Floats) -> str:
-    west, south, east, north = bounds
-    return f"W {west:.0f} S {south:.0f} E {east:.0f} N {north:.0f}"
+    return LiftedFile(rows, files, len(seen.earlier), NOUNS.get(module, "feature"), options, seen.tile_step_m)
 
 
 def _format(source: Path) -> ModuleType:
@@ -319,13 +220,6 @@ def _require_suffix(module: ModuleType, source: Path, out: Path) -> None:
             )
 
 
-def _plan(crs: str) -> str:
-    try:
-        return in_plan(crs)
-    except CatalogError as error:
-        raise TaskError(f"has a CRS that PROJ does not read: {error}; give another one with --crs") from error
-
-
 def _require_outputs(source: Path, out: Path, report: Path | None) -> None:
     """Raise an error if an output would replace the input, or another output."""
     files = [
@@ -351,15 +245,6 @@ def _named(out: Path, scratch: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror or str(error), str(out)) from error
 
 
-@contextmanager
-def _explained(source: Path) -> Iterator[None]:
-    """Name the file in errors of reading it."""
-    try:
-        yield
-    except (TaskError, InputRejected) as error:
-        raise ConfigError(f"{source} {error}") from error
-
-
 def _move(scratch: Path, out: Path) -> tuple[Path, ...]:
     """Move the files that a format has written into their places; the one that was asked for is the last."""
     made = sorted(path for path in scratch.iterdir() if path.is_file() and not path.name.startswith("."))
@@ -381,7 +266,7 @@ def _remove_parts(out: Path, files: Sequence[Path]) -> None:
                 part.unlink()
 
 
-def _write_report(rows: Sequence[Lifted], report: Path, in_run: _InRun) -> tuple[Path, ...]:
+def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> tuple[Path, ...]:
     """Write the table, and the places above limits if there are any; return the files."""
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, list(_row(Lifted(""))), lineterminator="\n")

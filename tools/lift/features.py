@@ -91,7 +91,7 @@ def lifted(
     - `features`: some of a layer's: they are in memory together.
     """
     paths = _Paths.of(features, run)
-    ends = np.cumsum(paths.samples_of_feature(len(features)))
+    ends = np.cumsum(np.bincount(paths.feature, paths.pieces, len(features)).astype(np.intp))
     first = 0
     while first < len(features):
         before = ends[first - 1] if first else 0
@@ -142,10 +142,6 @@ class _Paths:
         pieces[near] = np.clip(np.ceil(length[near] / STEP_M), 1, MOST_PIECES)
         owner = np.repeat(np.array(owners, np.intp), sizes)
         return cls(values, east, north, path_of, owner, pieces, length)
-
-    def samples_of_feature(self, count: int) -> NDArray[np.intp]:
-        """Return the number of points of each feature at which the surface is looked up."""
-        return np.bincount(self.feature, self.pieces, count).astype(np.intp)
 
     def of_features(self, first: int, last: int) -> _Paths:
         """Return the paths of some features."""
@@ -330,7 +326,8 @@ def _with_heights(
     place = slice(paths[0].start, paths[-1].end)
     known = np.isfinite(group.z[place])
     if not known.any():
-        length = sum(_length(path, group.samples) for path in paths)
+        along = group.samples.along
+        length = sum(float(along[path.end - 1] - along[path.start]) for path in paths)
         points = sum(path.code == POINT for path in paths)
         of_lines = length if points < len(paths) else np.nan
         return shape, Lifted(feature.id, of_lines, length, (), points_without_ground=points)
@@ -348,10 +345,6 @@ def _with_heights(
         new.append(values if path.m else values[:, :3])
         kept.append(chosen)
     return shape.with_paths(iter(new)), _row(feature, paths, z, kept, group)
-
-
-def _length(path: _Path, samples: _Samples) -> float:
-    return float(samples.along[path.end - 1] - samples.along[path.start])
 
 
 def _line(path: _Path, samples: _Samples) -> Line:

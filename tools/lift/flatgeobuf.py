@@ -23,7 +23,7 @@ from flexroad.tools.lift.features import (
     wanted_levels,
     with_zero,
 )
-from flexroad.tools.lift.shapes import of_wkb, to_wkb
+from flexroad.tools.lift.shapes import COLLECTION, NAMES, POINT, of_wkb, to_wkb
 from flexroad.tools.lift.types import Frame, Lifted, Options, RunSurface
 
 pyogrio = lazy("pyogrio")
@@ -32,20 +32,8 @@ if TYPE_CHECKING:
 else:
     pa = lazy("pyarrow")
 
-NOUN = "feature"
-"""What a row of the report is."""
-STEPS = True
-"""Whether heights have the steps beside roads."""
 SUFFIXES = (".fgb",)
-KINDS = (
-    "Point",
-    "LineString",
-    "Polygon",
-    "MultiPoint",
-    "MultiLineString",
-    "MultiPolygon",
-    "GeometryCollection",
-)
+KINDS = NAMES[POINT : COLLECTION + 1]
 """Types of layers that GDAL writes with z; those of layers with several types it does not."""
 
 
@@ -87,7 +75,10 @@ def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator
         ):
             warnings.filterwarnings("ignore", "'crs' was not provided")
             geometry, reader = opened[0]["geometry_name"] or "wkb_geometry", opened[1]
-            schema = _schema(reader.schema, options)
+            schema = reader.schema
+            for column in COLUMNS if options.columns else ():
+                new, at = pa.field(column, pa.float64()), schema.get_field_index(column)
+                schema = schema.append(new) if at < 0 else schema.set(at, new)
             tables = _lifted_tables(reader, schema, geometry, run, options, rows, failures)
             metadata = info["layer_metadata"] or {}
             pyogrio.raw.write_arrow(
@@ -122,14 +113,6 @@ def _general_reader() -> Iterator[None]:
         yield
     finally:
         pyogrio.set_gdal_config_options({option: before})
-
-
-def _schema(given: pa.Schema, options: Options) -> pa.Schema:
-    """Return the columns of the copy."""
-    for name in COLUMNS if options.columns else ():
-        new, at = pa.field(name, pa.float64()), given.get_field_index(name)
-        given = given.append(new) if at < 0 else given.set(at, new)
-    return given
 
 
 def _lifted_tables(

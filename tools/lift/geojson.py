@@ -33,10 +33,6 @@ from flexroad.tools.lift.features import (
 from flexroad.tools.lift.shapes import COLLECTION, LINE, NAMES, POINT, POLYGON, Shape
 from flexroad.tools.lift.types import Frame, Lifted, Options, RunSurface
 
-NOUN = "feature"
-"""What a row of the report is."""
-STEPS = True
-"""Whether heights have the steps beside roads."""
 SUFFIXES = (".geojson", ".json")
 DEGREES = "EPSG:4326"
 """The CRS of files that name none, with longitude first."""

@@ -32,10 +32,6 @@ from flexroad.tools.lift.features import (
 from flexroad.tools.lift.shapes import Shape, of_wkb, to_wkb
 from flexroad.tools.lift.types import Frame, Lifted, Options, RunSurface
 
-NOUN = "feature"
-"""What a row of the report is."""
-STEPS = True
-"""Whether heights have the steps beside roads."""
 SUFFIXES = (".gpkg",)
 ENVELOPES = (0, 32, 48, 48, 64)
 """Size of the envelope of a geometry by its number in the flags."""
@@ -77,7 +73,11 @@ def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator
             layers = _layers(file)
             for layer in layers:
                 yield from _lift_layer(file, layer, run, options, len(layers) > 1)
-            _make_views_3d(file)
+            # Views may show geometries with heights.
+            file.execute(
+                "UPDATE gpkg_geometry_columns SET z = 2 WHERE z = 0 AND lower(table_name) IN "
+                "(SELECT lower(name) FROM sqlite_master WHERE type = 'view')"
+            )
             file.commit()
         except sqlite3.Error as error:
             raise TaskError(f"cannot be changed as a GeoPackage: {error}; repair it with ogr2ogr") from error
@@ -230,11 +230,3 @@ def _blob(old: bytes, shape: Shape) -> bytes:
     has_envelope = flags >> 1 & 7 > 0
     header = old[:3] + struct.pack("B", flags & ~0b1110 | 0b10 * has_envelope) + old[4:8]
     return header + (old[8:40] if has_envelope else b"") + to_wkb(shape)
-
-
-def _make_views_3d(file: sqlite3.Connection) -> None:
-    """Say that views may show geometries with heights."""
-    file.execute(
-        "UPDATE gpkg_geometry_columns SET z = 2 WHERE z = 0 AND lower(table_name) IN "
-        "(SELECT lower(name) FROM sqlite_master WHERE type = 'view')"
-    )

@@ -38,7 +38,6 @@ class Line:
     def of(cls, x: Floats, y: Floats, metres: tuple[float, float] = (1.0, 1.0), step: float = STEP_M) -> Line:
         """Return a line with points between its vertices, at most ``step`` from each other (m).
 
-        - `x`, `y` ``(k,)``: its vertices.
         - `metres`: length of a unit of x and of y (m).
         """
         with np.errstate(over="ignore", invalid="ignore"):

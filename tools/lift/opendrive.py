@@ -36,10 +36,6 @@ from flexroad.tools.lift.road_profiles import AHEAD_M, NONE, CrossSections
 from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
-NOUN = "road"
-"""What a row of the report is."""
-STEPS = False
-"""Whether heights have the steps beside roads: OpenDRIVE has kerbs in its plan_view."""
 ALONG_M, LEAST_ALONG = 1.0, 4
 """Distance of the cross-sections of a road (m), and their least number, less one."""
 ACROSS_M = 1.0
@@ -118,15 +114,6 @@ class Road:
         return np.concatenate(x), np.concatenate(y)
 
 
-@dataclass(frozen=True)
-class Left:
-    """A road that stays as it is, and why."""
-
-    part: Part
-    id: str
-    note: str
-
-
 def frame(source: Path) -> Frame:
     """Return where the coordinates of a file are: its ``geoReference`` and ``offset``."""
     with xml_text.opened(source) as file:
@@ -150,35 +137,30 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
     of_links = _Linked(source, heights)
     with xml_text.opened(source) as file, xml_text.written(out) as copy:
         parts = map(_read, xml_text.parts(file, {"road"}))
-        for part, found in with_heights(parts, _places, heights):
-            if isinstance(part, bytes):
-                copy.write(part)
-            elif isinstance(part, Left) or found is None:
-                assert isinstance(part, Left)
-                copy.write(part.part.text)
-                yield Lifted(part.id, note=part.note)
-            else:
-                text, row = _lifted(part, found, options, of_links)
-                copy.write(text)
+        for part, found in with_heights(
+            parts, lambda each: each.places() if isinstance(each, Road) else None, heights
+        ):
+            if isinstance(part, Road):
+                assert found is not None
+                part = _lifted(part, found, options, of_links)
+            text, row = part
+            copy.write(text)
+            if row is not None:
                 yield row
 
 
-def _places(part: bytes | Left | Road) -> tuple[Floats, Floats] | None:
-    return part.places() if isinstance(part, Road) else None
-
-
-def _read(part: bytes | Part) -> bytes | Left | Road:
-    """Return a road, or why it stays as it is."""
+def _read(part: bytes | Part) -> Road | tuple[bytes, Lifted | None]:
+    """Return a road, or a text that stays as it is; of a road, with its row, which says why."""
     if isinstance(part, bytes):
-        return part
+        return part, None
     name = part.element.get("id", "")
     if part.path != ("OpenDRIVE",):
-        return part.text
+        return part.text, None
     try:
         with np.errstate(all="ignore"):
             return _road(part, name)
     except TaskError as error:
-        return Left(part, name, f"{error}; it stays as it was")
+        return part.text, Lifted(name, note=f"{error}; it stays as it was")
 
 
 def _road(part: Part, name: str) -> Road:

@@ -33,10 +33,6 @@ from flexroad.tools.lift.network import (
 from flexroad.tools.lift.types import POINTS, Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
-NOUN = "way"
-"""What a row of the report is."""
-STEPS = False
-"""Whether heights have the steps beside roads."""
 STEP_M = 1.0
 """Largest distance of points at which the heights of a way are taken (m)."""
 DEGREES, LOCAL = ("lon", "lat"), ("local_x", "local_y")

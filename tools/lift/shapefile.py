@@ -12,7 +12,6 @@ import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -40,10 +39,6 @@ from flexroad.tools.lift.types import Frame, Lifted, Options, RunSurface
 
 pyogrio = lazy("pyogrio")
 
-NOUN = "feature"
-"""What a row of the report is."""
-STEPS = True
-"""Whether heights have the steps beside roads."""
 SUFFIXES = (".shp",)
 KEPT = (*(end for end in SHAPEFILE_PARTS if end not in (".shx", ".dbf")), ".qpj", ".qml", ".sld", ".shp.xml")
 """Files that are copied: projection, encoding, indices, styles, description."""
@@ -54,6 +49,10 @@ NO_M = -1e39
 COLUMNS = (b"grade_pct", b"crossf_pct", b"error_m")
 """The columns on request, whose names have at most ten characters here."""
 WIDTH, DECIMALS = 12, 4
+
+
+_Record = tuple[int, bytes]
+"""Number and data of a geometry of the file."""
 
 
 def begins(data: bytes) -> bool:
@@ -105,14 +104,6 @@ def _parts(source: Path) -> dict[str, Path]:
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Record:
-    """A geometry of the file; empty data if there is none."""
-
-    number: int
-    data: bytes
-
-
 def _lifted(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
     """Write ``.shp`` and ``.shx``; yield the rows."""
     with ExitStack() as stack:
@@ -128,17 +119,17 @@ def _lifted(source: Path, out: Path, run: RunSurface, options: Options) -> Itera
                 f"has geometries of the type {code}, which is none of points, lines and polygons; write "
                 "them as such with ogr2ogr -nlt"
             )
-        copy = _Copy(shapes, index, code % 10, code > 10, header)
+        copy = _Copy(shapes, index, code % 10, header)
         for records, levels in _batches(source, file):
             features = []
-            for record, level in zip(records, levels, strict=True):
+            for (number, data), level in zip(records, levels, strict=True):
                 try:
-                    shape = _shape(record.data, code)
+                    shape = _shape(data, code)
                 except (struct.error, ValueError) as error:
                     raise TaskError(
-                        f"has the damaged feature {record.number}; repair the file with ogr2ogr"
+                        f"has the damaged feature {number}; repair the file with ogr2ogr"
                     ) from error
-                features.append(Feature(str(record.number), shape, level))
+                features.append(Feature(str(number), shape, level))
             for shape, row in lifted(features, run, options):
                 shape, row = with_zero(shape, row)
                 copy.add(shape)
@@ -151,7 +142,7 @@ def _batches(source: Path, file: BinaryIO) -> Iterator[tuple[list[_Record], list
     batch, size, first = list[_Record](), 0, 0
     for record in _records(file):
         batch.append(record)
-        size += len(record.data)
+        size += len(record[1])
         if size > BATCH_BYTES or len(batch) == BATCH_FEATURES:
             yield batch, _levels(source, first, len(batch))
             first += len(batch)
@@ -167,7 +158,7 @@ def _records(file: BinaryIO) -> Iterator[_Record]:
         at += 8 + size
         if size < 4 or at > whole:
             raise TaskError("is a damaged Shapefile: it ends in a feature; repair it with ogr2ogr")
-        yield _Record(number, file.read(size))
+        yield number, file.read(size)
         number += 1
 
 
@@ -231,7 +222,7 @@ def _shape(data: bytes, of_file: int) -> Shape | None:
 class _Copy:
     """The files ``.shp`` and ``.shx`` that are written."""
 
-    def __init__(self, shapes: BinaryIO, index: BinaryIO, code: int, z_or_m: bool, header: bytes) -> None:
+    def __init__(self, shapes: BinaryIO, index: BinaryIO, code: int, header: bytes) -> None:
         self.shapes, self.index, self.code, self.header = shapes, index, 10 + code, header
         self.count, self.at = 0, 100
         self.low, self.high = np.full(2, np.inf), np.full(2, -np.inf)

@@ -34,10 +34,6 @@ from flexroad.tools.lift.network import (
 from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
-NOUN = "edge"
-"""What a row of the report is."""
-STEPS = False
-"""Whether heights have the steps beside roads."""
 NO_PROJECTION = ("", "!", "-", ".")
 """Values of ``projParameter`` of networks without a CRS."""
 FAR_M = 1e12

@@ -1,46 +1,32 @@
-"""What the formats have in common: heights of all levels at points, options, and the rows of the report."""
+"""What the formats have in common: the surface of a run for a file, options, and the rows of the report."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from typing import Literal, Protocol, TypeVar
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog import Bounds
+from flexroad.catalog.crs import in_plan, short
+from flexroad.catalog.errors import CatalogError
 from flexroad.pipeline.config.options import METHOD, OUTPUTS, option
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.points import Heights, to_crs
+from flexroad.pipeline.run.sampler import RunSampler
+from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
 HeightsAt = Callable[[Floats, Floats], Heights]
 """Heights at x and y, ``(n,)`` each, in the coordinates of the file."""
+NEAR_M = 5.0
+"""Distance up to which consecutive points are of one line (m); lines have a height every metre or less."""
 POINTS = 500_000
 """Number of points of a batch: some 200 MB with their heights and what they belong to."""
 T = TypeVar("T")
-
-
-class RunSurface(Protocol):
-    """The surface of a run for a file, or for a layer of a file with several."""
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """West, south, east and north of the tiles of the run (m, in its CRS)."""
-
-    def __call__(self, x: Floats, y: Floats) -> Heights:
-        """Return the heights at coordinates of the file."""
-
-    def to_run(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return easting and northing (m) in the CRS of the run."""
-
-    def at(self, easting: Floats, northing: Floats) -> Heights:
-        """Return the heights at points in the CRS of the run."""
-
-    def errors(self, easting: Floats, northing: Floats, numbers: NDArray[np.int8]) -> Floats:
-        """Return the estimated errors (m) at points on levels; NaN where they are not known."""
-
-    def in_crs(self, crs: str | None, layer: str) -> RunSurface:
-        """Return the surface for a layer with its own CRS; a CRS that the user gave goes first."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +40,107 @@ class Frame:
     z: float = 0.0
     turn: float = 0.0
     """Radians, counter-clockwise."""
+
+
+@dataclass(eq=False)
+class _Seen:
+    """What has been looked up in a run for a file."""
+
+    known: int = 0
+    """Number of points with a height."""
+    bounds: Floats = field(default_factory=lambda: np.array([np.inf, np.inf, -np.inf, -np.inf]))
+    """Of all points, in the CRS of the run."""
+    earlier: set[str] = field(default_factory=set)
+    tile_step_m: float = 0.0
+    """Largest step between tiles on its lines."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunSurface:
+    """The surface of a run at coordinates of a file, or of a layer of a file with several."""
+
+    ground: RunSampler
+    crs: str
+    place: Frame
+    run_crs: str
+    steps: bool
+    given: bool
+    """Whether the user gave the CRS."""
+    seen: _Seen = field(default_factory=_Seen)
+
+    def in_crs(self, crs: str | None, layer: str) -> RunSurface:
+        """Return the surface for a layer with its own CRS; a CRS that the user gave goes first."""
+        if self.given:
+            return self
+        if crs is None:
+            raise TaskError(
+                f"has the layer {layer} without a CRS; give it with --crs, such as --crs EPSG:25832"
+            )
+        return replace(self, crs=plan_crs(crs))
+
+    @cached_property
+    def bounds(self) -> Bounds:
+        """West, south, east and north of the tiles of the run (m, in its CRS)."""
+        tiles = np.array([tile.grid.bounds for tile in self.ground.run.catalog.usable])
+        west, south = tiles[:, :2].min(axis=0).tolist()
+        east, north = tiles[:, 2:].max(axis=0).tolist()
+        return west, south, east, north
+
+    def to_run(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Return easting and northing (m) in the CRS of the run."""
+        place, x, y = self.place, np.asarray(x), np.asarray(y)
+        ahead, left = math.cos(place.turn), math.sin(place.turn)
+        with np.errstate(invalid="ignore"):
+            east, north = x * ahead - y * left + place.x, x * left + y * ahead + place.y
+        return to_crs(east, north, self.crs, self.run_crs)
+
+    def __call__(self, x: Floats, y: Floats) -> Heights:
+        """Return heights of all levels at coordinates of the file; NaN without a surface."""
+        return self.at(*self.to_run(x, y))
+
+    def at(self, easting: Floats, northing: Floats) -> Heights:
+        """Return heights of all levels at points in the CRS of the run."""
+        found, earlier = self.ground.heights(easting, northing, self.steps)
+        found = replace(found, z=found.z - self.place.z)
+        seen = self.seen
+        seen.earlier.update(earlier)
+        step = self.ground.largest_tile_step(easting, northing, NEAR_M)
+        seen.tile_step_m = max(seen.tile_step_m, step)
+        seen.known += int(np.isfinite(found.z).any(axis=0).sum())
+        inside = np.isfinite(easting) & np.isfinite(northing)
+        if inside.any():
+            part = np.array([[values.min(), values.max()] for values in (easting[inside], northing[inside])])
+            seen.bounds[:2] = np.minimum(seen.bounds[:2], part[:, 0])
+            seen.bounds[2:] = np.maximum(seen.bounds[2:], part[:, 1])
+        return found
+
+    def errors(self, easting: Floats, northing: Floats, numbers: NDArray[np.int8]) -> Floats:
+        """Return the estimated errors (m) at points on levels, in the CRS of the run."""
+        return self.ground.errors(easting, northing, numbers)[0]
+
+    def require_heights(self) -> None:
+        """Raise an error if no point has had a height."""
+        if self.seen.known:
+            return
+        if not np.isfinite(self.seen.bounds).all():
+            raise TaskError("has no road or feature with coordinates")
+        raise TaskError(
+            f"does not lie on the finished tiles: it lies in {_box(self.seen.bounds)}, they in "
+            f"{_box(self.bounds)} ({short(self.run_crs)}); correct its CRS with --crs and --offset"
+        )
+
+
+def _box(bounds: Sequence[float] | Floats) -> str:
+    west, south, east, north = bounds
+    return f"W {west:.0f} S {south:.0f} E {east:.0f} N {north:.0f}"
+
+
+def plan_crs(crs: str) -> str:
+    """Return the horizontal part of the CRS of a file."""
+    try:
+        return in_plan(crs)
+    except CatalogError as error:
+        raise TaskError(f"has a CRS that PROJ does not read: {error}; give another one with --crs") from error
 
 
 @dataclass(frozen=True)
@@ -143,7 +230,6 @@ def with_heights(
     """Yield each part, in its order, with the heights of its points: a run reads each tile once per batch.
 
     - `points`: returns x and y of the points of a part, ``(n,)`` each; None if it needs no heights.
-    - `heights`: heights of a run.
     """
     batch, size = list[tuple[T, tuple[Floats, Floats] | None]](), 0
     for part in parts:

@@ -67,7 +67,12 @@ def load_arrays(
     if not isinstance(road_mask, Source):
         patches["road_mask"] = _patch("road_mask", road_mask)
     core = _grid(patches["dsm"])
-    _check_scale(core)
+    try:
+        require_scale(
+            "dsm", core.crs, core.bounds, "reproject it to metres, e.g. dsm.rio.reproject('{zone}')"
+        )
+    except CatalogError as error:
+        raise TaskError(str(error)) from error
     grid = core.buffered(options.halo_m)
     notes: list[str | None] = [_absurd(patches[name]) for name in ("dsm", "dtm")]
     notes += [_misfit(patch, core) for name, patch in patches.items() if name != "dsm"]
@@ -133,15 +138,6 @@ def _crs(name: str, array: xr.DataArray) -> str:
     if not is_projected(crs) or not math.isclose(metres, 1.0):
         raise TaskError(f"{name} is in {short(crs)}, whose coordinates are in {unit}; {remedy}")
     return crs
-
-
-def _check_scale(grid: Grid) -> None:
-    """Raise an error if a metre of the CRS is none on the ground."""
-    remedy = "reproject it to metres, e.g. dsm.rio.reproject('{zone}')"
-    try:
-        require_scale("dsm", grid.crs, grid.bounds, remedy)
-    except CatalogError as error:
-        raise TaskError(str(error)) from error
 
 
 def _check_unit(name: str, array: xr.DataArray, crs: str) -> None:

@@ -67,7 +67,6 @@ def read_points(path: Path, given: str | None = None, layer: str | None = None) 
     """Read the points of a CSV or vector file.
 
     - `path`: a vector file if its name ends like one (`VECTOR_SUFFIXES`), else a CSV (`parse_csv`).
-    - `given`: CRS of the points, as the user says it.
     - `layer`: layer of a vector file; needed if it has several.
     """
     if path.suffix.lower() in VECTOR_SUFFIXES:
@@ -86,10 +85,6 @@ def parse_csv(data: bytes, name: str, given: str | None = None) -> Points:
     decimal commas; else with a tab by tabs; else by commas. The coordinates are the columns ``easting`` and
     ``northing`` or ``x`` and ``y``. Without these, or with a CRS in degrees, they are ``longitude`` and
     ``latitude`` or ``lon`` and ``lat``, in WGS 84 if no CRS is given.
-
-    - `data`: the file, in UTF-8.
-    - `name`: its name, for messages.
-    - `given`: CRS of the coordinates, as the user says it.
     """
     try:
         text = data.decode("utf-8-sig")
@@ -211,7 +206,6 @@ def read_lines(given: str, crs: str | None, layer: str | None, run_crs: str) -> 
       touch at their ends are one line.
     - `crs`: CRS of the lines, as the user says it; None: that of the file, or for vertices that of the run.
     - `layer`: layer of a vector file; needed if it has several.
-    - `run_crs`: CRS of the result.
     """
     if _COORDINATES.fullmatch(given) and not Path(given).exists():
         lines, source = [_vertices(given)], crs

@@ -4,8 +4,8 @@ For tests, benchmarks and a first try. Start at `scenes.write_scenes`, then `sce
 houses, trees and cars of one tile.
 """
 
-from flexroad.tools.synthetic.options import SceneOptions, block
 from flexroad.tools.synthetic.scene import Scene, make_scene
 from flexroad.tools.synthetic.spoilers import Kind
+from flexroad.tools.synthetic.world import SceneOptions, block
 
 __all__ = ["Kind", "Scene", "SceneOptions", "block", "make_scene"]

@@ -10,9 +10,9 @@ import numpy as np
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.types import Floats
 from flexroad.tools.synthetic.network import Plan, Stream, Street
-from flexroad.tools.synthetic.options import DEFAULTS, SceneOptions
 from flexroad.tools.synthetic.scene import plan_of
 from flexroad.tools.synthetic.surfaces import CIRCLE_M, ISLAND_M, SUNKEN_M
+from flexroad.tools.synthetic.world import DEFAULTS, SceneOptions
 
 STEP_M = 5.0
 """Distance between the points of a line (m)."""

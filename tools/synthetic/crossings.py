@@ -23,13 +23,12 @@ from flexroad.tasks.options import Options
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.centrelines import MAIN, MARGIN_M, SIDE, CentreLine
 from flexroad.tools.synthetic.network import Plan
-from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.objects import Car, Crown
-from flexroad.tools.synthetic.options import SOUTH_M, WEST_M
 from flexroad.tools.synthetic.population import Objects, Trace
 from flexroad.tools.synthetic.scene import DTM_BLUR_M, Scene, terrain_model
 from flexroad.tools.synthetic.spoilers import Canvas, surface_model
 from flexroad.tools.synthetic.surfaces import CROSSFALL, Relief, relief, smoothstep
+from flexroad.tools.synthetic.world import SOUTH_M, WEST_M, generator
 
 SPACING_M = 200.0
 """Distance between the crossings of the main road (m)."""
@@ -177,7 +176,9 @@ class Crossings:
             half, end = crossing.half_length_m, SPACING_M / 2
             for low, high, level in ((-end, -half, 0), (-half, half, crossing.level), (half, end, 0)):
                 lines.append(CentreLine(self._line(crossing, low, high), 2 * MAIN_M, MAIN, level))
-            lines.append(CentreLine(self._cross_line(crossing), 2 * CROSS_M, SIDE))
+            t = np.array([-REACH_M, REACH_M])
+            line = self._on_map(crossing.along + t * math.sin(crossing.skew), t * math.cos(crossing.skew))
+            lines.append(CentreLine(line, 2 * CROSS_M, SIDE))
         return lines
 
     def road(self, easting: Floats, northing: Floats) -> Bools:
@@ -300,10 +301,6 @@ class Crossings:
     def _line(self, crossing: _Crossing, low: float, high: float) -> Floats:
         """Return the ends of a piece of the main road, ``(2, 2)``, by distances from the crossing (m)."""
         return self._on_map(crossing.along + np.array([low, high]), np.zeros(2))
-
-    def _cross_line(self, crossing: _Crossing) -> Floats:
-        t = np.array([-REACH_M, REACH_M])
-        return self._on_map(crossing.along + t * math.sin(crossing.skew), t * math.cos(crossing.skew))
 
     def _on_map(self, s: Floats, v: Floats) -> Floats:
         return np.column_stack(self.plan.to_map(s + self._origin[0], v + self._origin[1]))

@@ -26,10 +26,9 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks import options as base
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.synthetic.noise import field, generator, waves
-from flexroad.tools.synthetic.options import SOUTH_M, WEST_M, SceneOptions
 from flexroad.tools.synthetic.scene import Scene, true_height
 from flexroad.tools.synthetic.spoilers import Kind
+from flexroad.tools.synthetic.world import SOUTH_M, WEST_M, SceneOptions, field, generator, waves
 
 CRS = "EPSG:32632"
 """UTM zone 32 on WGS 84, as for DSC3D's own meshes."""

@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from flexroad.catalog.grid import Grid
-from flexroad.tools.synthetic.noise import generator
-from flexroad.tools.synthetic.options import SOUTH_M, WEST_M, SceneOptions
+from flexroad.tools.synthetic.world import SOUTH_M, WEST_M, SceneOptions, generator
 
 STRATA = {"urban": 168, "suburban": 23, "rural": 49}
 """Tiles of the complete benchmark, as in the paper."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
-from flexroad.tools.synthetic.noise import generator
+from flexroad.tools.synthetic.world import generator
 
 Box = tuple[float, float, float, float]
 """Lowest x and y, highest x and y in the plan's frame (m)."""

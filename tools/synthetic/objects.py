@@ -16,8 +16,8 @@ import numpy as np
 
 from flexroad.tasks.types import Floats
 from flexroad.tools.synthetic.network import Street
-from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.surfaces import Ground
+from flexroad.tools.synthetic.world import generator
 
 GroundAt = Callable[[Floats, Floats], Ground]
 """x and y in the plan's frame -> the ground there."""

@@ -16,10 +16,9 @@ from scipy import ndimage
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.synthetic.noise import generator, waves
-from flexroad.tools.synthetic.options import DEFAULTS, SceneOptions
 from flexroad.tools.synthetic.scene import Scene, make_scene
 from flexroad.tools.synthetic.spoilers import Kind
+from flexroad.tools.synthetic.world import DEFAULTS, SceneOptions, generator, waves
 
 Picture = NDArray[np.float32]
 """``(H, W, 3)``, red, green and blue, 0 to 255."""

@@ -13,9 +13,9 @@ from flexroad.catalog.lazy import lazy
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.prepare.mesh.sample import TexturedMesh
 from flexroad.tools.synthetic.dsc3d import Place, Reconstruction, reconstruct
-from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.orthophoto import orthophoto
 from flexroad.tools.synthetic.scene import Scene, make_scene
+from flexroad.tools.synthetic.world import generator
 
 PIL = lazy("PIL")
 pv = lazy("pyvista")
@@ -67,7 +67,9 @@ def photogrammetry(place: Place, seed: int) -> _PhotogrammetryScene:
     height = reconstruction.height[reconstruction.grid.cells(x + origin[0], y + origin[1])]
     centres = np.column_stack([x, y, height - origin[2] + rng.uniform(*FLOATING_M, number)])
     floating, pieces = fragments(centres, rng)
-    vertices, faces = _mesh(reconstruction, site.triangles - len(pieces), origin)
+    east, north = reconstruction.grid.eastings - origin[0], reconstruction.grid.northings - origin[1]
+    nodes = lattice(east, north, reconstruction.height - origin[2], reconstruction.open)
+    vertices, faces = simplified(*nodes, site.triangles - len(pieces))
     faces = np.concatenate([faces, pieces + np.int32(len(vertices))])
     vertices = np.concatenate([vertices, floating])
     vertices[:, :2] = np.clip(vertices[:, :2], 0, np.array([grid.width, grid.height]) * grid.cell)
@@ -82,13 +84,6 @@ def _nodes(grid: Grid) -> Grid:
     cells = Grid.covering(grid.crs, grid.bounds, NODE_M)
     west, north = grid.west - NODE_M / 2, grid.north + NODE_M / 2
     return Grid(grid.crs, west, north, NODE_M, cells.width + 1, cells.height + 1)
-
-
-def _mesh(reconstruction: Reconstruction, triangles: int, origin: Floats) -> tuple[Floats, Faces]:
-    east, north = reconstruction.grid.eastings - origin[0], reconstruction.grid.northings - origin[1]
-    return simplified(
-        *lattice(east, north, reconstruction.height - origin[2], reconstruction.open), triangles
-    )
 
 
 def _textured(

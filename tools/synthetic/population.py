@@ -12,7 +12,6 @@ import numpy as np
 
 from flexroad.tasks.types import Floats
 from flexroad.tools.synthetic.network import Street
-from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.objects import (
     CORNER_M,
     Car,
@@ -28,7 +27,7 @@ from flexroad.tools.synthetic.objects import (
     spots,
     towers,
 )
-from flexroad.tools.synthetic.options import SceneOptions
+from flexroad.tools.synthetic.world import SceneOptions, generator
 
 KERB_REACH_M = 2.5
 """Greatest distance of a parked car's centre from the kerb (m); farther ones are in a roundabout's lane."""

@@ -16,14 +16,21 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.prepare.points.binning import Points, bins
 from flexroad.tools.synthetic.network import Box, Plan, find_stratum
-from flexroad.tools.synthetic.noise import field, generator
 from flexroad.tools.synthetic.objects import GroundAt
-from flexroad.tools.synthetic.options import DEFAULTS, SceneOptions
 from flexroad.tools.synthetic.population import Objects, populate
-from flexroad.tools.synthetic.segmentation import segmentation
 from flexroad.tools.synthetic.spoilers import BARE, Canvas, Kind, surface_model
 from flexroad.tools.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
-from flexroad.tools.synthetic.survey_errors import changes, growth, hidden, mixed, rise, scars, water
+from flexroad.tools.synthetic.survey_errors import (
+    changes,
+    growth,
+    hidden,
+    mixed,
+    rise,
+    scars,
+    segmentation,
+    water,
+)
+from flexroad.tools.synthetic.world import DEFAULTS, SceneOptions, field, generator
 
 __all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.network import Stream, Street
-from flexroad.tools.synthetic.noise import Waves, field, generator, waves
+from flexroad.tools.synthetic.world import Waves, field, generator, waves
 
 CROSSFALL = 0.025
 """Mean cross slope from a street's middle to its edge."""

@@ -10,18 +10,22 @@ penetrate, mixed cells at edges and walls, errors of a terrain model under house
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.special import ndtri
 
+from flexroad.catalog.grid import Grid
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.network import Stream, Street
-from flexroad.tools.synthetic.noise import field, generator
-from flexroad.tools.synthetic.objects import Crown, House, from_middle
-from flexroad.tools.synthetic.spoilers import Canvas
+from flexroad.tools.synthetic.objects import Crown, GroundAt, House, Roof, from_middle
+from flexroad.tools.synthetic.population import Area, Objects
+from flexroad.tools.synthetic.spoilers import Canvas, covered
 from flexroad.tools.synthetic.surfaces import BED_M
+from flexroad.tools.synthetic.world import SceneOptions, field, generator
 
 KINDS = ("surface", "kerb", "excavation")
 LENGTH_M = {"surface": (30.0, 100.0), "kerb": (8.0, 30.0), "excavation": (4.0, 20.0)}
@@ -44,6 +48,14 @@ TILT = 0.5
 """Tilt of a scar, as a fraction of its depth."""
 SPREAD = 0.5
 """Greatest deviation of the length of a crown's hidden ground, relative: crowns are not equally dense."""
+WOBBLE_M = (5.0, 40.0)
+"""Shortest and longest wave of the offset of the mask's edges (m)."""
+STRETCH_M = (20.0, 120.0)
+"""Shortest and longest wave of the fields that say where the mask reaches beyond the carriageway (m)."""
+SOLID = 0.8
+"""Radius of the part of a crown that hides what is below, as a fraction of the crown's radius."""
+FACADE_REACH_M = 8.0
+"""Greatest distance from the carriageway of a facade that is mistaken for road (m)."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +73,11 @@ class _Change:
 
 def changes(streets: Sequence[Street], seed: int, mean: float) -> tuple[_Change, ...]:
     """Return the changes of some streets, ``mean`` per street on average."""
-    return tuple(change for street in streets for change in _of(street, seed, mean)) if mean > 0 else ()
-
-
-def _of(street: Street, seed: int, mean: float) -> list[_Change]:
-    rng = generator(seed, "works", *street.key)
-    return [_drawn(street, str(rng.choice(KINDS)), rng) for _ in range(rng.poisson(mean))]
+    found = list[_Change]()
+    for street in streets if mean > 0 else ():
+        rng = generator(seed, "works", *street.key)
+        found += [_drawn(street, str(rng.choice(KINDS)), rng) for _ in range(rng.poisson(mean))]
+    return tuple(found)
 
 
 def _drawn(street: Street, kind: str, rng: np.random.Generator) -> _Change:
@@ -169,3 +180,101 @@ def water(canvas: Canvas, streams: Iterable[Stream]) -> Bools:
         if not stream.paved:
             wet |= stream.distance(canvas.x, canvas.y) < BED_M
     return wet
+
+
+def segmentation(
+    canvas: Canvas, edge: Floats, objects: Objects, ground_at: GroundAt, options: SceneOptions
+) -> Bools:
+    """Return the road mask with the errors of a segmentation, ``(H, W)``.
+
+    - `edge`: distance of the cells to the nearest carriageway's edge, negative on the road (m).
+    - `objects`: objects: crowns hide the road; spots, and some areas, roofs and facades, are classified
+      wrongly.
+    - `ground_at`: returns the ground at points, for patches.
+    - `options`: sizes of the errors; ``mask_errors`` 0 gives a perfect mask.
+    """
+    if not options.patch_m or not options.mask_errors:
+        return _classified(canvas, edge, objects, options)
+    patches = Canvas.of(_patches(canvas.grid, options.patch_m), canvas.plan)
+    mask = _classified(patches, ground_at(patches.x, patches.y).edge, objects, options)
+    # The mask is resampled to the cells by nearest neighbour, as in the paper.
+    return mask[patches.grid.cells(*np.meshgrid(canvas.grid.eastings, canvas.grid.northings))]
+
+
+def _patches(grid: Grid, side: float) -> Grid:
+    """Return the lattice of patches that covers a grid; it is the same for all grids."""
+    west, south, east, north = grid.bounds
+    west, south = (math.floor(bound / side) * side for bound in (west, south))
+    east, north = (math.ceil(bound / side) * side for bound in (east, north))
+    return Grid(grid.crs, west, north, side, round((east - west) / side), round((north - south) / side))
+
+
+def _classified(canvas: Canvas, edge: Floats, objects: Objects, options: SceneOptions) -> Bools:
+    """Return the mask at the points of a canvas, ``(H, W)``."""
+    scale = options.mask_errors
+    error = scale * field(canvas.plan.seed, "wobble", WOBBLE_M, 12, options.wobble_m)(canvas.x, canvas.y)
+    verge = np.where(_stretches(canvas, "verge", options.verge_share), options.verge_m, 0.0)
+    mask: Bools = edge + error <= scale * verge
+    if scale > 0:
+        mask |= _stretches(canvas, "open ground", options.open_ground)
+        _add(mask, canvas, objects.yards, error)
+    for crown in objects.crowns:
+        if crown.hides:
+            window, inside = _disc(canvas, crown.x, crown.y, SOLID * crown.radius * scale, error)
+            mask[window][inside] = False
+        if objects.roofs:
+            # Under most crowns the road is inferred, but beyond the carriageway every crown is seen.
+            window, inside = _disc(canvas, crown.x, crown.y, crown.radius * scale, error)
+            mask[window][inside & (edge[window] > 0)] = False
+    for spot in objects.spots:
+        window, inside = _disc(canvas, spot.x, spot.y, spot.radius * scale, error)
+        mask[window][inside] = spot.road
+    if scale > 0:
+        _add(mask, canvas, (*objects.car_parks, *objects.fields), error)
+        for roof in objects.roofs:
+            _show(roof, mask, canvas, edge, options.overhang_m)
+        _add(mask, canvas, objects.false_roofs, error)
+    return mask
+
+
+def _disc(
+    canvas: Canvas, x: float, y: float, radius: float, error: Floats
+) -> tuple[tuple[slice, slice], Bools]:
+    """Return the window and the cells of a disc whose edge is shifted by ``error`` (m)."""
+    window = canvas.around(x, y, radius + 2)
+    away = np.hypot(canvas.x[window] - x, canvas.y[window] - y)
+    return window, away + error[window] < radius
+
+
+def _stretches(canvas: Canvas, purpose: str, share: float) -> Bools:
+    """Return coherent areas that cover a fraction of the plane, ``(H, W)``."""
+    if share <= 0:
+        return np.zeros(canvas.x.shape, np.bool_)
+    inside: Bools = field(canvas.plan.seed, purpose, STRETCH_M, 15)(canvas.x, canvas.y) < ndtri(share)
+    return inside
+
+
+def _add(mask: Bools, canvas: Canvas, areas: Iterable[Area], error: Floats) -> None:
+    """Add the areas that are mistaken for road, in place."""
+    for area in areas:
+        if area.as_road:
+            window, inside = covered(canvas, area, error)
+            mask[window][inside] = True
+
+
+def _show(roof: Roof, mask: Bools, canvas: Canvas, edge: Floats, overhang_m: float) -> None:
+    """Remove what a roof hides in the photograph, and add its visible facades, in place."""
+    house, (east, north) = roof.house, roof.shift
+    reach = math.hypot(house.half_length, house.half_depth) + overhang_m + math.hypot(east, north)
+    window = canvas.around(house.x, house.y, reach)
+    size = house.half_length + overhang_m, house.half_depth + overhang_m
+    stands, seen = (
+        (np.abs(u) <= size[0]) & (np.abs(v) <= size[1])
+        for u, v in (
+            canvas.local(window, house.x + dx, house.y + dy, house.heading)
+            for dx, dy in ((0.0, 0.0), (east, north))
+        )
+    )
+    mask[window][seen | stands] = False
+    if roof.facade_as_road:
+        mask[window][stands & ~seen & (edge[window] <= FACADE_REACH_M)] = True

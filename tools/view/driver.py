@@ -41,9 +41,9 @@ from flexroad.tasks.roads.rasterise import Options as RoadOptions
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats
-from flexroad.tools.export.centre_lines import read_centre_lines
-from flexroad.tools.export.pieces import Piece, write_pieces
+from flexroad.tools.export.network import read_centre_lines
 from flexroad.tools.export.source import TileItem, layer_state
+from flexroad.tools.export.tile_outputs import TileOutput, write_outputs
 from flexroad.tools.view import encoding
 
 shapely = lazy("shapely")
@@ -113,7 +113,7 @@ def write_viewer(
     look = Look(run.origin, roads)
     finished = track(_finished(run, done, variant), "writing tiles", len(done))
     with ended(finished):
-        rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
+        rows = list(write_outputs(finished, out, VERSION, script, look, executor))
     for file in built_files():
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())
@@ -202,7 +202,7 @@ def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any
         "height": [north - south for _, south, _, north in bounds],
         "state": states,
         "stale": stale,
-        "flags": [_flags(row) for row in rows],
+        "flags": [[flag for flag in (row.get("flags") or "").split(", ") if flag] for row in rows],
         "error": errors,
         "measures": known,
     }
@@ -230,10 +230,6 @@ def _error(status: TileStatus) -> str:
     failures = status.last_record.failures if status.failed and status.last_record else ()
     lines = dict.fromkeys(f"{f.line}{f' [{f.file}]' if f.file else ''}" for f in failures)
     return "; ".join(lines)
-
-
-def _flags(row: dict[str, Any]) -> list[str]:
-    return [flag for flag in (row.get("flags") or "").split(", ") if flag]
 
 
 def _figure(value: Any) -> float | None:
@@ -289,7 +285,7 @@ class Look:
     """Selection of the road lines."""
 
 
-def piece(item: TileItem, look: Look) -> Piece:
+def script(item: TileItem, look: Look) -> TileOutput:
     """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks."""
     tile = item.tile
     source, notes = tile.tile, list[str]()
@@ -311,7 +307,7 @@ def piece(item: TileItem, look: Look) -> Piece:
         places = {flag: list(place) for flag, place in tile.flag_places.items()}
         small = encoding.picture(height, road, data.core.cell)
         seen = base64.b64encode(small).decode("ascii")
-    scene = encoding.TileScene(
+    encoded = encoding.encode_tile(
         tile.id,
         glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
@@ -325,8 +321,8 @@ def piece(item: TileItem, look: Look) -> Piece:
         _lines(source, look.roads, notes),
     )
     name = f"tiles/{safe_name(tile.id)}{encoding.NAME_TILE}"
-    return Piece(
-        {name: encoding.encode_tile(scene)},
+    return TileOutput(
+        {name: encoded},
         {"tile": tile.id, "notes": notes, "picture": seen, "places": places},
     )
 

@@ -12,7 +12,6 @@ import io
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,60 +44,57 @@ ESTIMATE_STEP_M = 0.002
 """Step of the error estimate (m): 8 bits, up to 0.5 m; larger ones have the last value."""
 
 
-@dataclass(frozen=True, eq=False)
-class TileScene:
-    """What the viewer shows of one tile."""
+def encode_tile(
+    tile_id: str,
+    glb: bytes,
+    grid: Grid,
+    corners: Floats,
+    height_source: NDArray[np.uint8],
+    dsm: Floats | None = None,
+    dtm: Floats | None = None,
+    estimate: Floats | None = None,
+    surface: NurbsSurface | None = None,
+    top: Floats | None = None,
+    lines: tuple[CentreLine, ...] = (),
+) -> bytes:
+    """Return the script of a tile. Equal inputs give equal bytes.
 
-    id: str
-    glb: bytes
-    """The mesh, with the orthophoto if there is one."""
-    grid: Grid
-    """The tile's core."""
-    corners: Floats
-    """Longitude and latitude of the corners, ``(4, 2)``: south-west, south-east, north-west, north-east."""
-    height_source: NDArray[np.uint8]
-    """The core's `tasks.quality.height_source.HeightSource`, ``(H, W)``."""
-    dsm: Floats | None = None
-    """``(H, W)``, m; NaN where unknown; None if the source files cannot be read. So the next two."""
-    dtm: Floats | None = None
-    estimate: Floats | None = None
-    """Error estimate of the surface, ``(H, W)``, m."""
-    surface: NurbsSurface | None = None
-    """None if the surface is of another kind or has levels: the viewer then takes heights from the mesh."""
-    top: Floats | None = None
-    """Height of the highest level, ``(H, W)``, m; None if there are no levels."""
-    lines: tuple[CentreLine, ...] = ()
-    """Road lines on the tile."""
+    Rasters are of the tile's core, ``(H, W)``. Heights are in m, NaN where unknown.
 
-
-def encode_tile(scene: TileScene) -> bytes:
-    """Return the script of a tile. Equal inputs give equal bytes."""
-    stride = max(1, -(-max(scene.grid.shape) // MOST_CELLS))
+    - `glb`: the mesh, with the orthophoto if there is one.
+    - `corners`: longitude and latitude, ``(4, 2)``: south-west, south-east, north-west, north-east.
+    - `height_source`: `tasks.quality.height_source.HeightSource` of each cell.
+    - `dsm`, `dtm`, `estimate`: None if the source files cannot be read.
+    - `surface`: None if it is of another kind or has levels: the viewer then takes heights from the mesh.
+    - `top`: height of the highest level; None if there are no levels.
+    - `lines`: road lines on the tile.
+    """
+    stride = max(1, -(-max(grid.shape) // MOST_CELLS))
     thinned = slice(stride // 2, None, stride)
-    rows, cols = scene.height_source[thinned, thinned].shape
-    shift = (stride // 2 + 0.5 - stride / 2) * scene.grid.cell
-    west, north = scene.grid.west + shift, scene.grid.north - shift
+    rows, cols = height_source[thinned, thinned].shape
+    shift = (stride // 2 + 0.5 - stride / 2) * grid.cell
+    west, north = grid.west + shift, grid.north - shift
     content = {
-        "glb": _packed(scene.glb),
+        "glb": _packed(glb),
         "grid": {
             "west": west,
             "north": north,
-            "cell": stride * scene.grid.cell,
+            "cell": stride * grid.cell,
             "rows": rows,
             "cols": cols,
         },
-        "corners": np.round(scene.corners, 8).tolist(),
-        "height_source": _packed(scene.height_source[thinned, thinned].tobytes()),
-        "dsm": _heights(scene.dsm, thinned),
-        "dtm": _heights(scene.dtm, thinned),
-        "estimate": _estimate(scene.estimate, thinned),
-        "surface": _surface(scene.surface),
-        "steps": _steps(scene.surface),
-        "lines": [_line(line, scene.grid) for line in scene.lines],
+        "corners": np.round(corners, 8).tolist(),
+        "height_source": _packed(height_source[thinned, thinned].tobytes()),
+        "dsm": _heights(dsm, thinned),
+        "dtm": _heights(dtm, thinned),
+        "estimate": _estimate(estimate, thinned),
+        "surface": _surface(surface),
+        "steps": _steps(surface),
+        "lines": [_line(line, grid) for line in lines],
     }
-    if scene.top is not None:
-        content["top"] = _heights(scene.top, thinned)
-    return _call("tile", scene.id, content)
+    if top is not None:
+        content["top"] = _heights(top, thinned)
+    return _call("tile", tile_id, content)
 
 
 def encode_run(content: Mapping[str, Any]) -> bytes:
@@ -110,7 +106,6 @@ def picture(height: Floats, road: Bools, cell: float) -> bytes:
     """Return a tile seen from above as a small grey WebP image: hillshade, roads darker.
 
     - `height`: the surface (m); NaN beyond the survey, where the picture is transparent.
-    - `cell`: size of a cell (m).
     """
     by_south, by_east = np.gradient(height, cell) if min(height.shape) > 1 else np.zeros((2, *height.shape))
     east, north, up = np.array(SUN) / np.linalg.norm(SUN)

@@ -11,7 +11,7 @@ from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.tools.export.ellipsoidal import Datum
+from flexroad.tools.export.georeference import Datum
 from flexroad.tools.export.source import Options
 from flexroad.tools.synthetic.scenes import write_scenes
 

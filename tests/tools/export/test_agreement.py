@@ -43,7 +43,7 @@ def mesh(surface) -> Mesh:
 
 def of_landxml(mesh: Mesh) -> np.ndarray:
     file = io.BytesIO()
-    landxml.write(file, [mesh], landxml.Project("tile", datetime(2026, 5, 4)))
+    landxml.join(file, [landxml.part(mesh)], landxml.Project("tile", datetime(2026, 5, 4)))
     texts = [p.text for p in ElementTree.fromstring(file.getvalue()).iter() if p.tag.endswith("}P")]
     return np.array([text.split() for text in texts], float)[:, [1, 0, 2]]
 

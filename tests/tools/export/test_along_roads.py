@@ -18,7 +18,7 @@ from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.run import sampler
 from flexroad.pipeline.run.finished import estimate
 from flexroad.tasks.spline.stepped import without_steps
-from flexroad.tools.export import pieces
+from flexroad.tools.export import tile_outputs
 from flexroad.tools.export.driver import BEGUN, export
 from flexroad.tools.export.source import Options, select
 from tests import validators
@@ -234,7 +234,7 @@ def test_second_export_writes_nothing_and_other_roads_replace_the_files(city, st
 
 
 def test_interrupted_export_goes_on_with_the_next_road(city, streets, exported, tmp_path, monkeypatch):
-    write, done = pieces._write, []
+    write, done = tile_outputs._write, []
 
     def interrupted(job):
         if done:
@@ -242,13 +242,13 @@ def test_interrupted_export_goes_on_with_the_next_road(city, streets, exported, 
         done.append(job.tile.id)
         return write(job)
 
-    monkeypatch.setattr(pieces, "_write", interrupted)
+    monkeypatch.setattr(tile_outputs, "_write", interrupted)
     with pytest.raises(KeyboardInterrupt):
         export(select(city), tmp_path, ["crg"], Options(roads=str(streets)), SerialExecutor())
     assert len(list((tmp_path / "crg").glob("*.crg"))) == 1
     assert not (tmp_path / "crg" / "roads.csv").exists()
     again = []
-    monkeypatch.setattr(pieces, "_write", lambda job: again.append(job.tile.id) or write(job))
+    monkeypatch.setattr(tile_outputs, "_write", lambda job: again.append(job.tile.id) or write(job))
     export(select(city), tmp_path, ["crg"], Options(roads=str(streets)), SerialExecutor())
     assert len(again) == 2  # the second road, and the one that is too short
     assert not set(again) & set(done)

@@ -10,7 +10,7 @@ import shapely
 
 from flexroad.tasks.roads.rasterise import Options
 from flexroad.tasks.types import Source
-from flexroad.tools.export.centre_lines import from_table, read_centre_lines
+from flexroad.tools.export.network import from_table, read_centre_lines
 from tests.make_roads import GRID, in_cp1252, on_grid, write
 
 ALONG = shapely.LineString([(0, 0), (10, 0), (20, 5)])

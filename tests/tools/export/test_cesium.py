@@ -14,7 +14,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.spline.stepped import without_steps
 from flexroad.tools.export.driver import export
-from flexroad.tools.export.ellipsoidal import Datum, Ellipsoidal
+from flexroad.tools.export.georeference import Datum, Ellipsoidal
 from flexroad.tools.export.source import Options, select
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests import validators

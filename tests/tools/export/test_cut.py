@@ -6,7 +6,7 @@ from scipy.interpolate import BSpline
 
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.surface import ExactNurbs, NurbsSurface, clamped_knots, uniform_knots
-from flexroad.tools.export.cut import cut, patch
+from flexroad.tools.export.step import cut, patch
 
 BOUNDS = (295500.0, 5629250.0, 295750.0, 5629450.0)
 WITHIN = (295512.3, 5629250.0, 295730.0, 5629444.4)

@@ -17,10 +17,10 @@ from flexroad.pipeline.run.progress import StepProgress
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.errors import TaskError
-from flexroad.tools.export import pieces
+from flexroad.tools.export import tile_outputs
 from flexroad.tools.export.driver import check_formats, export
-from flexroad.tools.export.ellipsoidal import Datum
 from flexroad.tools.export.formats import FORMATS
+from flexroad.tools.export.georeference import Datum
 from flexroad.tools.export.source import Options, select
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests.read_exports import OFFSET_M, off_surface, vertices
@@ -77,13 +77,13 @@ def test_manifest_says_what_was_written(city, exported):
 
 def test_export_again_writes_only_what_is_missing_or_of_other_options(city, tmp_path, monkeypatch):
     written = []
-    write = pieces._write
+    write = tile_outputs._write
 
     def counted(job):
         written.append(job.tile.id)
         return write(job)
 
-    monkeypatch.setattr(pieces, "_write", counted)
+    monkeypatch.setattr(tile_outputs, "_write", counted)
 
     def again(options=OPTIONS):
         written.clear()

@@ -40,7 +40,7 @@ def tile(column: int = 0, row: int = 0, n: int = 5, size: float = 10.0, road_fro
 
 def written(meshes, project=PROJECT, **options) -> bytes:
     file = io.BytesIO()
-    landxml.write(file, meshes, project, **options)
+    landxml.join(file, (landxml.part(mesh, project.joined) for mesh in meshes), project, **options)
     return file.getvalue()
 
 
@@ -171,7 +171,8 @@ def test_write_memory_grows_with_the_outline_only(tmp_path):
     def peak(rows: int) -> int:
         with (tmp_path / "run.xml").open("wb") as file:
             tracemalloc.start()
-            landxml.write(file, (tile(c, r, n=9) for r in range(rows) for c in range(3)), PROJECT, tmp_path)
+            parts = (landxml.part(tile(c, r, n=9)) for r in range(rows) for c in range(3))
+            landxml.join(file, parts, PROJECT, tmp_path)
             _, most = tracemalloc.get_traced_memory()
             tracemalloc.stop()
         return most

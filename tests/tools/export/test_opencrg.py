@@ -6,8 +6,8 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads.routes import CentreLine, Route
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots
 from flexroad.tools.export import opencrg
-from flexroad.tools.export.along_line import HeightGrid, height_grid
-from flexroad.tools.export.local_frame import LocalFrame
+from flexroad.tools.export.georeference import LocalFrame
+from flexroad.tools.export.profiles import HeightGrid, height_grid
 from flexroad.tools.export.reference_line import Options as LineOptions
 from flexroad.tools.export.reference_line import reference_line
 

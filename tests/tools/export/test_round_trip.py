@@ -12,7 +12,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.tasks.spline.stepped import without_steps
 from flexroad.tools.export.driver import export
-from flexroad.tools.export.ellipsoidal import Datum
+from flexroad.tools.export.georeference import Datum
 from flexroad.tools.export.source import Options, select
 from tests.make_city import CRS, TILE_M, make_city, south_west
 from tests.read_exports import on_mesh

@@ -136,9 +136,9 @@ def test_interrupted_export_has_exit_code_130_and_goes_on(made_city, whole, tmp_
 
 
 def test_interrupted_export_keeps_the_parts_that_it_has(made_city, whole, tmp_path, monkeypatch):
-    from flexroad.tools.export import pieces
+    from flexroad.tools.export import tile_outputs
 
-    written, write = [], pieces._write
+    written, write = [], tile_outputs._write
 
     def second_is_interrupted(job):
         written.append(job.tile.id)
@@ -146,7 +146,7 @@ def test_interrupted_export_keeps_the_parts_that_it_has(made_city, whole, tmp_pa
             raise KeyboardInterrupt
         return write(job)
 
-    monkeypatch.setattr(pieces, "_write", second_is_interrupted)
+    monkeypatch.setattr(tile_outputs, "_write", second_is_interrupted)
     assert command_line.call(*words(made_city, "landxml", tmp_path)).code == 130
     goes_on(made_city, "landxml", tmp_path, whole[0])
     assert written == [*made_city.done, made_city.done[1]]

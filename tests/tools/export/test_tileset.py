@@ -18,11 +18,11 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.meshing.relief import of_mesh
 from flexroad.tasks.products import glb
-from flexroad.tools.export import pieces
+from flexroad.tools.export import tile_outputs
 from flexroad.tools.export import tileset as coarse
 from flexroad.tools.export.aerial import Aerial, joined
 from flexroad.tools.export.driver import export
-from flexroad.tools.export.ellipsoidal import Datum
+from flexroad.tools.export.georeference import Datum
 from flexroad.tools.export.source import Options, aerial_of, select
 from flexroad.tools.export.tiles3d import placed
 from flexroad.tools.export.tileset import Node, blocks
@@ -235,8 +235,8 @@ def test_drape_without_any_photo_is_refused_before_anything_is_written(survey, t
 
 def test_changed_photo_is_written_again_with_what_it_is_part_of(city, survey, tmp_path, monkeypatch):
     written = []
-    write = pieces._write
-    monkeypatch.setattr(pieces, "_write", lambda job: written.append(job.tile.id) or write(job))
+    write = tile_outputs._write
+    monkeypatch.setattr(tile_outputs, "_write", lambda job: written.append(job.tile.id) or write(job))
     exported(city, tmp_path, DRAPED)
     assert len(written) == 5
     path = survey.tiles[0].paths(survey.tiles[0].layer("dop"))[0]

@@ -10,9 +10,9 @@ from flexroad.catalog import Grid
 from flexroad.tools.synthetic import Kind, Scene, SceneOptions, block, make_scene
 from flexroad.tools.synthetic.gerod import PRESET
 from flexroad.tools.synthetic.network import Plan
-from flexroad.tools.synthetic.noise import generator
 from flexroad.tools.synthetic.spoilers import BARE
 from flexroad.tools.synthetic.surfaces import CIRCLE_M, ISLAND_M
+from flexroad.tools.synthetic.world import generator
 
 GRID = block(1)[0][1]
 QUIET = {"dsm_noise_m": (0, 0), "dtm_noise_m": 0, "flight_offset_m": 0}

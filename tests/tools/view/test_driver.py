@@ -139,7 +139,7 @@ def test_interrupted_writing_leaves_no_page(city, folder, tmp_path, monkeypatch)
     def fails(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr(viewer, "write_pieces", fails)
+    monkeypatch.setattr(viewer, "write_outputs", fails)
     with pytest.raises(OSError, match="disk full"):
         write_viewer(Run.open(city), tmp_path, SerialExecutor())
     assert not (tmp_path / PAGE).exists()

@@ -14,7 +14,6 @@ from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 from flexroad.tools.view.encoding import (
     ESTIMATE_STEP_M,
     MOST_CELLS,
-    TileScene,
     encode_run,
     encode_tile,
     picture,
@@ -23,9 +22,9 @@ from flexroad.tools.view.encoding import (
 GRID = Grid("EPSG:25832", 500000.0, 5600000.0, 1.0, 40, 30)
 
 
-def scene(grid=GRID, **values):
+def encoded(grid=GRID, **values):
     height_source = np.ones(grid.shape, np.uint8)
-    return TileScene("a", b"glTF", grid, np.zeros((4, 2)), height_source, **values)
+    return content(encode_tile("a", b"glTF", grid, np.zeros((4, 2)), height_source, **values))
 
 
 def content(script):
@@ -48,14 +47,14 @@ def heights(raster, grid):
 def test_heights_are_within_half_a_step_and_voids_stay(span_m):
     dsm = np.linspace(-20.0, -20.0 + span_m, GRID.width * GRID.height).reshape(GRID.shape)
     dsm[3, 4] = np.nan
-    made = content(encode_tile(scene(dsm=dsm)))
+    made = encoded(dsm=dsm)
     found = heights(made["dsm"], made["grid"])
     assert made["dsm"]["step"] <= max(0.001, span_m / 65000)
     np.testing.assert_allclose(found, dsm, rtol=0, atol=0.51 * made["dsm"]["step"])
 
 
 def test_raster_without_heights_is_left_out():
-    made = content(encode_tile(scene(dsm=np.full(GRID.shape, np.nan))))
+    made = encoded(dsm=np.full(GRID.shape, np.nan))
     assert made["dsm"] is None
     assert made["dtm"] is None
 
@@ -65,7 +64,7 @@ def test_thinned_cells_have_their_own_heights_at_their_centres(size):
     grid = Grid("EPSG:25832", 500000.0, 5600000.0, 0.5, size, size)
     eastings, northings = np.meshgrid(grid.eastings, grid.northings)
     plane = 0.01 * (eastings - grid.west) - 0.02 * (northings - grid.south)
-    made = content(encode_tile(scene(grid, dsm=plane)))
+    made = encoded(grid, dsm=plane)
     placed = made["grid"]
     assert max(placed["rows"], placed["cols"]) <= MOST_CELLS
     east = placed["west"] + (np.arange(placed["cols"]) + 0.5) * placed["cell"]
@@ -77,7 +76,7 @@ def test_thinned_cells_have_their_own_heights_at_their_centres(size):
 def test_error_estimates_are_within_half_a_step_up_to_half_a_metre():
     estimate = np.linspace(0, 0.5, GRID.width * GRID.height).reshape(GRID.shape)
     estimate[0, 0], estimate[0, 1] = np.nan, 7.0
-    made = content(encode_tile(scene(estimate=estimate)))
+    made = encoded(estimate=estimate)
     codes = numbers(made["estimate"], np.uint8, made["grid"])
     assert codes[0, 0] == 0
     assert codes[0, 1] == 255
@@ -125,10 +124,10 @@ def test_steps_beside_roads_are_of_every_cell_and_exactly_none_on_the_road():
     spline |= {"knots_u": knots, "knots_v": knots, "A": np.ones((2, 2)), "W": np.ones((2, 2))}
     spline |= {"south_north": np.zeros((2, cells.width)), "west_east": np.zeros((2, cells.height))}
     surface = SteppedSurface(**spline, origin=cells.origin, steps=steps, cells=cells)
-    packed = content(encode_tile(scene(cells, surface=surface)))["steps"]
+    packed = encoded(cells, surface=surface)["steps"]
     assert (packed["grid"]["rows"], packed["grid"]["cols"]) == cells.shape
     found = np.nan_to_num(heights(packed, packed["grid"]))
     np.testing.assert_allclose(found, steps, rtol=0, atol=0.0006)
     assert (found[steps == 0] == 0).all()
-    smooth = content(encode_tile(scene(cells, surface=without_steps(surface))))
+    smooth = encoded(cells, surface=without_steps(surface))
     assert smooth["steps"] is None

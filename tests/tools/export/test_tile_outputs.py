@@ -5,7 +5,7 @@ import json
 import pytest
 
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.tools.export import cityjson, landxml, pieces
+from flexroad.tools.export import cityjson, landxml, tile_outputs
 from flexroad.tools.export.driver import BEGUN, export
 from flexroad.tools.export.source import Options, select
 
@@ -18,13 +18,13 @@ each = pytest.mark.parametrize("name", JOINED)
 @pytest.fixture
 def encoded(monkeypatch):
     """The ids of the tiles that workers have encoded."""
-    ids, write = [], pieces._write
+    ids, write = [], tile_outputs._write
 
     def noted(job):
         ids.append(job.tile.id)
         return write(job)
 
-    monkeypatch.setattr(pieces, "_write", noted)
+    monkeypatch.setattr(tile_outputs, "_write", noted)
     return ids
 
 
@@ -37,12 +37,14 @@ def test_files_are_those_of_the_meshes(made_city, tmp_path):
     export(chosen, tmp_path, JOINED, Options(), SerialExecutor())
     meshes = [(tile.id, tile.mesh) for tile in chosen.finished()]
     with (tmp_path / "expected").open("wb") as file:
-        cityjson.write(file, meshes, chosen.crs, (*chosen.origin, 0.0), chosen.vertical)
+        about = (*chosen.origin, 0.0), chosen.vertical
+        file.write(cityjson.header(chosen.crs, *about))
+        file.writelines(cityjson.features(name, mesh, *about) for name, mesh in meshes)
     assert (tmp_path / "cityjson" / "city.city.jsonl").read_bytes() == (tmp_path / "expected").read_bytes()
     written = max(tile.datetime for tile in chosen.tiles)
     project = landxml.Project("city", written, chosen.vertical, joined=False)
     with (tmp_path / "expected").open("wb") as file:
-        landxml.write(file, [mesh for _, mesh in meshes], project)
+        landxml.join(file, (landxml.part(mesh, joined=False) for _, mesh in meshes), project)
     assert (tmp_path / "landxml" / "city.xml").read_bytes() == (tmp_path / "expected").read_bytes()
 
 
@@ -74,7 +76,7 @@ def test_whole_file_is_written_once_and_replaces_one_of_another_name(tmp_path):
 
     for name in ("first.xodr", "first.xodr", "second.xodr"):
         (tmp_path / "xodr").mkdir(exist_ok=True)
-        pieces.write_whole(tmp_path / "xodr" / name, "key", {}, fill)
+        tile_outputs.write_whole(tmp_path / "xodr" / name, "key", {}, fill)
     assert len(filled) == 2
     assert [path.name for path in (tmp_path / "xodr").iterdir()] == ["second.xodr"]
 
@@ -103,7 +105,7 @@ def test_parts_of_an_interrupted_export_are_used(made_city, tmp_path, name, enco
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(pieces, "atomic_file", interrupted)
+        patch.setattr(tile_outputs, "atomic_file", interrupted)
         with pytest.raises(KeyboardInterrupt):
             write(made_city, tmp_path, name)
     assert encoded == list(made_city.done)

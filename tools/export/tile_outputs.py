@@ -41,7 +41,7 @@ LARGEST = ("height_error_m", "steps_max_m")
 SMOOTH = "the surface without kerbs and walls"
 STEPS_SHOWN_M = 0.01
 """Height of steps that are left out from which the user is told (m)."""
-Row = dict[str, Any]
+ManifestRow = dict[str, Any]
 """What the files of the complete run need of a tile, as JSON values."""
 
 
@@ -53,12 +53,12 @@ def steps_left_out(steps_m: float | None) -> str:
 
 
 @dataclass(frozen=True)
-class Piece:
+class TileOutput:
     """The files of one tile."""
 
     files: Mapping[str, bytes]
     """By name."""
-    row: Row
+    row: ManifestRow
 
 
 class Item(Protocol):
@@ -80,7 +80,7 @@ class Item(Protocol):
         ...
 
 
-Encode = Callable[[Any, Any], Piece]
+Encode = Callable[[Any, Any], TileOutput]
 """Makes the files of an `Item` with the options of a format; runs in the worker processes."""
 Join = Callable[[Path, Iterator[bytes]], None]
 """Writes a file from the parts of all tiles, in the order of the catalog; each part is in memory alone."""
@@ -94,7 +94,7 @@ class _Mark:
     """Fingerprint of their content, the format's version and its options."""
     sizes: Mapping[str, int]
     """Names and sizes of the files."""
-    row: Row
+    row: ManifestRow
     """What else of them is needed later."""
 
     @classmethod
@@ -137,7 +137,7 @@ class _Job:
     """That of an earlier export."""
 
 
-def write_pieces(
+def write_outputs(
     tiles: Iterable[Item],
     folder: Location,
     version: int,
@@ -145,14 +145,14 @@ def write_pieces(
     options: Any,
     executor: Executor,
     group: str = "",
-) -> Iterator[Row]:
+) -> Iterator[ManifestRow]:
     """Write the files of each tile that does not have them, and yield the row of each, in any order.
 
     Files of tiles of an earlier export that are not among the given ones are removed at the end.
 
     - `group`: name of what the items have in common, if a format has several kinds of them.
     """
-    unchanged: list[Row] = []
+    unchanged: list[ManifestRow] = []
     kept: set[str] = set()
 
     def jobs() -> Iterator[_Job]:
@@ -178,7 +178,7 @@ def write_pieces(
             remove(markers / name)
 
 
-def figures(rows: Iterable[Row]) -> dict[str, Any]:
+def figures(rows: Iterable[ManifestRow]) -> dict[str, Any]:
     """Return what the manifest says of all tiles: the largest error and step, and the number of each note."""
     largest, notes = dict[str, Any](), Counter[str]()
     for row in rows:
@@ -191,14 +191,12 @@ def figures(rows: Iterable[Row]) -> dict[str, Any]:
     return largest | summary | {"notes": said}
 
 
-def write_whole(file: Location, key: str, row: Row, fill: Callable[[Path], None]) -> None:
+def write_whole(file: Location, key: str, row: ManifestRow, fill: Callable[[Path], None]) -> None:
     """Write the one file of a folder, unless it exists and was made with the same key.
 
     Its former one, if it had another name, is removed.
 
     - `key`: fingerprint of its content and name.
-    - `row`: kept in its mark.
-    - `fill`: writes the file to a local path.
     """
     folder = file.parent
     former = _Mark.read(_whole_marker(folder))
@@ -222,7 +220,7 @@ def write_joined(
     tiles: Iterable[FinishedTile],
     file: Location,
     version: int,
-    encode: Callable[[FinishedTile, Any], Piece],
+    encode: Callable[[FinishedTile, Any], TileOutput],
     options: Any,
     executor: Executor,
     join: Join,
@@ -231,8 +229,7 @@ def write_joined(
 
     The figures of all tiles are returned.
 
-    - `tiles`: all tiles of the source.
-    - `encode`: makes the piece of a tile, whose only file has the name of `part_name`; runs in the workers.
+    - `encode`: makes the output of a tile, whose only file has the name of `part_name`; runs in the workers.
     - `options`: given to ``encode``; with the name of the file, also all that ``join`` depends on.
     """
     folder = file.parent
@@ -245,34 +242,34 @@ def write_joined(
             pass  # each is checked to be still finished
         rows = mark.row
     else:
-        rows = figures(write_pieces(tiles, folder, version, encode, options, executor))
+        rows = figures(write_outputs(tiles, folder, version, encode, options, executor))
         parts = (read(folder / part_name(tile.id)) for tile in source.tiles)
         write_whole(file, key, rows, lambda local: join(local, parts))
     _remove_parts(folder)
     return rows
 
 
-def _write(job: _Job) -> tuple[Row, str]:
+def _write(job: _Job) -> tuple[ManifestRow, str]:
     """Write the files of a tile; return its row, or the reason why it has none."""
     folder = parse_location(job.folder)
     try:
-        piece = job.encode(job.tile, job.options)
+        output = job.encode(job.tile, job.options)
         # First, while the mark still names them.
         if job.former:
-            job.former.remove_files(folder, piece.files)
-        for name, data in piece.files.items():
+            job.former.remove_files(folder, output.files)
+        for name, data in output.files.items():
             write(folder / name, data)
-        sizes = {name: len(data) for name, data in piece.files.items()}
-        _Mark(job.key, sizes, piece.row).write(_marker(folder, job.group, job.tile.id))
+        sizes = {name: len(data) for name, data in output.files.items()}
+        _Mark(job.key, sizes, output.row).write(_marker(folder, job.group, job.tile.id))
     except OSError as error:
         return {}, f"{job.tile.label}: {error}; correct that, and the same command goes on"
     except (ConfigError, TaskError, CatalogError) as error:
         name, reason = f"{job.tile.label}: ", str(error)
         return {}, reason if reason.startswith(name) else name + reason
-    return piece.row, ""
+    return output.row, ""
 
 
-def _lost(job: _Job, reason: str) -> tuple[Row, str]:
+def _lost(job: _Job, reason: str) -> tuple[ManifestRow, str]:
     return {}, f"{job.tile.label}: {reason}"
 
 

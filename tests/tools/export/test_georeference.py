@@ -1,0 +1,153 @@
+"""Coordinates of exported files: origins, local projections, and heights above the ellipsoid."""
+
+import json
+
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+from pyproj import CRS, Transformer
+
+from flexroad.catalog.crs import CatalogError
+from flexroad.tools.export.georeference import Datum, Ellipsoidal, Georeference, LocalFrame, geocentric
+
+PLACE = Georeference("EPSG:25832", (295500.0, 5629250.0, 150.0), "EPSG:7837")
+
+
+def test_sidecar_has_place_axes_and_other_entries():
+    content = json.loads(PLACE.sidecar("x east", step_m=0.5))
+    assert content == {
+        "crs": "EPSG:25832",
+        "crs_name": "ETRS89 / UTM zone 32N",
+        "vertical_crs": "EPSG:7837",
+        "origin": [295500.0, 5629250.0, 150.0],
+        "axes": "x east",
+        "step_m": 0.5,
+    }
+
+
+def test_lines_are_single_ascii_lines():
+    wkt = 'PROJCRS["Réunion",\n BASEGEOGCRS["b"]]'
+    lines = Georeference(wkt, PLACE.origin).lines()
+    assert lines == [
+        "origin 295500 5629250 150 (easting northing height, m)",
+        'crs PROJCRS["R\\xe9union", BASEGEOGCRS["b"]]',
+        "vertical crs unknown",
+    ]
+
+
+def test_prj_is_read_as_the_same_crs():
+    text = PLACE.prj().decode()
+    assert len(text.splitlines()) == 1
+    assert CRS.from_user_input(text).to_epsg(20) == 25832
+
+
+PLACES = {
+    "EPSG:25832": (366_000.0, 5_621_000.0),
+    "EPSG:27700": (532_400.0, 181_800.0),
+    "EPSG:26910": (5e5, 4.2e6),
+}
+
+
+@pytest.mark.parametrize("crs", PLACES)
+def test_local_frame_there_and_back_is_the_same_point(crs):
+    easting, northing = (at + np.array([0.0, 3000.0, -700.0]) for at in PLACES[crs])
+    frame = LocalFrame.around(crs, easting[0], northing[0])
+    x, y = frame.to_local(easting, northing)
+    assert np.hypot(x[0], y[0]) < 1.5
+    back = frame.to_run(x, y)
+    np.testing.assert_allclose(back, (easting, northing), atol=1e-5)
+
+
+def test_local_frame_lengths_are_those_on_the_ellipsoid():
+    frame = LocalFrame.around("EPSG:25832", 366_000.0, 5_621_000.0)
+    easting, northing = np.array([366_000.0, 367_000.0]), np.array([5_621_000.0, 5_621_000.0])
+    x, y = frame.to_local(easting, northing)
+    to_degrees = pyproj.Transformer.from_crs("EPSG:25832", "EPSG:4258", always_xy=True)
+    truth = pyproj.Geod(ellps="GRS80").line_length(*to_degrees.transform(easting, northing))
+    assert np.hypot(x[1] - x[0], y[1] - y[0]) == pytest.approx(truth, abs=1e-4)
+    assert truth - 1000 > 0.1  # UTM is that much off here
+
+
+@pytest.mark.parametrize("crs", PLACES)
+def test_local_frame_proj_string_describes_its_coordinates(crs):
+    easting, northing = PLACES[crs]
+    frame = LocalFrame.around(crs, easting, northing)
+    x, y = frame.to_local(np.array([easting + 900]), np.array([northing - 400]))
+    words = dict(word.lstrip("+").split("=") for word in frame.proj.split())
+    assert words["k"] == "1"
+    assert "+no_defs" not in frame.proj
+    # The same ellipsoid, without a datum that could shift the result.
+    degrees = pyproj.Proj(frame.proj)(x[0], y[0], inverse=True)
+    geodetic = "EPSG:4326" if words["ellps"] == "WGS84" else pyproj.CRS(crs).geodetic_crs
+    truth = pyproj.Transformer.from_crs(crs, geodetic, always_xy=True).transform(
+        easting + 900, northing - 400
+    )
+    np.testing.assert_allclose(degrees, truth, atol=1e-9)
+
+
+def test_local_frame_other_ellipsoid_than_that_of_gnss_uses_wgs_84():
+    assert "+ellps=WGS84" in LocalFrame.around("EPSG:27700", 532_400.0, 181_800.0).proj
+    assert "+ellps=GRS80" in LocalFrame.around("EPSG:25832", 366_000.0, 5_621_000.0).proj
+
+
+POINT = np.array([500_000.0]), np.array([5_600_000.0]), np.array([100.0])
+
+
+@pytest.fixture
+def geoid(tmp_path):
+    """A geoid around 9 E, 50.55 N: 47 m above the ellipsoid at 9 E, and 1 m per degree of longitude."""
+    path = tmp_path / "geoid.gtx"
+    longitude = np.linspace(7, 11, 41)
+    values = np.tile(47 + (longitude - 9), (41, 1)).astype(np.float32)
+    place = rasterio.Affine(0.1, 0, 6.95, 0, -0.1, 52.55)
+    form = {"driver": "GTX", "dtype": "float32", "count": 1, "width": 41, "height": 41}
+    with rasterio.open(path, "w", **form, crs="EPSG:4326", transform=place) as raster:
+        raster.write(values, 1)
+    return path
+
+
+def test_offset_is_added_and_the_place_is_that_of_pyproj():
+    longitude, latitude, height = Ellipsoidal("EPSG:25832", Datum("offset", "47.5")).geographic(*POINT)
+    expected = Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True).transform(*POINT[:2])
+    np.testing.assert_allclose((longitude, latitude), expected, atol=1e-12)
+    assert height == 147.5
+
+
+def test_geoid_is_added_at_each_place(geoid):
+    east = np.array([460_000.0, 500_000.0, 540_000.0])
+    north, level = np.full(3, 5_600_000.0), np.array([0.0, 100.0, 200.0])
+    conversion = Ellipsoidal("EPSG:25832", Datum("geoid", str(geoid)))
+    longitude, _, height = conversion.geographic(east, north, level)
+    np.testing.assert_allclose(height - level, 47 + (longitude - 9), atol=1e-4)
+
+
+def test_geoid_that_does_not_cover_the_area_raises(geoid):
+    with pytest.raises(CatalogError, match=r"no exact conversion from EPSG:25833 .*--geoid FILE"):
+        Ellipsoidal("EPSG:25833", Datum("geoid", str(geoid))).geographic(*POINT)
+
+
+def test_vertical_crs_without_its_grid_raises_and_is_not_ignored():
+    with pytest.raises(CatalogError, match=r"heights of EPSG:7837 .*; give the geoid's grid with --geoid"):
+        Ellipsoidal("EPSG:25832", Datum("crs", "EPSG:7837")).geographic(*POINT)
+
+
+def test_geocentric_agrees_with_the_equations_of_the_ellipsoid():
+    conversion = Ellipsoidal("EPSG:25832", Datum("offset", "0"))
+    longitude, latitude, height = conversion.geographic(*POINT)
+    a, f = 6378137.0, 1 / 298.257223563
+    e2 = f * (2 - f)
+    lam, phi = np.radians(longitude), np.radians(latitude)
+    n = a / np.sqrt(1 - e2 * np.sin(phi) ** 2)
+    expected = [
+        (n + height) * np.cos(phi) * np.cos(lam),
+        (n + height) * np.cos(phi) * np.sin(lam),
+        (n * (1 - e2) + height) * np.sin(phi),
+    ]
+    np.testing.assert_allclose(geocentric(longitude, latitude, height)[0], np.ravel(expected), atol=1e-6)
+
+
+@pytest.mark.parametrize(("kind", "value"), [("geoid", "none.gtx"), ("offset", "nan")])
+def test_datum_that_cannot_be_used_raises(kind, value):
+    with pytest.raises(CatalogError, match=value):
+        Datum(kind, value)
