@@ -36,8 +36,7 @@ from flexroad.pipeline.worker.tile import marker_stat
 from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
-from flexroad.tasks.quality.flagged import Bits
-from flexroad.tasks.quality.places import Place, places
+from flexroad.tasks.quality.flagged import Bits, Place, places
 from flexroad.tasks.types import (
     Floats,
     Mesh,
@@ -317,7 +316,7 @@ class FinishedTile:
         cells = compare(
             data, self.road, self.clusters, self.surface, self.assessment.dsm_dtm_tolerance_m, only_road=True
         )
-        found = places(cells, data.core, self.assessment)
+        found = places(cells, data.core, self.assessment.dsm_dtm_tolerance_m)
         return {flag: found[flag] for flag in flags if flag in found}
 
     @cached_property
