@@ -19,8 +19,7 @@ from flexroad.catalog.scan.rasters import quiet
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.dsm_and_dtm import below_ground_note, survey_difference
-from flexroad.tasks.io.height_offset import offset_note
+from flexroad.tasks.io.dsm_and_dtm import below_ground_note, offset_note, survey_difference
 from flexroad.tasks.io.height_units import check_units
 from flexroad.tasks.io.mosaic import Mosaic, read_mosaic
 from flexroad.tasks.types import Bools, Floats, Source, TileData

@@ -33,7 +33,7 @@ from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import MarkerStat, distances_of
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.pipeline.worker.tile import marker_stat
-from flexroad.tasks.metrics.mesh_distance import FIGURES
+from flexroad.tasks.metrics.evaluate import FIGURES
 from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.flagged import Bits, Place, places

@@ -20,7 +20,7 @@ from flexroad.catalog.ids import safe_name
 from flexroad.catalog.scan.rasters import quiet
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store.products import file_entry
-from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.io.dsm_and_dtm import vertical_crs
 from flexroad.tasks.levels.seen import top_mask
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import cog, glb, npz, ply

@@ -34,7 +34,7 @@ from flexroad.pipeline.store.records import (
 from flexroad.pipeline.worker.evaluator import Evaluator, StageCost, StageError, failure_of
 from flexroad.pipeline.worker.exports import EXTENSIONS, Product, assets, links, product_names, products
 from flexroad.pipeline.worker.texture import tile_texture
-from flexroad.tasks.io.left_out import recorded
+from flexroad.tasks.errors import recorded
 from flexroad.tasks.types import Metrics, Quality
 
 QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")

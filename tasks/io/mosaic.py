@@ -19,7 +19,7 @@ from flexroad.catalog.guard.kept_rasters import kept_raster
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.catalog.tile import HEIGHTS, TOUCH_M
-from flexroad.tasks.errors import TaskError, Unusable
+from flexroad.tasks.errors import TaskError, Unusable, leave_out
 from flexroad.tasks.io.height_units import (
     absurd_note,
     converted_note,
@@ -27,7 +27,6 @@ from flexroad.tasks.io.height_units import (
     smaller_unit_fault,
     with_unit,
 )
-from flexroad.tasks.io.left_out import leave_out
 from flexroad.tasks.io.raster import RasterWindow, misalignment, read_raster, read_window
 from flexroad.tasks.io.raster_header import header
 from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights, reach_m

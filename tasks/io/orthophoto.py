@@ -20,8 +20,7 @@ from flexroad.catalog.scan.rasters import quiet
 from flexroad.catalog.scan.valid_cells import color_kinds
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
-from flexroad.tasks.errors import LayerMissing, TaskError, Unusable
-from flexroad.tasks.io.left_out import leave_out
+from flexroad.tasks.errors import LayerMissing, TaskError, Unusable, leave_out
 from flexroad.tasks.io.raster import read_raster
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.io.raster_header import place

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from flexroad.tasks import options as base
 from flexroad.tasks.levels.seen import level_data, level_road
-from flexroad.tasks.metrics.statistics import mean, nmad
+from flexroad.tasks.metrics.evaluate import mean, nmad, percentile
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.flagged import bends, edge_steps, flagged_cells, largest_patch, worst_piece
 from flexroad.tasks.quality.height_source import HeightSource
@@ -139,17 +139,17 @@ def _assess(
     unexplained = largest_patch(on_road & (cells.deviation > options.dsm_dtm_tolerance_m))
     residuals, to_dtm = _finite(cells.off_dsm[kept]), _finite(cells.off_dtm[on_road])
     figures: dict[str, Any] = {
-        "residual_median_m": _quantile(residuals, 50),
+        "residual_median_m": percentile(residuals, 50),
         "residual_nmad_m": nmad(residuals),
-        "residual_p95_m": _quantile(np.abs(residuals), 95),
-        "curvature_per_m": _largest(_finite(bends(cells.height, on_road)) / cell**2),
-        "edge_step_m": _quantile(_finite(edge_steps(cells)), 95),
+        "residual_p95_m": percentile(np.abs(residuals), 95),
+        "curvature_per_m": percentile(_finite(bends(cells.height, on_road)) / cell**2, 100),
+        "edge_step_m": percentile(_finite(edge_steps(cells)), 95),
         "measured_road": mean(classes[on_road] == HeightSource.MEASURED),
         "dtm_road": mean(classes[on_road] == HeightSource.DTM),
         "inferred_road": mean(classes[on_road] == HeightSource.INFERRED),
         "dropped_road": mean(~kept[on_road]),
-        "dsm_excess_m": _quantile(_finite(cells.excess[kept]), 50),
-        "off_dtm_m": _quantile(to_dtm, 50),
+        "dsm_excess_m": percentile(_finite(cells.excess[kept]), 50),
+        "off_dtm_m": percentile(to_dtm, 50),
         "off_dtm_road": mean(np.abs(to_dtm) > options.dsm_dtm_tolerance_m),
         "bounded_weights": mean(np.abs(np.log(surface.W)) > MAX_LOG_WEIGHT * (1 - 1e-9))
         if isinstance(surface, NurbsSurface)
@@ -215,11 +215,3 @@ def top_errors(
 
 def _finite(values: Floats) -> Floats:
     return values[np.isfinite(values)]
-
-
-def _largest(values: Floats) -> float:
-    return float(values.max()) if values.size else float("nan")
-
-
-def _quantile(values: Floats, percent: float) -> float:
-    return float(np.percentile(values, percent)) if values.size else float("nan")

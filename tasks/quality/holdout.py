@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.levels.seen import level_data
-from flexroad.tasks.metrics.statistics import mean
+from flexroad.tasks.metrics.evaluate import mean
 from flexroad.tasks.quality.estimate import INTERVAL, SQUARE_M, compare, heights_fitted
 from flexroad.tasks.types import Bools, RoadClusters, RoadMask, Surface, TileData
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.metrics.mesh_distance import FIGURES, mesh_distances
+from flexroad.tasks.metrics.evaluate import FIGURES, mesh_distances
 from flexroad.tasks.spline.moving import moving
 from flexroad.tasks.spline.space import clamped_space, surface_on
 from flexroad.tasks.spline.stepped import SteppedSurface

@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from flexroad.catalog.text import count, printable
-from flexroad.tasks.io.height_offset import is_offset
+from flexroad.tasks.io.dsm_and_dtm import is_offset
 from flexroad.tasks.quality.assess import FLAGS, LIMITS, NO_ROAD
 from flexroad.tasks.quality.flagged import Place
 from flexroad.tasks.quality.structures import BELOW, LEAST_RISE_M, NO_ABUTMENT, NO_RISE
