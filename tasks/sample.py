@@ -33,18 +33,19 @@ from flexroad.tasks.meshing.abutment_lines import (
     level_outline,
     without_abutments,
 )
-from flexroad.tasks.meshing.breaklines import breaklines
 from flexroad.tasks.meshing.lines import (
+    DECIMALS,
     apart_from,
+    axis,
     divided,
     ends_at_border,
     parts_of,
     points_and_segments,
+    without_duplicates,
 )
 from flexroad.tasks.meshing.parts import middles, with_levels
-from flexroad.tasks.meshing.positions import DECIMALS, axis, without_duplicates
 from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
-from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
+from flexroad.tasks.meshing.survey_limit import SurveyLimit, breaklines, survey_limit
 from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.mesh_border import (

@@ -4,7 +4,7 @@ The surface is the NURBS graph of `tasks.spline.surface` with unit weights. It m
 the height differences plus the bending energy of a thin plate that is stiffer on roads than beside them. The
 problem is convex; `tasks.spline.irls` solves it. docs/fit.md compares it with the paper's fit.
 
-Control points lie on the lattice of `tasks.spline.lattice`, which all tiles share. Those that act on a corner
+Control points lie on the lattice of `tasks.spline.space`, which all tiles share. Those that act on a corner
 of the tile are fitted first, then those on its edges, each to the ground around it and without regard to the
 tile (`corner` and `edge`). `fit` holds them and fits the points inside to the tile's own cells. So two
 neighbours have one surface, although no tile waits for another (docs/mosaic.md).
@@ -30,10 +30,9 @@ from flexroad.tasks.roads.dtm_validity import Slices, ground_to_fit, valid_dtm
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.frame import Corner, Edge, Frame, rounded
 from flexroad.tasks.spline.irls import HuberObjective, minimise
-from flexroad.tasks.spline.lattice import Lattice, Range
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.objective import objective
-from flexroad.tasks.spline.space import Space, check_cells, start_heights, surface_on
+from flexroad.tasks.spline.space import Lattice, Range, Space, check_cells, start_heights, surface_on
 from flexroad.tasks.spline.stepped import border_steps, ground_beside, spline_around, with_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.spline.thin_plate import bending_energy

@@ -20,8 +20,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.roads.distances import distances, within
 from flexroad.tasks.roads.road_height import ground_heights
 from flexroad.tasks.spline.frame import Frame, rounded
-from flexroad.tasks.spline.lattice import Lattice, Range
-from flexroad.tasks.spline.space import surface_on
+from flexroad.tasks.spline.space import Lattice, Range, surface_on
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, Surface, TileData
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.meshing.breaklines import APART, breaklines
+from flexroad.tasks.meshing.survey_limit import APART, breaklines
 from flexroad.tasks.spline.stepped import SteppedSurface
 
 CELLS = Grid("EPSG:25832", 500000.0, 5600030.0, 1.0, 30, 30)
