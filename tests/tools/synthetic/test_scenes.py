@@ -10,7 +10,7 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.sources.prepared import HEIGHTS, MASKS, PHOTO
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.load import Options, load
-from flexroad.tasks.roads.level_numbers import level_numbers
+from flexroad.tasks.roads.attributes import level_numbers
 from flexroad.tasks.segment import vector
 from flexroad.tools.synthetic import make_scene
 from flexroad.tools.synthetic.crossings import Crossings, make_crossings
