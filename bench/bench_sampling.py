@@ -29,7 +29,7 @@ from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.evaluate import OFF_CENTRE, mesh_distances
 from flexroad.tasks.metrics.mesh_check import check
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.sample import SMOOTH_M, Options, sample
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.stepped import SteppedSurface

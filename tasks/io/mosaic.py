@@ -28,7 +28,7 @@ from flexroad.tasks.io.height_units import (
     with_unit,
 )
 from flexroad.tasks.io.raster import RasterWindow, misalignment, read_raster, read_window
-from flexroad.tasks.io.raster_header import header
+from flexroad.tasks.io.raster_grid import header
 from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights, reach_m
 from flexroad.tasks.types import Bools, Floats
 

@@ -22,8 +22,7 @@ from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import LayerMissing, TaskError, Unusable, leave_out
 from flexroad.tasks.io.raster import read_raster
-from flexroad.tasks.io.raster_grid import RasterGrid
-from flexroad.tasks.io.raster_header import place
+from flexroad.tasks.io.raster_grid import RasterGrid, place
 from flexroad.tasks.types import Bools, Orthophoto, Source
 
 BITS = {"uint8": 8, "uint16": 16}

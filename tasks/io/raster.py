@@ -29,8 +29,7 @@ from flexroad.catalog.scan.valid_cells import transparent
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason
 from flexroad.tasks.errors import TaskError, Unusable
-from flexroad.tasks.io.raster_grid import RasterGrid
-from flexroad.tasks.io.raster_header import file_crs, header, place
+from flexroad.tasks.io.raster_grid import RasterGrid, file_crs, header, place
 from flexroad.tasks.types import Bools, Floats
 
 T = TypeVar("T")

@@ -21,8 +21,7 @@ from pydantic import Field
 from flexroad.tasks import options as base
 from flexroad.tasks.metrics import mesh_check
 from flexroad.tasks.metrics.dihedral import mean_angles
-from flexroad.tasks.metrics.point_to_mesh import nearest
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape, nearest
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.spline.moving import MovingNurbs
 from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadMask, Surface, TileData
