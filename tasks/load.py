@@ -128,21 +128,21 @@ def load(tile: Tile, options: Options) -> TileData:
     )
 
 
-def load_border(ground: Tile, core: Grid, options: Options | None = None) -> TileData:
+def load_border(ground: Tile, core: Grid, options: Options) -> TileData:
     """Read the ground around a corner or an edge of tiles; it may be without data in part or everywhere.
 
     Files that cannot be used (`Unusable`) are left out: they fail the tiles that they lie on.
 
     - `ground`: the ground, with the files that reach it (`Tile.around`).
     - `core`: the tile that the files are of: the position of a file without georeference.
-    - `options`: the heights that roads are fitted to; None: the DSM's. The halo does not count.
+    - `options`: the heights that roads are fitted to. The halo does not count.
     """
-    grid, chosen = ground.grid, options or Options()
+    grid = ground.grid
     with quiet():
         mosaics = {
             layer.name: read_mosaic(ground, layer, grid, core, around=True)
             for layer in ground.layers
-            if _is_read(layer, chosen)
+            if _is_read(layer, options)
         }
     patches = [patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches]
     if patches:
@@ -157,7 +157,7 @@ def load_border(ground: Tile, core: Grid, options: Options | None = None) -> Til
         dsm=dsm,
         dtm=dtm,
         road_height=mosaics["road_height"].values if "road_height" in mosaics else None,
-        offset_dsm=_offset(ground, chosen)[0],
+        offset_dsm=_offset(ground, options)[0],
         road_mask=_road(ground, "road_mask", mosaics),
         dop=_optional(layer_source(ground, "dop")),
         roads=_optional(layer_source(ground, "roads")),

@@ -81,7 +81,8 @@ class Mosaic:
 
     def check_read(self, core: Grid) -> None:
         """Raise an error if the layer is missing on the tile itself, or a file that it needs is left out."""
-        left_out = self._left_out_from_main(core) if self.left_out else []
+        main = self.main_file(core) if self.left_out else None
+        left_out = sorted(self.left_out, key=lambda pair: pair[0] != main)
         needed = [error for file, error in left_out if file.may_lie_on(core)]
         if needed and not self.reached(core).all():
             raise TaskError(str(needed[0]), needed[0].file)
@@ -107,19 +108,11 @@ class Mosaic:
                 "lower load.min_valid to keep such tiles"
             )
         else:
-            fault = self._smaller_unit(main, tile) or " has only nodata on this tile; leave the tile out"
+            patch = _window(tile, self.layer, main, tile.grid, tile.grid)
+            declare = ", or declare that unit with gdal_edit.py -units"
+            smaller = smaller_unit_fault(with_unit(patch, self.layer), declare) if patch else None
+            fault = smaller or " has only nodata on this tile; leave the tile out"
         raise TaskError(f"{main.title}{fault}", str(main.path))
-
-    def _left_out_from_main(self, core: Grid) -> list[tuple[SourceFile, Unusable]]:
-        """Return the files left out; the one that covers most of the tile comes first."""
-        main = self.main_file(core)
-        return sorted(self.left_out, key=lambda pair: pair[0] != main)
-
-    def _smaller_unit(self, file: SourceFile, tile: Tile) -> str | None:
-        """Return that the file's heights on the tile may be in a smaller unit than metres, None if not."""
-        patch = _window(tile, self.layer, file, tile.grid, tile.grid)
-        declare = ", or declare that unit with gdal_edit.py -units"
-        return smaller_unit_fault(with_unit(patch, self.layer), declare) if patch else None
 
 
 def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = False) -> Mosaic:
@@ -201,24 +194,13 @@ def _files(tile: Tile, layer: Layer) -> tuple[SourceFile, ...]:
 def _window(tile: Tile, layer: Layer, file: SourceFile, grid: Grid, core: Grid) -> RasterWindow | None:
     """Return the part of a file that covers a grid, None if there is none; see `read_window`."""
     heights = layer.name in HEIGHTS
+    if file.extent and max(map(abs, file.extent)) <= FARTHEST:
+        # Where a file without georeference lies: the same for all tiles.
+        core = Grid.covering(core.crs, file.extent, core.cell)
+    resampling = Resampling.average if heights else Resampling.mode
     return read_window(
-        file.path,
-        file.title,
-        grid,
-        _position(file, core),
-        layer.crs,
-        Resampling.average if heights else Resampling.mode,
-        heights,
-        layer.reproject,
-        tile.missing,
+        file.path, file.title, grid, core, layer.crs, resampling, heights, layer.reproject, tile.missing
     )
-
-
-def _position(file: SourceFile, core: Grid) -> Grid:
-    """Return where a file lies if it has no georeference: at its extent, which is the same for all tiles."""
-    if file.extent is None or max(map(abs, file.extent)) > FARTHEST:
-        return core
-    return Grid.covering(core.crs, file.extent, core.cell)
 
 
 def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow | None) -> None:
@@ -228,7 +210,10 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
     """
     core = tile.grid
     # Files of neighbours only touch the tile.
-    if not (file.extent and _shared_m2(file.extent, core.bounds)) or (patch and _is_on(patch, core)):
+    if not (file.extent and _shared_m2(file.extent, core.bounds)):
+        return
+    lattice = patch.lattice if patch else None
+    if lattice and (lattice.reached(core).any() if lattice.crs else _shared_m2(lattice.bounds, core.bounds)):
         return
     found = read_raster(file.path, file.title, header, kept_raster, tile.missing)
     if found.lattice is None:
@@ -243,12 +228,6 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
         "elsewhere than the catalog says; build the catalog again",
         str(file.path),
     )
-
-
-def _is_on(patch: RasterWindow, core: Grid) -> bool:
-    """Return whether a part of a file covers a cell of a tile."""
-    lattice = patch.lattice
-    return bool(lattice.reached(core).any()) if lattice.crs else _shared_m2(lattice.bounds, core.bounds) > 0
 
 
 def _shared_m2(extent: Bounds | None, bounds: Bounds) -> float:

@@ -107,9 +107,20 @@ def _filled(parts: Sequence[RasterWindow], grid: Grid, resampling: Resampling) -
 
 def _resampled_together(groups: Sequence[Sequence[RasterWindow]], grid: Grid) -> list[Floats]:
     """Return each group of files of one lattice on a grid's cells, interpolated with the other groups."""
-    sheets = [_on_grid(group, grid) if group[0].lattice.fits(grid) else joined(group)[0] for group in groups]
+    own = RasterGrid(grid.west, grid.north, grid.cell, grid.cell, grid.width, grid.height)
+    sheets = [
+        replace(group[0], values=_filled(group, grid, Resampling.bilinear), lattice=own)
+        if group[0].lattice.fits(grid)
+        else joined(group)[0]
+        for group in groups
+    ]
     # The mean of a step with fewer cells is off its centre: heights of other files go before.
-    known = [_complete_steps(sheet) for sheet in sheets]
+    known = [
+        replace(sheet, values=np.where(sheet.share < 1 - EXACT, np.nan, sheet.values))
+        if sheet.share is not None
+        else sheet
+        for sheet in sheets
+    ]
     # The coarsest first: its cells beyond its border are farthest from the borders of the others, and these
     # then interpolate up to their own borders.
     for number in sorted(range(len(sheets)), key=lambda number: -_cell_m2(sheets[number].lattice, grid)):
@@ -119,20 +130,6 @@ def _resampled_together(groups: Sequence[Sequence[RasterWindow]], grid: Grid) ->
         resample_to(sheet if sheet.lattice.fits(grid) else wide, grid, Resampling.bilinear)
         for sheet, wide in zip(sheets, known, strict=True)
     ]
-
-
-def _on_grid(group: Sequence[RasterWindow], grid: Grid) -> RasterWindow:
-    """Return the files whose cells coincide with a grid's as one window of it."""
-    values = _filled(group, grid, Resampling.bilinear)
-    lattice = RasterGrid(grid.west, grid.north, grid.cell, grid.cell, grid.width, grid.height)
-    return replace(group[0], values=values, lattice=lattice)
-
-
-def _complete_steps(patch: RasterWindow) -> RasterWindow:
-    """Return a window of which the cells read together from fewer cells of the file have no value."""
-    if patch.share is None:
-        return patch
-    return replace(patch, values=np.where(patch.share < 1 - EXACT, np.nan, patch.values))
 
 
 def _cell_m2(lattice: RasterGrid, grid: Grid) -> float:
