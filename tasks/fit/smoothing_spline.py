@@ -344,4 +344,4 @@ def _minimum(
     bending = bending_energy(stiffness / np.count_nonzero(np.isfinite(heights)), space)
     loss = objective(heights, weight, space)
     convex = HuberObjective(loss, first.shape, huber_m, bending, held)
-    return minimise(convex, first, ITERATIONS, tolerance).z
+    return minimise(convex, first, ITERATIONS, tolerance)[0]

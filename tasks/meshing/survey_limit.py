@@ -9,12 +9,12 @@ The edges of kerbs and walls are found alike. Each is two lines side by side, on
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 import shapely
-from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.lazy import lazy
@@ -119,26 +119,12 @@ def _covered(lines: shapely.MultiLineString, area: shapely.Polygon, outside: Boo
     return shapely.MultiPolygon(list(parts[(2 * beyond < cells)[1:]]))
 
 
-@dataclass(frozen=True, eq=False)
-class Breaklines:
-    """The edges of steps on a tile."""
+def breaklines(
+    surface: SteppedSurface, local: Bounds
+) -> tuple[shapely.MultiLineString, Callable[[Floats], Floats]]:
+    """Return the edges of the steps of a surface, and a function of points, ``(n, 2)``.
 
-    surface: SteppedSurface
-    lines: shapely.MultiLineString
-    level: SurveyLimit
-    """The ground without steps."""
-    nearest: NDArray[np.float32]
-    """The step of the nearest cell that has one, ``(H, W)``, m."""
-
-    def height(self, points: Floats) -> Floats:
-        """Return the heights (m) of points, ``(n, 2)``, by the side of the lines on which they lie."""
-        place = (points + self.surface.cells.origin).T
-        step = self.nearest[self.surface.cells.cells(*place)]
-        return np.asarray(self.surface.smooth(*place) + np.where(self.level.covers(points), 0.0, step))
-
-
-def breaklines(surface: SteppedSurface, local: Bounds) -> Breaklines:
-    """Return the edges of the steps of a surface.
+    It returns their heights (m) by the side of the lines on which they lie.
 
     - `local`: west, south, east and north of the tile, from the origin of its cells (m).
     """
@@ -159,4 +145,10 @@ def breaklines(surface: SteppedSurface, local: Bounds) -> Breaklines:
     if high.any():
         at = scipy.ndimage.distance_transform_edt(~high, return_distances=False, return_indices=True)
         nearest = surface.steps[tuple(at)]
-    return Breaklines(surface, shapely.multilinestrings(lines), level, nearest)
+
+    def height(points: Floats) -> Floats:
+        place = (points + cells.origin).T
+        step = nearest[cells.cells(*place)]
+        return np.asarray(surface.smooth(*place) + np.where(level.covers(points), 0.0, step))
+
+    return shapely.multilinestrings(lines), height

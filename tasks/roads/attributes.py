@@ -240,7 +240,10 @@ def level_numbers(table: Any) -> tuple[NDArray[np.int64], tuple[str, ...]]:
                 if levels[i] is None and has_value(value):
                     text = str(value).strip().lower()
                     levels[i] = read(text)
-                    bad += [str(value)] if levels[i] is None and not _is_unknown(text) else []
+                    is_code = (
+                        LEVEL_NUMBER.fullmatch(text) and abs(float(text.replace(",", "."))) >= UNKNOWN_LEVEL
+                    )
+                    bad += [str(value)] if levels[i] is None and not is_code else []
             if bad:
                 notes.append(
                     f"{count(len(bad), 'value')} of the column {column} cannot be read as levels of roads "
@@ -279,8 +282,3 @@ def _structure(text: str) -> int | None:
     # A column of numbers with gaps is one of floats: 1800.0.
     word = re.split("[/#]", text)[-1].removesuffix(".0").translate(UMLAUTS)
     return STRUCTURE_LEVEL.get(word)
-
-
-def _is_unknown(text: str) -> bool:
-    """Return whether a text is a code for "unknown"."""
-    return LEVEL_NUMBER.fullmatch(text) is not None and abs(float(text.replace(",", "."))) >= UNKNOWN_LEVEL
