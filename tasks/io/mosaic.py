@@ -29,7 +29,7 @@ from flexroad.tasks.io.height_units import (
 )
 from flexroad.tasks.io.raster import RasterWindow, misalignment, read_raster, read_window
 from flexroad.tasks.io.raster_grid import header
-from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights, reach_m
+from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights, reach_m, shared_m2
 from flexroad.tasks.types import Bools, Floats
 
 
@@ -76,7 +76,7 @@ class Mosaic:
         """Return the file that covers most of a tile: by its extent in the catalog, else by what was read."""
         read = {patch.file: patch.lattice.bounds for patch in self.patches if not patch.lattice.crs}
         return max(
-            self.files, key=lambda file: _shared_m2(file.extent or read.get(str(file.path)), core.bounds)
+            self.files, key=lambda file: shared_m2(file.extent or read.get(str(file.path)), core.bounds)
         )
 
     def check_read(self, core: Grid) -> None:
@@ -210,10 +210,10 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
     """
     core = tile.grid
     # Files of neighbours only touch the tile.
-    if not (file.extent and _shared_m2(file.extent, core.bounds)):
+    if not (file.extent and shared_m2(file.extent, core.bounds)):
         return
     lattice = patch.lattice if patch else None
-    if lattice and (lattice.reached(core).any() if lattice.crs else _shared_m2(lattice.bounds, core.bounds)):
+    if lattice and (lattice.reached(core).any() if lattice.crs else shared_m2(lattice.bounds, core.bounds)):
         return
     found = read_raster(file.path, file.title, header, kept_raster, tile.missing)
     if found.lattice is None:
@@ -228,15 +228,6 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
         "elsewhere than the catalog says; build the catalog again",
         str(file.path),
     )
-
-
-def _shared_m2(extent: Bounds | None, bounds: Bounds) -> float:
-    """Return the area that an extent shares with a tile (m2), 0 if it is None."""
-    if extent is None:
-        return 0.0
-    width = min(extent[2], bounds[2]) - max(extent[0], bounds[0])
-    height = min(extent[3], bounds[3]) - max(extent[1], bounds[1])
-    return max(width, 0.0) * max(height, 0.0)
 
 
 def _notes(layer: Layer, patches: Sequence[RasterWindow], grid: Grid) -> list[str]:

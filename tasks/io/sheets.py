@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
 from flexroad.catalog.crs import transformer
-from flexroad.catalog.grid import Grid
+from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.io.raster import EXACT, RasterWindow, fill_from, joined, resample_to, same_lattice
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.types import Bools, Floats
@@ -36,10 +36,7 @@ class Coverage:
         if patch.lattice.crs:
             return False
         grid = self._grid
-        west, south, east, north = patch.lattice.bounds
-        width = min(east, grid.bounds[2]) - max(west, grid.bounds[0])
-        height = min(north, grid.bounds[3]) - max(south, grid.bounds[1])
-        self._most_cells += max(width, 0.0) * max(height, 0.0) / grid.cell**2
+        self._most_cells += shared_m2(patch.lattice.bounds, grid.bounds) / grid.cell**2
         self._unchecked.append(patch)
         # Cells are compared only if the areas of the files suffice.
         if self._most_cells < 0.999 * self._missing.size:
@@ -47,6 +44,15 @@ class Coverage:
         while self._unchecked:
             self._missing &= ~_covered(self._unchecked.pop(), grid)
         return not self._missing.any()
+
+
+def shared_m2(extent: Bounds | None, bounds: Bounds) -> float:
+    """Return the area that an extent shares with a tile (m2), 0 if it is None."""
+    if extent is None:
+        return 0.0
+    width = min(extent[2], bounds[2]) - max(extent[0], bounds[0])
+    height = min(extent[3], bounds[3]) - max(extent[1], bounds[1])
+    return max(width, 0.0) * max(height, 0.0)
 
 
 def reach_m(patches: Sequence[RasterWindow], grid: Grid) -> float:
