@@ -2,7 +2,7 @@
 
 Usage: ``PYTHONPATH=. python bench/bench_sampling.py CATALOG...``; each catalog gives a table, the mean
 over its tiles. Surfaces, masks and frames are those of production. Distances are those of
-`tasks.metrics.mesh_distance`, with the 99th percentile on roads and that of terrain from the surface without
+`tasks.metrics.evaluate`, with the 99th percentile on roads and that of terrain from the surface without
 the steps that a mesh without breaklines leaves out.
 """
 
@@ -27,9 +27,9 @@ from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.dihedral import mean_angles
+from flexroad.tasks.metrics.evaluate import OFF_CENTRE, mesh_distances
 from flexroad.tasks.metrics.mesh_check import check
-from flexroad.tasks.metrics.mesh_distance import OFF_CENTRE, mesh_distances
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.sample import SMOOTH_M, Options, sample
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.stepped import SteppedSurface

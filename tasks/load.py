@@ -18,8 +18,7 @@ from flexroad.catalog.scan.rasters import quiet
 from flexroad.catalog.tile import HEIGHTS, MIN_COVER
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.dsm_and_dtm import below_ground_note, survey_difference
-from flexroad.tasks.io.height_offset import offset_note
+from flexroad.tasks.io.dsm_and_dtm import below_ground_note, offset_note, survey_difference
 from flexroad.tasks.io.height_units import check_units
 from flexroad.tasks.io.mosaic import Mosaic, read_mosaic
 from flexroad.tasks.types import Bools, Floats, Source, TileData
@@ -104,65 +103,63 @@ def load(tile: Tile, options: Options) -> TileData:
     with quiet():
         mosaics["dsm"].check_valid(tile, options.min_valid)
         mosaics["dtm"].check_valid(tile, 0.0)
-    offset_dsm, remarks = _offset(tile, options)
-    models = mosaics["dsm"].values, mosaics["dtm"].values
+    data, remarks = _data(tile, grid, tile.grid, mosaics, options)
     # Of the tile alone: the sheets of its neighbours may have other heights.
     window = grid.window(tile.grid)
-    if suspect := offset_note(*(model[window] for model in models)) or below_ground_note(*models):
+    if suspect := offset_note(data.dsm[window], data.dtm[window]) or below_ground_note(data.dsm, data.dtm):
         remarks = [*remarks, suspect]
-    return TileData(
-        tile_id=tile.id,
-        grid=grid,
-        core=tile.grid,
-        dsm=mosaics["dsm"].values,
-        dtm=mosaics["dtm"].values,
-        road_height=mosaics["road_height"].values if "road_height" in mosaics else None,
-        offset_dsm=offset_dsm,
-        road_mask=_road(tile, "road_mask", mosaics),
+    return replace(
+        data,
         reference=_reference(mosaics),
         reference_road=_road(tile, "reference_road", mosaics),
         notes=(*(note for mosaic in mosaics.values() for note in mosaic.notes), *remarks),
-        dop=layer_source(tile, "dop"),
-        roads=layer_source(tile, "roads"),
-        decks=mosaics["bridges"].values if "bridges" in mosaics else None,
     )
 
 
-def load_border(ground: Tile, core: Grid, options: Options | None = None) -> TileData:
+def load_border(ground: Tile, core: Grid, options: Options) -> TileData:
     """Read the ground around a corner or an edge of tiles; it may be without data in part or everywhere.
 
     Files that cannot be used (`Unusable`) are left out: they fail the tiles that they lie on.
 
     - `ground`: the ground, with the files that reach it (`Tile.around`).
     - `core`: the tile that the files are of: the position of a file without georeference.
-    - `options`: the heights that roads are fitted to; None: the DSM's. The halo does not count.
+    - `options`: the heights that roads are fitted to. The halo does not count.
     """
-    grid, chosen = ground.grid, options or Options()
+    grid = ground.grid
     with quiet():
         mosaics = {
             layer.name: read_mosaic(ground, layer, grid, core, around=True)
             for layer in ground.layers
-            if _is_read(layer, chosen)
+            if _is_read(layer, options)
         }
     patches = [patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches]
     if patches:
         check_units(patches)
-    dsm, dtm = (
-        mosaics[name].values if name in mosaics else np.full(grid.shape, np.nan) for name in ("dsm", "dtm")
-    )
-    return TileData(
-        tile_id=ground.id,
+    data, _ = _data(ground, grid, grid, mosaics, options)
+    return replace(data, dop=_optional(data.dop), roads=_optional(data.roads))
+
+
+def _data(
+    tile: Tile, grid: Grid, core: Grid, mosaics: Mapping[str, Mosaic], options: Options
+) -> tuple[TileData, list[str]]:
+    """Return what a tile and the ground around a border have, and a note on the heights of roads."""
+    values = {name: mosaic.values for name, mosaic in mosaics.items()}
+    unknown = np.full(grid.shape, np.nan)
+    offset_dsm, remarks = _offset(tile, options)
+    data = TileData(
+        tile_id=tile.id,
         grid=grid,
-        core=grid,
-        dsm=dsm,
-        dtm=dtm,
-        road_height=mosaics["road_height"].values if "road_height" in mosaics else None,
-        offset_dsm=_offset(ground, chosen)[0],
-        road_mask=_road(ground, "road_mask", mosaics),
-        dop=_optional(layer_source(ground, "dop")),
-        roads=_optional(layer_source(ground, "roads")),
-        decks=mosaics["bridges"].values if "bridges" in mosaics else None,
+        core=core,
+        dsm=values.get("dsm", unknown),
+        dtm=values.get("dtm", unknown),
+        road_height=values.get("road_height"),
+        offset_dsm=offset_dsm,
+        road_mask=_road(tile, "road_mask", mosaics),
+        dop=layer_source(tile, "dop"),
+        roads=layer_source(tile, "roads"),
+        decks=values.get("bridges"),
     )
+    return data, remarks
 
 
 def _is_read(layer: Layer, options: Options) -> bool:

@@ -24,7 +24,7 @@ import shapely
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.grid import Bounds
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.meshing.abutment_lines import (
@@ -33,18 +33,19 @@ from flexroad.tasks.meshing.abutment_lines import (
     level_outline,
     without_abutments,
 )
-from flexroad.tasks.meshing.breaklines import breaklines
 from flexroad.tasks.meshing.lines import (
+    DECIMALS,
     apart_from,
+    axis,
     divided,
     ends_at_border,
     parts_of,
     points_and_segments,
+    without_duplicates,
 )
 from flexroad.tasks.meshing.parts import middles, with_levels
-from flexroad.tasks.meshing.positions import DECIMALS, axis, without_duplicates
 from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
-from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
+from flexroad.tasks.meshing.survey_limit import SurveyLimit, breaklines, survey_limit
 from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.mesh_border import (
@@ -220,7 +221,7 @@ def _other_level(
     if limit:
         area = shapely.intersection(area, limit.covered)
         lines.append(parts_of(limit.lines))
-    border = _dynamic_border(surface.height, road, local, options, frame, lines)
+    border = _border(surface.height, road, local, options, frame, lines)
     border = outline.with_shared(border, ground, local)
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
     covered = SurveyLimit(
@@ -254,8 +255,8 @@ def _dynamic(
     lines = [] if limit is None else [_divided(limit.lines, road, mask, options)]
     breaks = None
     if isinstance(surface, SteppedSurface) and options.breaklines:
-        breaks = breaklines(surface, local)
-        lines.append(without_abutments(_divided(breaks.lines, road, mask, options), others))
+        edges, breaks = breaklines(surface, local)
+        lines.append(without_abutments(_divided(edges, road, mask, options), others))
     if road.areas is not None and options.mask == "raw":
         outline = road_outline(road.areas, local, options.road_m)
         lines.append(without_abutments(outline.lines, others))
@@ -265,13 +266,13 @@ def _dynamic(
     joined = JoinedGround(surface, road.core.origin, others) if others else None
     if frame:
         free = free[~on_border(free, local)]
-    border = _dynamic_border((joined or surface).height, road, local, options, frame, lines)
+    border = _border((joined or surface).height, road, local, options, frame, lines)
     free = free[apart_from(free, lines, options.road_m / 2)]
     if limit:
         free = free[limit.covers(free)]
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
     place = (plan + road.core.origin).T
-    z = breaks.height(plan) if breaks else surface.height(*place)
+    z = breaks(plan) if breaks else surface.height(*place)
     if joined:
         z = joined.on_abutments(place[0], place[1], z)
     if isinstance(surface, MovingNurbs):
@@ -330,26 +331,23 @@ def _lattice(surface: Surface, road: RoadMask, where: Bools, local: Bounds, step
     return np.stack([x[j], y[i], z[i, j]], axis=1)
 
 
-def _dynamic_border(
-    height: HeightAt,
-    road: RoadMask,
-    local: Bounds,
-    options: Options,
-    frame: Frame | None,
-    lines: Sequence[NDArray[np.object_]],
-) -> Floats:
-    """Return the border points of a dynamic mesh, ``(n, 3)``."""
-    if frame:
-        return _shared_border(height, road.core, local, options, frame)
-    return _border(height, road.core.origin, local, options, lines)
-
-
 def _border(
-    height: HeightAt, origin: tuple[float, float], local: Bounds, options: Options,
+    height: HeightAt, road: RoadMask, local: Bounds, options: Options, frame: Frame | None,
     lines: Sequence[NDArray[np.object_]],
 ) -> Floats:  # fmt: skip
-    """Return points along the four edges of the domain, with corners and ends of lines, ``(n, 3)``."""
+    """Return points along the border of a dynamic mesh, with corners and ends of lines, ``(n, 3)``.
+
+    With a frame they are those of the neighbours, too.
+    """
     west, south, east, north = local
+    if frame:
+        fine, coarse = (
+            [axis(0.0, length, step, to_end=True) for length in (east - west, north - south)]
+            for step in (options.road_m, options.terrain_m)
+        )
+        raw, apart_m = options.mask == "raw", options.road_m / 4
+        plan = border_points(frame, local, road.core.cell, fine, coarse, raw, apart_m)
+        return np.column_stack([plan, border_heights(height, *(plan + road.core.origin).T)])
     x, y = (axis(*ends, options.terrain_m, to_end=True) for ends in ((west, east), (south, north)))
     sides = [np.stack(np.broadcast_arrays(x, edge), axis=1) for edge in (south, north)]
     sides += [np.stack(np.broadcast_arrays(edge, y), axis=1) for edge in (west, east)]
@@ -359,20 +357,7 @@ def _border(
         corners = np.isin(plan[:, 0], [west, east]) & np.isin(plan[:, 1], [south, north])
         away = np.linalg.norm(plan[:, None] - ends, axis=2).min(axis=1, initial=np.inf)
         plan = np.concatenate([plan[corners | (away >= options.road_m / 4)], ends])
-    z = height(plan[:, 0] + origin[0], plan[:, 1] + origin[1])
-    return np.column_stack([plan, z])
-
-
-def _shared_border(height: HeightAt, core: Grid, local: Bounds, options: Options, frame: Frame) -> Floats:
-    """Return the border points of a tile that joins its neighbours, ``(n, 3)``."""
-    lengths = local[2] - local[0], local[3] - local[1]
-    fine, coarse = (
-        [axis(0.0, length, step, to_end=True) for length in lengths]
-        for step in (options.road_m, options.terrain_m)
-    )
-    plan = border_points(frame, local, core.cell, fine, coarse, options.mask == "raw", options.road_m / 4)
-    z = border_heights(height, *(plan + core.origin).T)
-    return np.column_stack([plan, z])
+    return np.column_stack([plan, height(*(plan + road.core.origin).T)])
 
 
 def _mesh(

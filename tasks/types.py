@@ -399,7 +399,7 @@ class Quality:
     error_estimate_m: float
     """Mean estimated error of the surface, by `tasks.quality.estimate`."""
     worst_error_estimate_m: float
-    """Largest estimated error that 25 m2 of connected road reach, by `tasks.quality.worst`."""
+    """Largest estimated error that 25 m2 of connected road reach, by `tasks.quality.flagged`."""
     worst_easting: float
     """Easting of the cell with the largest estimate in that piece of road (m)."""
     worst_northing: float

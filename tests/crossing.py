@@ -14,9 +14,8 @@ from flexroad.tasks.meshing.road_outline import crossings, encoded
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.sample import Options, sample
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
-from flexroad.tasks.spline.lattice import Lattice
 from flexroad.tasks.spline.levelled import LevelledSurface
-from flexroad.tasks.spline.space import surface_on
+from flexroad.tasks.spline.space import Lattice, surface_on
 from flexroad.tasks.types import Level, LevelSpline, Mesh, RoadClusters, RoadMask
 
 WEST, SOUTH = 500000.0, 5600000.0

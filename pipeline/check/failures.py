@@ -25,7 +25,7 @@ from flexroad.pipeline.check.trial import Finding, trials
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.layers import lacking, without_photo
 from flexroad.tasks import load
-from flexroad.tasks.io.raster_header import header
+from flexroad.tasks.io.raster_grid import header
 
 MISSING, NO_FILE = "missing", "not a regular file"
 REMEDIES = {MISSING: "restore it or build the catalog again", NO_FILE: "replace it by one"}

@@ -9,7 +9,7 @@ from typing import Any
 
 from flexroad.catalog.text import count, some
 from flexroad.pipeline.check.trial import Finding, Trial
-from flexroad.tasks.io.height_offset import FAR_M, on_tiles
+from flexroad.tasks.io.dsm_and_dtm import FAR_M, on_tiles
 
 STEP_M = 0.3
 """Change of the offset between tiles that is taken for another vertical reference (m)."""
@@ -62,7 +62,7 @@ def road_step(rows: Iterable[Mapping[str, Any]], tiles: int) -> Iterator[str]:
 
 def _step(trials: Sequence[Trial]) -> str | None:
     """Return that the offset changes between tiles, by the widest gap in its values; None if it does not."""
-    calm = [(tile.offset.median_m, tile) for tile in trials if tile.offset and tile.offset.spread_m <= CALM_M]
+    calm = [(tile.offset[0], tile) for tile in trials if tile.offset and tile.offset[1] <= CALM_M]
     calm.sort(key=lambda pair: pair[0])
     values = [value for value, _ in calm]
     gaps = [after - before for before, after in pairwise(values)]

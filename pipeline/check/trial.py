@@ -15,7 +15,7 @@ from flexroad.catalog.text import some
 from flexroad.pipeline.config.models import Config
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.height_offset import Offset, offset_note, open_offset
+from flexroad.tasks.io.dsm_and_dtm import Offset, offset_note, open_offset
 from flexroad.tasks.io.height_units import is_conversion
 from flexroad.tasks.options import stage_function, stage_module
 from flexroad.tasks.types import Bools, Floats

@@ -39,7 +39,7 @@ from flexroad.pipeline.run.status import TileStatus, pending_tiles, progress, su
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import MetricsRow, TileState
 from flexroad.pipeline.worker.tile import TileResult
-from flexroad.tasks.io.height_offset import is_offset, on_tiles
+from flexroad.tasks.io.dsm_and_dtm import is_offset, on_tiles
 
 app = group()
 

@@ -28,7 +28,7 @@ from flexroad.pipeline.graph.sources import border_json, to_json
 from flexroad.tasks.border import BorderStages, BorderTask
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options, stage_module
-from flexroad.tasks.spline.lattice import check_spacing
+from flexroad.tasks.spline.space import check_spacing
 
 STAGE = "border"
 """Name of the nodes in the store, the log and the table of failures."""

@@ -33,11 +33,10 @@ from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import MarkerStat, distances_of
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.pipeline.worker.tile import marker_stat
-from flexroad.tasks.metrics.mesh_distance import FIGURES
+from flexroad.tasks.metrics.evaluate import FIGURES
 from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
-from flexroad.tasks.quality.flagged import Bits
-from flexroad.tasks.quality.places import Place, places
+from flexroad.tasks.quality.flagged import Bits, Place, places
 from flexroad.tasks.types import Floats, Mesh, Metrics, Quality, RoadClusters, RoadMask, Surface, TileData
 
 ESTIMATES = 32
@@ -308,7 +307,7 @@ class FinishedTile:
         cells = compare(
             data, self.road, self.clusters, self.surface, self.assessment.dsm_dtm_tolerance_m, only_road=True
         )
-        found = places(cells, data.core, self.assessment)
+        found = places(cells, data.core, self.assessment.dsm_dtm_tolerance_m)
         return {flag: found[flag] for flag in flags if flag in found}
 
     @cached_property

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from flexroad.tasks.metrics.mesh_distance import FIGURES
+from flexroad.tasks.metrics.evaluate import FIGURES
 from flexroad.tasks.quality.assess import NO_ROAD
 
 MetricsRow = dict[str, Any]

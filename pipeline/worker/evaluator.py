@@ -25,8 +25,7 @@ from flexroad.pipeline.graph.graph import Node, TileGraph, files_read
 from flexroad.pipeline.graph.sources import hashed, to_json
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.records import Failure, utc_now
-from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.left_out import recorded
+from flexroad.tasks.errors import TaskError, recorded
 from flexroad.tasks.options import Options, stage_function
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, Surface, TileData

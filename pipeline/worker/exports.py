@@ -22,14 +22,14 @@ from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store.products import file_entry
 from flexroad.pipeline.worker.evaluator import check_unchanged
 from flexroad.tasks.errors import LayerMissing
+from flexroad.tasks.io.dsm_and_dtm import vertical_crs
 from flexroad.tasks.io.orthophoto import read_photo
-from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.levels.seen import top_mask
 from flexroad.tasks.load import layer_source
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import cog, glb, npz, ply
 from flexroad.tasks.quality.height_source import of_faces, top_height_source
-from flexroad.tasks.roads.level_numbers import HIGHEST
+from flexroad.tasks.roads.attributes import HIGHEST_LEVEL
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Orthophoto, Quality, Surface
 
@@ -99,7 +99,7 @@ def of_level(kind: Kind, number: int) -> Kind:
 
 
 LEVEL_KINDS = tuple(
-    of_level(kind, number) for kind in (HEIGHT, HEIGHT_SOURCE) for number in range(-HIGHEST, 1)
+    of_level(kind, number) for kind in (HEIGHT, HEIGHT_SOURCE) for number in range(-HIGHEST_LEVEL, 1)
 )
 """Further kinds of the format ``cog``, for tiles with decks or tunnels."""
 

@@ -42,7 +42,7 @@ from flexroad.pipeline.worker.exports import (
     products,
     tile_texture,
 )
-from flexroad.tasks.io.left_out import recorded
+from flexroad.tasks.errors import recorded
 from flexroad.tasks.types import Metrics, Quality
 
 QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")

@@ -137,7 +137,10 @@ def _clusters_of(
     cell, theta = data.grid.cell, options.theta_z_m
     points = road.mask & np.isfinite(data.dsm)
     patches = flat_patches(data.dsm, points, cell, options.roughness_m, BEND, data.dtm, theta)
-    clusters = _clusters(data.dsm, patches, options.theta_xy_m / cell, theta)
+    # Neighbouring patches share most of their cells, so they always merge. Across gaps, clusters merge if any
+    # two of their edge cells agree in height along the street's slope.
+    roots = _merged(patches.centres, options.theta_xy_m / cell, data.dsm, patches.trend, theta)
+    clusters = _covered(roots, patches.reach)
     ground = _on_ground(data, clusters, theta, raised_m2_per_m)
     reach = max(1, math.floor(REACH_M / cell + 1e-9))
     # The plane of a foot goes on up the object's side.
@@ -169,17 +172,6 @@ def _streets(mask: Bools, kept: Bools) -> Bools:
     street = np.zeros(mask.size + 1, np.bool_)
     street[parts[kept]] = True
     return street[parts]
-
-
-def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArray[np.int32]:
-    """Return the root of the cluster of each cell that lies in a flat patch, ``(H, W)``, else -1.
-
-    Neighbouring patches share most of their cells, so they always merge. Across gaps, clusters merge if any
-    two of their edge cells agree in height along the street's slope.
-    """
-    roots = _merged(patches.centres, gap, dsm, patches.trend, theta)
-    covered: NDArray[np.int32] = _covered(roots, patches.reach)
-    return covered
 
 
 def _on_ground(data: TileData, clusters: NDArray[np.int32], theta: float, raised_m2_per_m: float) -> Bools:

@@ -18,7 +18,7 @@ from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.roads.dtm_validity import valid_dtm
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline import adam
-from flexroad.tasks.spline.moving import WEIGHTS, MovingNurbs, moving
+from flexroad.tasks.spline.moving import WEIGHTS, MovingNurbs, loss_by_variables, moving
 from flexroad.tasks.spline.objective import Objective, objective
 from flexroad.tasks.spline.space import (
     Space,
@@ -138,9 +138,10 @@ def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Flo
         options.learning_rate, options.iterations, STOP_TOLERANCE, STOP_WINDOW, options.result == "last",
     )  # fmt: skip
     if weights := WEIGHTS.get(options.weights):
-        variables = np.stack([start, np.full_like(start, weights.start)])
-        (z, s), _ = adam.minimise(weights.loss(loss), variables, np.array(math.inf), schedule)
-        return z, weights.value(s)
+        one, value, _ = weights
+        variables = np.stack([start, np.full_like(start, one)])
+        (z, s), _ = adam.minimise(loss_by_variables(loss, weights), variables, np.array(math.inf), schedule)
+        return z, value(s)
     variables = np.stack([start, np.zeros_like(start)])
     limit = np.array([math.inf, MAX_LOG_WEIGHT])[:, None, None]
     if options.engine == "torch":

@@ -4,7 +4,7 @@ The surface is the NURBS graph of `tasks.spline.surface` with unit weights. It m
 the height differences plus the bending energy of a thin plate that is stiffer on roads than beside them. The
 problem is convex; `tasks.spline.irls` solves it. docs/fit.md compares it with the paper's fit.
 
-Control points lie on the lattice of `tasks.spline.lattice`, which all tiles share. Those that act on a corner
+Control points lie on the lattice of `tasks.spline.space`, which all tiles share. Those that act on a corner
 of the tile are fitted first, then those on its edges, each to the ground around it and without regard to the
 tile (`corner` and `edge`). `fit` holds them and fits the points inside to the tile's own cells. So two
 neighbours have one surface, although no tile waits for another (docs/mosaic.md).
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -30,10 +30,9 @@ from flexroad.tasks.roads.dtm_validity import Slices, ground_to_fit, valid_dtm
 from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.spline.frame import Corner, Edge, Frame, rounded
 from flexroad.tasks.spline.irls import HuberObjective, minimise
-from flexroad.tasks.spline.lattice import Lattice, Range
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.objective import objective
-from flexroad.tasks.spline.space import Space, check_cells, start_heights, surface_on
+from flexroad.tasks.spline.space import Lattice, Range, Space, check_cells, start_heights, surface_on
 from flexroad.tasks.spline.stepped import border_steps, ground_beside, spline_around, with_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.spline.thin_plate import bending_energy
@@ -75,25 +74,6 @@ class Options(BaseOptions):
     steps: bool = Field(
         True, description="give the cells beside roads a step above the spline: kerbs, walls and banks"
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """The loss of one tile, corner or edge, and the control heights to start from."""
-
-    space: Space
-    heights: Floats
-    """Heights to fit above the datum, ``(H, W)``, m; NaN cells are ignored."""
-    weight: Floats
-    """Weight of the height differences, ``(H, W)``, before the division by the number of cells."""
-    stiffness: Floats
-    """Weight of the squared curvature, ``(H, W)``, m3, before that division."""
-    first: Floats
-    """Control heights at the start, ``(m, n)``, m above the datum."""
-    held: Bools
-    """Control points that keep their height, ``(m, n)``."""
-    datum: float
-    """Height above sea level that has been subtracted from all heights (m)."""
 
 
 def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None = None) -> NurbsSurface:
@@ -142,14 +122,10 @@ def _spline(data: TileData, clusters: RoadClusters, options: Options, frame: Fra
     if clusters.level is None:
         check_cells(ground_to_fit(fitted, clusters, (rows, cols)), (shape[1], shape[0]))
     held = frame.control(shape) if frame else np.full(shape, np.nan)
-    problem = _problem(fitted, clusters, lattice, (rows.stop, cols.start), (0, n), (0, m), held, options)
-    z = _with_held(held, _minimum_of(problem, options, TOLERANCE) + problem.datum)
+    start = rows.stop, cols.start
+    space, z = _fitted(fitted, clusters, lattice, start, (0, n), (0, m), held, options, TOLERANCE)
     # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
-    return surface_on(problem.space, core, core.exact_bounds, z, np.ones_like(z), datum=0.0)
-
-
-def _with_held(held: Floats, z: Floats) -> Floats:
-    return np.where(np.isfinite(held), held, z)
+    return surface_on(space, core, core.exact_bounds, z, np.ones_like(z), datum=0.0)
 
 
 def acting_m(options: Options) -> float:
@@ -201,7 +177,7 @@ def _corner(
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     k, j = _lines(data, clusters, border, lattice)
     held = np.full((2 * j + p, 2 * k + p), np.nan)
-    z = _control_heights(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, options)
+    _, z = _fitted(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, options)
     row, col = border.cell
     around = road.outside[row - 1 : row + 1, col - 1 : col + 1]
     return Corner(rounded(z[j : j + p, k : k + p]), around)
@@ -291,7 +267,7 @@ def _along(
     acting = slice(j, j + m + p), slice(k, k + n + p)
     held[acting][:p, :p], held[acting][-p:, -p:] = (end.control for end in ends)
     u, v = (-k, n + k), (-j, m + j)
-    around = _control_heights(fitted, clusters, lattice, border.cell, u, v, held, options)
+    _, around = _fitted(fitted, clusters, lattice, border.cell, u, v, held, options)
     z = rounded(around[acting])
     return z[:, p:-p] if eastward else z[p:-p], spline_around(lattice, border, u, v, around)
 
@@ -333,48 +309,29 @@ def _lines(data: TileData, clusters: RoadClusters, border: Border, lattice: Latt
     return lattice.lines_over((border.cell[1] - 0.5) * cell)
 
 
-def _control_heights(
+def _fitted(
     data: TileData, clusters: RoadClusters, lattice: Lattice, start: tuple[int, int], u: Range, v: Range,
-    held: Floats, options: Options,
-) -> Floats:  # fmt: skip
-    """Return the control heights (m) of a part of the lattice, fitted to the cells in it.
+    held: Floats, options: Options, tolerance: float = BORDER_TOLERANCE,
+) -> tuple[Space, Floats]:  # fmt: skip
+    """Return the splines over a part of the lattice, and their control heights (m), fitted to its cells.
 
     Points with a finite height in ``held`` keep it. The others are NaN if no cell has a height.
     """
-    problem = _problem(data, clusters, lattice, start, u, v, held, options)
-    if np.isnan(problem.heights).all():
-        return held
-    return _with_held(held, _minimum_of(problem, options, BORDER_TOLERANCE) + problem.datum)
-
-
-def _problem(
-    data: TileData, clusters: RoadClusters, lattice: Lattice, start: tuple[int, int], u: Range, v: Range,
-    held: Floats, options: Options,
-) -> _Problem:  # fmt: skip
-    """Return the loss over the cells in a part of the lattice."""
     space, window = lattice.part(data.grid.shape, start, u, v)
     dsm, road, dtm = data.dsm[window], clusters.labels[window] > 0, valid_dtm(data, clusters, window)
     ground = np.where(road, dsm, dtm)
     if np.isnan(ground).all():
         # Of a corner or edge: tiles that bridge it must still hold the same points.
         dtm = ground = dsm
-    no_ground = np.isnan(ground).all()
-    first, datum = (held, 0.0) if no_ground else start_heights(dsm, dtm, road, space)
+    if np.isnan(ground).all():
+        return space, held
+    first, datum = start_heights(dsm, dtm, road, space)
     is_held = np.isfinite(held)
-    return _Problem(
-        space,
-        heights=ground - datum,
-        weight=np.where(road, 1.0, options.lambda_terrain),
-        stiffness=options.bending_m3 * np.where(road, 1.0, TERRAIN_BENDING),
-        first=np.where(is_held, held, first) - datum,
-        held=is_held,
-        datum=datum,
-    )
-
-
-def _minimum_of(problem: _Problem, options: Options, tolerance: float) -> Floats:
-    p = problem
-    return _minimum(p.space, p.heights, p.weight, p.stiffness, p.first, p.held, options.huber_m, tolerance)
+    first = np.where(is_held, held, first) - datum
+    stiffness = options.bending_m3 * np.where(road, 1.0, TERRAIN_BENDING)
+    weight = np.where(road, 1.0, options.lambda_terrain)
+    z = _minimum(space, ground - datum, weight, stiffness, first, is_held, options.huber_m, tolerance)
+    return space, np.where(is_held, held, z + datum)
 
 
 def _minimum(
@@ -387,4 +344,4 @@ def _minimum(
     bending = bending_energy(stiffness / np.count_nonzero(np.isfinite(heights)), space)
     loss = objective(heights, weight, space)
     convex = HuberObjective(loss, first.shape, huber_m, bending, held)
-    return minimise(convex, first, ITERATIONS, tolerance).z
+    return minimise(convex, first, ITERATIONS, tolerance)[0]

@@ -1,13 +1,20 @@
-"""Checks of a DSM against a DTM: whether they are swapped, and whether they are of one survey."""
+"""Checks of a DSM against a DTM, and what their files declare of survey and vertical CRS.
+
+The two may be swapped, or of two surveys. A DSM that lies above or below the DTM as a whole has another
+vertical datum, or another unit of heights.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import vertical
+from flexroad.catalog.guard.open_raster import kept_raster
 from flexroad.catalog.scan.rasters import date_of, quiet
 from flexroad.tasks.io.raster import Unreadable, read_raster
 from flexroad.tasks.types import Floats
@@ -16,6 +23,28 @@ BELOW_M = 1.0
 """Distance from which a surface below the ground counts, or one above it (m)."""
 SHARE, TIMES = 0.05, 4.0
 """Share of the cells with a surface below the ground that is noted, if it is so many times that above it."""
+FAR_M = 1.0
+"""Offset from which two vertical references are suspected (m)."""
+SMOOTH_M = 0.2
+"""Change of the difference from a cell to its neighbours, up to which the cell may be open ground (m)."""
+LOWEST = 10.0
+"""Percentile of the difference over smooth cells that stands for the ground: roofs are smooth, too, and a
+tile with less ground than this share is rare."""
+CONSTANT_M = 0.2
+"""Largest spread of an offset that is the same over the tile: relief gives more (m)."""
+OPEN_M = 1.0
+"""Open ground is smooth and within this of the lowest (m)."""
+SMOOTH_SHARE, OPEN_SHARE = 0.05, 0.25
+"""Least share of smooth cells in those with both heights, and of open ones in the smooth."""
+SCALES = {"feet": 0.3048, "dm": 0.1, "cm": 0.01, "mm": 0.001}
+"""Units that one of the models may be in, in metres."""
+HIGH_M = 3 * FAR_M
+"""Height of the ground from which a ratio of heights tells more than that both are near 0 (m)."""
+ABOVE, RATIO = "the DSM lies ", "the heights of the DSM are "
+"""Begin of notes on an offset, and on a ratio."""
+
+Offset = tuple[float, float]
+"""DSM minus DTM over the open cells of a tile (m): median, and spread by the median absolute deviation."""
 
 
 def below_ground_note(dsm: Floats, dtm: Floats) -> str | None:
@@ -41,14 +70,12 @@ def below_ground_note(dsm: Floats, dtm: Floats) -> str | None:
 def survey_difference(tile: Tile) -> tuple[str, str]:
     """Return how DSM and DTM differ, and what their files do not declare; "" if nothing.
 
-    Only headers are read. Files that cannot be read are left out, as by `load`.
-
     - `tile`: with the files to compare (`Tile.within`).
     """
-    declared = {name: _declared(tile, name) for name in ("dsm", "dtm")}
+    declared = [_declared(tile, name) for name in ("dsm", "dtm")]
     differs, missing = [], []
     for number, what in enumerate(("date", "vertical CRS")):
-        dsm, dtm = ({file[number] for file in declared[name]} for name in ("dsm", "dtm"))
+        dsm, dtm = ({file[number] for file in files} for files in declared)
         if dsm - {""} and dtm - {""} and dsm - {""} != dtm - {""}:
             differs.append(f"{what}: dsm {', '.join(sorted(dsm))}, dtm {', '.join(sorted(dtm))}")
         elif dsm | dtm != (dsm & dtm) - {""}:
@@ -56,14 +83,32 @@ def survey_difference(tile: Tile) -> tuple[str, str]:
     return "; ".join(differs), " and ".join(missing)
 
 
+def vertical_crs(tile: Tile) -> str | None:
+    """Return the vertical CRS of the heights that `load` gives, in metres; None if it is not known.
+
+    It is known if all files of DSM and DTM on the tile declare the same one.
+    """
+    tile = tile.within(tile.grid.bounds)
+    found = {crs for name in ("dsm", "dtm") for _, crs in _declared(tile, name)}
+    return found.pop() or None if len(found) == 1 else None
+
+
 def _declared(tile: Tile, name: str) -> list[tuple[str, str]]:
-    """Return date and vertical CRS of each file of a layer, "" where it declares none."""
+    """Return date and vertical CRS of each file of a layer, "" where it declares none.
+
+    Only headers are read. Files that cannot be read are left out, as by `load`.
+    """
     layer = tile.layer(name)
+
+    def read(raster: Any) -> tuple[str | None, dict[str, str]]:
+        tags = {**raster.tags(), **raster.tags(ns="IMAGERY")}
+        return raster.crs.to_wkt() if raster.crs else None, tags
+
     found: list[tuple[str, str]] = []
     with quiet():
         for path in tile.paths(layer) if layer else ():
             try:
-                crs, tags = read_raster(path, name, _crs_and_tags, missing=tile.missing)
+                crs, tags = read_raster(path, name, read, kept_raster, tile.missing)
             except Unreadable:
                 continue
             taken, crs = date_of(tags), crs or (layer.crs if layer else None)
@@ -71,7 +116,84 @@ def _declared(tile: Tile, name: str) -> list[tuple[str, str]]:
     return found
 
 
-def _crs_and_tags(raster: Any) -> tuple[str | None, dict[str, str]]:
-    """Return the CRS of an open raster as WKT, None if it has none, and its tags."""
-    tags = {**raster.tags(), **raster.tags(ns="IMAGERY")}
-    return raster.crs.to_wkt() if raster.crs else None, tags
+def open_offset(dsm: Floats, dtm: Floats) -> Offset | None:
+    """Return by how much a DSM lies above a DTM (m, same shape) on open ground.
+
+    Open ground is where the difference is the same in neighbouring cells, and low: crowns of trees are rough,
+    and roofs are higher. None if too few cells are so.
+    """
+    above = dsm - dtm
+    known = np.isfinite(above)
+    smooth = known.copy()
+    with np.errstate(invalid="ignore"):
+        beside, below = np.abs(np.diff(above, axis=1)) <= SMOOTH_M, np.abs(np.diff(above, axis=0)) <= SMOOTH_M
+    smooth[:, :-1] &= beside
+    smooth[:, 1:] &= beside
+    smooth[:-1] &= below
+    smooth[1:] &= below
+    cells = above[smooth]
+    if not cells.size or cells.size < SMOOTH_SHARE * np.count_nonzero(known):
+        return None
+    ground = cells[np.abs(cells - np.percentile(cells, LOWEST)) <= OPEN_M]
+    if ground.size < OPEN_SHARE * cells.size:
+        return None
+    median = float(np.median(ground))
+    return median, 1.4826 * float(np.median(np.abs(ground - median)))
+
+
+def offset_note(dsm: Floats, dtm: Floats) -> str | None:
+    """Return a note if hardly a cell of a DSM is near the DTM (m, same shape), and the offset is constant.
+
+    Or if the heights of one are those of the other in another unit; else None.
+    """
+    most = LOWEST / 100
+    # Every fourth row of most tiles has near cells enough for all of it.
+    if np.count_nonzero(np.abs(dsm[::4] - dtm[::4]) <= FAR_M) > most * dsm.size:
+        return None
+    above = np.abs(dsm - dtm)
+    near, known = np.count_nonzero(above <= FAR_M), np.count_nonzero(np.isfinite(above))
+    if not known or near > most * known:
+        return None
+    offset = open_offset(dsm, dtm)
+    for unit, metres in SCALES.items():
+        for ratio, which, scaled in (
+            (1 / metres, f"the DSM in {unit}, the DTM in metres?", (dsm * metres, dtm)),
+            (metres, f"the DTM in {unit}, the DSM in metres?", (dsm, dtm * metres)),
+        ):
+            if _agree(*scaled, offset):
+                return f"{RATIO}{ratio:.{2 if ratio > 0.05 else 3}f} times those of the DTM: {which}"
+    median_m, spread_m = offset or (0.0, 0.0)
+    if abs(median_m) < FAR_M or spread_m > CONSTANT_M:
+        return None
+    if median_m > 0:
+        return f"{ABOVE}{median_m:.1f} m above the DTM: ellipsoidal heights?"
+    return f"{ABOVE}{-median_m:.1f} m below the DTM: ellipsoidal heights, or are their files swapped?"
+
+
+def _agree(dsm: Floats, dtm: Floats, unscaled: Offset | None) -> bool:
+    """Return whether a DSM lies on a DTM after one of them was converted, and better than before."""
+    found = open_offset(dsm, dtm)
+    if not found or abs(found[0]) > FAR_M or np.nanmedian(np.abs(dtm)) < HIGH_M:
+        return False
+    return not unscaled or found[1] <= unscaled[1]
+
+
+def is_offset(note: str) -> bool:
+    """Return whether a note of a tile is one of `offset_note`."""
+    return note.startswith((ABOVE, RATIO))
+
+
+def on_tiles(notes: Iterable[str], tiles: int) -> list[str]:
+    """Return one line for each cause in notes of tiles by `offset_note`, with the number of tiles.
+
+    - `notes`: one for each tile that has one; of each cause the first is shown.
+    - `tiles`: number of tiles looked at.
+    """
+    first: dict[str, str] = {}
+    number = Counter[str]()
+    for note in notes:
+        what, _, cause = note.partition(": ")
+        first.setdefault(cause, what)
+        number[cause] += 1
+    total = f"{tiles} tile{'s' * (tiles != 1)}"
+    return [f"{what} on {number[cause]} of {total}: {cause}" for cause, what in first.items()]

@@ -19,7 +19,7 @@ from flexroad.catalog.guard.open_raster import kept_raster
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.catalog.tile import HEIGHTS, TOUCH_M
-from flexroad.tasks.errors import TaskError, Unusable
+from flexroad.tasks.errors import TaskError, Unusable, leave_out
 from flexroad.tasks.io.height_units import (
     absurd_note,
     converted_note,
@@ -27,10 +27,9 @@ from flexroad.tasks.io.height_units import (
     smaller_unit_fault,
     with_unit,
 )
-from flexroad.tasks.io.left_out import leave_out
 from flexroad.tasks.io.raster import RasterWindow, misalignment, read_raster, read_window
-from flexroad.tasks.io.raster_header import header
-from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights, reach_m
+from flexroad.tasks.io.raster_grid import header
+from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights, reach_m, shared_m2
 from flexroad.tasks.types import Bools, Floats
 
 
@@ -77,12 +76,13 @@ class Mosaic:
         """Return the file that covers most of a tile: by its extent in the catalog, else by what was read."""
         read = {patch.file: patch.lattice.bounds for patch in self.patches if not patch.lattice.crs}
         return max(
-            self.files, key=lambda file: _shared_m2(file.extent or read.get(str(file.path)), core.bounds)
+            self.files, key=lambda file: shared_m2(file.extent or read.get(str(file.path)), core.bounds)
         )
 
     def check_read(self, core: Grid) -> None:
         """Raise an error if the layer is missing on the tile itself, or a file that it needs is left out."""
-        left_out = self._left_out_from_main(core) if self.left_out else []
+        main = self.main_file(core) if self.left_out else None
+        left_out = sorted(self.left_out, key=lambda pair: pair[0] != main)
         needed = [error for file, error in left_out if file.may_lie_on(core)]
         if needed and not self.reached(core).all():
             raise TaskError(str(needed[0]), needed[0].file)
@@ -108,19 +108,11 @@ class Mosaic:
                 "lower load.min_valid to keep such tiles"
             )
         else:
-            fault = self._smaller_unit(main, tile) or " has only nodata on this tile; leave the tile out"
+            patch = _window(tile, self.layer, main, tile.grid, tile.grid)
+            declare = ", or declare that unit with gdal_edit.py -units"
+            smaller = smaller_unit_fault(with_unit(patch, self.layer), declare) if patch else None
+            fault = smaller or " has only nodata on this tile; leave the tile out"
         raise TaskError(f"{main.title}{fault}", str(main.path))
-
-    def _left_out_from_main(self, core: Grid) -> list[tuple[SourceFile, Unusable]]:
-        """Return the files left out; the one that covers most of the tile comes first."""
-        main = self.main_file(core)
-        return sorted(self.left_out, key=lambda pair: pair[0] != main)
-
-    def _smaller_unit(self, file: SourceFile, tile: Tile) -> str | None:
-        """Return that the file's heights on the tile may be in a smaller unit than metres, None if not."""
-        patch = _window(tile, self.layer, file, tile.grid, tile.grid)
-        declare = ", or declare that unit with gdal_edit.py -units"
-        return smaller_unit_fault(with_unit(patch, self.layer), declare) if patch else None
 
 
 def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = False) -> Mosaic:
@@ -202,24 +194,13 @@ def _files(tile: Tile, layer: Layer) -> tuple[SourceFile, ...]:
 def _window(tile: Tile, layer: Layer, file: SourceFile, grid: Grid, core: Grid) -> RasterWindow | None:
     """Return the part of a file that covers a grid, None if there is none; see `read_window`."""
     heights = layer.name in HEIGHTS
+    if file.extent and max(map(abs, file.extent)) <= FARTHEST:
+        # Where a file without georeference lies: the same for all tiles.
+        core = Grid.covering(core.crs, file.extent, core.cell)
+    resampling = Resampling.average if heights else Resampling.mode
     return read_window(
-        file.path,
-        file.title,
-        grid,
-        _position(file, core),
-        layer.crs,
-        Resampling.average if heights else Resampling.mode,
-        heights,
-        layer.reproject,
-        tile.missing,
+        file.path, file.title, grid, core, layer.crs, resampling, heights, layer.reproject, tile.missing
     )
-
-
-def _position(file: SourceFile, core: Grid) -> Grid:
-    """Return where a file lies if it has no georeference: at its extent, which is the same for all tiles."""
-    if file.extent is None or max(map(abs, file.extent)) > FARTHEST:
-        return core
-    return Grid.covering(core.crs, file.extent, core.cell)
 
 
 def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow | None) -> None:
@@ -229,7 +210,10 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
     """
     core = tile.grid
     # Files of neighbours only touch the tile.
-    if not (file.extent and _shared_m2(file.extent, core.bounds)) or (patch and _is_on(patch, core)):
+    if not (file.extent and shared_m2(file.extent, core.bounds)):
+        return
+    lattice = patch.lattice if patch else None
+    if lattice and (lattice.reached(core).any() if lattice.crs else shared_m2(lattice.bounds, core.bounds)):
         return
     found = read_raster(file.path, file.title, header, kept_raster, tile.missing)
     if found.lattice is None:
@@ -244,21 +228,6 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
         "elsewhere than the catalog says; build the catalog again",
         str(file.path),
     )
-
-
-def _is_on(patch: RasterWindow, core: Grid) -> bool:
-    """Return whether a part of a file covers a cell of a tile."""
-    lattice = patch.lattice
-    return bool(lattice.reached(core).any()) if lattice.crs else _shared_m2(lattice.bounds, core.bounds) > 0
-
-
-def _shared_m2(extent: Bounds | None, bounds: Bounds) -> float:
-    """Return the area that an extent shares with a tile (m2), 0 if it is None."""
-    if extent is None:
-        return 0.0
-    width = min(extent[2], bounds[2]) - max(extent[0], bounds[0])
-    height = min(extent[3], bounds[3]) - max(extent[1], bounds[1])
-    return max(width, 0.0) * max(height, 0.0)
 
 
 def _notes(layer: Layer, patches: Sequence[RasterWindow], grid: Grid) -> list[str]:

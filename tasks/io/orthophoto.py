@@ -20,11 +20,9 @@ from flexroad.catalog.scan.rasters import quiet
 from flexroad.catalog.scan.valid_cells import color_kinds
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
-from flexroad.tasks.errors import LayerMissing, TaskError, Unusable
-from flexroad.tasks.io.left_out import leave_out
+from flexroad.tasks.errors import LayerMissing, TaskError, Unusable, leave_out
 from flexroad.tasks.io.raster import read_raster
-from flexroad.tasks.io.raster_grid import RasterGrid
-from flexroad.tasks.io.raster_header import place
+from flexroad.tasks.io.raster_grid import RasterGrid, place
 from flexroad.tasks.types import Bools, Orthophoto, Source
 
 BITS = {"uint8": 8, "uint16": 16}
@@ -58,8 +56,12 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None, finest_m:
             if part is None:
                 continue
             piece, lattice = part
-            photo, gsd_m = _under(photo, piece), piece.grid.cell
-            reached = reached | lattice.reached(piece.grid)
+            gsd_m = piece.grid.cell
+            if photo:
+                colour = np.where(photo.known, photo.colour, piece.colour)
+                piece = replace(photo, colour=colour, known=photo.known | piece.known)
+            photo = piece
+            reached = reached | lattice.reached(photo.grid)
             if photo.known.all():
                 break
     # A tile also lists files around it: an unusable file fails only the tiles that need it.
@@ -74,14 +76,6 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None, finest_m:
             source.name,
         )
     return photo
-
-
-def _under(first: Orthophoto | None, second: Orthophoto) -> Orthophoto:
-    """Return the first photo, filled with the second where its pixels are unknown."""
-    if first is None:
-        return second
-    colour = np.where(first.known, first.colour, second.colour)
-    return replace(first, colour=colour, known=first.known | second.known)
 
 
 def _read(

@@ -27,8 +27,7 @@ from flexroad.catalog.scan.valid_cells import transparent
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason
 from flexroad.tasks.errors import TaskError, Unusable
-from flexroad.tasks.io.raster_grid import RasterGrid
-from flexroad.tasks.io.raster_header import file_crs, header, place
+from flexroad.tasks.io.raster_grid import RasterGrid, file_crs, header, place
 from flexroad.tasks.types import Bools, Floats
 
 T = TypeVar("T")
@@ -129,8 +128,8 @@ def read_window(
             return None
         step = lattice.step_for(grid)
         slices = lattice.whole_steps(step, *slices)
-        reader = readable_cells if damaged else all_cells
-        values, unreadable = reader(src, lattice, step, slices, resampling)
+        cells = src, lattice, step, slices, resampling
+        values, unreadable = readable_cells(*cells) if damaged else (_cells(*cells), None)
         shown, unit = lattice.cut(*slices).coarser(step), src.units[0] or ""
         return RasterWindow(
             name,
@@ -171,26 +170,20 @@ def read_raster(
     - `read`: takes the open raster.
     - `missing`: full names of the files that are known to be missing; None if that is not known.
     """
+
+    def attempt() -> T:
+        src = None
+        try:
+            with by(path) as src:
+                return read(src)
+        except ERRORS as error:
+            raise _fault(path, name, error, missing, src is not None) from error
+
     try:
-        return _attempt(path, name, read, by, missing)
+        return attempt()
     except Unreadable:
         # The system may have failed in between, and a damaged file fails again.
-        return _attempt(path, name, read, by, missing)
-
-
-def _attempt(
-    path: Location,
-    name: str,
-    read: Callable[[Any], T],
-    by: Callable[[Location], AbstractContextManager[Any]],
-    missing: frozenset[str] | None,
-) -> T:
-    src = None
-    try:
-        with by(path) as src:
-            return read(src)
-    except ERRORS as error:
-        raise _fault(path, name, error, missing, src is not None) from error
+        return attempt()
 
 
 def _fault(
@@ -397,17 +390,10 @@ def _share(lattice: RasterGrid, step: int) -> Floats | None:
     return np.outer(rows, cols)
 
 
-def all_cells(
-    src: Any, lattice: RasterGrid, step: int, slices: Slices, resampling: Resampling
-) -> tuple[Floats, None]:
-    """Return the cells of a window, ``step`` x ``step`` of them as one, rows from the north; and None."""
-    return _cells(src, lattice, step, slices, resampling), None
-
-
 def readable_cells(
     src: Any, lattice: RasterGrid, step: int, slices: Slices, resampling: Resampling
 ) -> tuple[Floats, Bools]:
-    """Return the cells as `all_cells` does, NaN where they cannot be read, and which these are.
+    """Return the cells as `_cells` does, NaN where they cannot be read, and which these are.
 
     GDAL reads blocks. A window with a damaged block is halved along borders of blocks, until each part is
     read, or is one block.

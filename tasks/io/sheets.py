@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
 from flexroad.catalog.crs import transformer
-from flexroad.catalog.grid import Grid
+from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.io.raster import EXACT, RasterWindow, fill_from, joined, resample_to, same_lattice
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.types import Bools, Floats
@@ -36,10 +36,7 @@ class Coverage:
         if patch.lattice.crs:
             return False
         grid = self._grid
-        west, south, east, north = patch.lattice.bounds
-        width = min(east, grid.bounds[2]) - max(west, grid.bounds[0])
-        height = min(north, grid.bounds[3]) - max(south, grid.bounds[1])
-        self._most_cells += max(width, 0.0) * max(height, 0.0) / grid.cell**2
+        self._most_cells += shared_m2(patch.lattice.bounds, grid.bounds) / grid.cell**2
         self._unchecked.append(patch)
         # Cells are compared only if the areas of the files suffice.
         if self._most_cells < 0.999 * self._missing.size:
@@ -47,6 +44,15 @@ class Coverage:
         while self._unchecked:
             self._missing &= ~_covered(self._unchecked.pop(), grid)
         return not self._missing.any()
+
+
+def shared_m2(extent: Bounds | None, bounds: Bounds) -> float:
+    """Return the area that an extent shares with a tile (m2), 0 if it is None."""
+    if extent is None:
+        return 0.0
+    width = min(extent[2], bounds[2]) - max(extent[0], bounds[0])
+    height = min(extent[3], bounds[3]) - max(extent[1], bounds[1])
+    return max(width, 0.0) * max(height, 0.0)
 
 
 def reach_m(patches: Sequence[RasterWindow], grid: Grid) -> float:
@@ -107,9 +113,20 @@ def _filled(parts: Sequence[RasterWindow], grid: Grid, resampling: Resampling) -
 
 def _resampled_together(groups: Sequence[Sequence[RasterWindow]], grid: Grid) -> list[Floats]:
     """Return each group of files of one lattice on a grid's cells, interpolated with the other groups."""
-    sheets = [_on_grid(group, grid) if group[0].lattice.fits(grid) else joined(group)[0] for group in groups]
+    own = RasterGrid(grid.west, grid.north, grid.cell, grid.cell, grid.width, grid.height)
+    sheets = [
+        replace(group[0], values=_filled(group, grid, Resampling.bilinear), lattice=own)
+        if group[0].lattice.fits(grid)
+        else joined(group)[0]
+        for group in groups
+    ]
     # The mean of a step with fewer cells is off its centre: heights of other files go before.
-    known = [_complete_steps(sheet) for sheet in sheets]
+    known = [
+        replace(sheet, values=np.where(sheet.share < 1 - EXACT, np.nan, sheet.values))
+        if sheet.share is not None
+        else sheet
+        for sheet in sheets
+    ]
     # The coarsest first: its cells beyond its border are farthest from the borders of the others, and these
     # then interpolate up to their own borders.
     for number in sorted(range(len(sheets)), key=lambda number: -_cell_m2(sheets[number].lattice, grid)):
@@ -119,20 +136,6 @@ def _resampled_together(groups: Sequence[Sequence[RasterWindow]], grid: Grid) ->
         resample_to(sheet if sheet.lattice.fits(grid) else wide, grid, Resampling.bilinear)
         for sheet, wide in zip(sheets, known, strict=True)
     ]
-
-
-def _on_grid(group: Sequence[RasterWindow], grid: Grid) -> RasterWindow:
-    """Return the files whose cells coincide with a grid's as one window of it."""
-    values = _filled(group, grid, Resampling.bilinear)
-    lattice = RasterGrid(grid.west, grid.north, grid.cell, grid.cell, grid.width, grid.height)
-    return replace(group[0], values=values, lattice=lattice)
-
-
-def _complete_steps(patch: RasterWindow) -> RasterWindow:
-    """Return a window of which the cells read together from fewer cells of the file have no value."""
-    if patch.share is None:
-        return patch
-    return replace(patch, values=np.where(patch.share < 1 - EXACT, np.nan, patch.values))
 
 
 def _cell_m2(lattice: RasterGrid, grid: Grid) -> float:

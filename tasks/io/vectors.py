@@ -325,12 +325,12 @@ def _unpacked(table: Any, columns: tuple[str, ...]) -> Any:
     if OTHER_TAGS not in table:
         return table
     packed = [dict(TAG.findall(text)) if isinstance(text, str) else {} for text in table[OTHER_TAGS]]
-    tags = {name: [_unescaped(tags.get(name)) for tags in packed] for name in columns if name not in table}
+    tags = {
+        name: [re.sub(r"\\(.)", r"\1", tags[name]) if name in tags else None for tags in packed]
+        for name in columns
+        if name not in table
+    }
     return table.drop(columns=OTHER_TAGS).assign(**tags)
-
-
-def _unescaped(value: str | None) -> str | None:
-    return value and re.sub(r"\\(.)", r"\1", value)
 
 
 @contextlib.contextmanager

@@ -1,5 +1,7 @@
 """Where the roads of other levels begin: the abutments of decks and tunnels, and their approaches.
 
+Roads of one level that cross in plan are noted, as a level has one height at each place.
+
 Everything is decided from the vectors and from cells near each abutment alone, so that a tile, its neighbour
 and their edge find the same levels.
 """
@@ -18,7 +20,6 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.text import count
 from flexroad.tasks.io.vectors import has_place
-from flexroad.tasks.levels.overlaps import crossing_notes, place
 from flexroad.tasks.meshing.road_outline import polygons_of
 from flexroad.tasks.roads.flat_patches import flat_patches
 from flexroad.tasks.roads.rasterise import cells
@@ -56,6 +57,12 @@ APART_M = 0.02
 """Roads of level 0 are kept apart by this from decks (m)."""
 TUNNEL_M = 50.0
 """Longest tunnel (m): heights of a longer one would be guessed."""
+SAME_M = 0.01
+"""Vertices within this distance are the same (m)."""
+PART_M2 = 1.0
+"""Smaller parts of a road beside another one are slivers (m2)."""
+MOST_SHARED = 0.5
+"""A road with more than this share of its area in common with another one lies on it: it is on its deck."""
 
 Lines = NDArray[np.object_]
 
@@ -86,7 +93,14 @@ def levels_of(
         if not shapely.intersects(shapely.union(level.areas, level.approach), near):
             continue
         if number > 0:
-            notes += _without_abutment(level, data)
+            parts = shapely.get_parts(level.areas)
+            alone = parts[lack_abutment(parts, level.abutments, data.grid, data.core)]
+            if len(alone):
+                notes.append(
+                    f"segment: {count(len(alone), 'deck')} of level {number} without an abutment at a road "
+                    f"of level 0, such as at {place(alone[0])}; check the level of the roads at its ends, "
+                    f"and gaps above {GAP_M:g} m"
+                )
         cut = _polygons(shapely.intersection(level.areas, window))
         levels.append(replace(level, areas=cut))
     return tuple(levels), tuple(notes)
@@ -105,7 +119,11 @@ def _grown(grid: Grid, distance_m: float) -> shapely.Polygon:
 def _level(number: int, areas: shapely.MultiPolygon, streets: Lines, data: TileData) -> Level:
     """Return a level with all its areas."""
     near = streets[shapely.dwithin(streets, areas, APPROACH_M + GAP_M)]
-    passes = _passes(near, areas)
+    # Streets with a part well within an outline pass below the deck, or above the tunnel.
+    parts = shapely.get_parts(areas)
+    width = 2 * shapely.area(parts) / shapely.length(parts)
+    inner = shapely.union_all(shapely.buffer(parts, -np.minimum(BELOW_M, INNER * width)))
+    passes = shapely.area(shapely.intersection(near, inner)) >= PASSES_M2
     touching = near[~passes & shapely.dwithin(near, areas, GAP_M)]
     lines = list(_ends(areas, touching))
     if number > 0:
@@ -124,14 +142,6 @@ def _level(number: int, areas: shapely.MultiPolygon, streets: Lines, data: TileD
     approach = _polygons(shapely.union(road, gaps))
     beside = shapely.intersection(shapely.union_all(near[passes]), shapely.buffer(abutments, REACH_M))
     return Level(number, areas, abutments, approach, _polygons(shapely.difference(beside, approach)))
-
-
-def _passes(streets: Lines, areas: shapely.MultiPolygon) -> Bools:
-    """Return which streets pass below a deck, or above a tunnel: they have a part well within its outline."""
-    parts = shapely.get_parts(areas)
-    width = 2 * shapely.area(parts) / shapely.length(parts)
-    inner = shapely.union_all(shapely.buffer(parts, -np.minimum(BELOW_M, INNER * width)))
-    return np.asarray(shapely.area(shapely.intersection(streets, inner)) >= PASSES_M2)
 
 
 def _ends(areas: shapely.MultiPolygon, streets: Lines) -> Iterator[shapely.LineString]:
@@ -242,14 +252,49 @@ def lack_abutment(parts: Lines, abutments: shapely.MultiLineString, grid: Grid, 
     return np.asarray(known & ~shapely.dwithin(parts, abutments, APART_M))
 
 
-def _without_abutment(level: Level, data: TileData) -> list[str]:
-    """Return a note about the decks on a tile at which no road of level 0 begins."""
-    parts = shapely.get_parts(level.areas)
-    alone = parts[lack_abutment(parts, level.abutments, data.grid, data.core)]
-    if not len(alone):
-        return []
-    return [
-        f"segment: {count(len(alone), 'deck')} of level {level.number} without an abutment at a road of "
-        f"level 0, such as at {place(alone[0])}; check the level of the roads at its ends, and gaps above "
-        f"{GAP_M:g} m"
-    ]
+def crossing_notes(areas: Lines, shapes: Lines, numbers: NDArray[np.int64], core: Grid) -> tuple[str, ...]:
+    """Return a note for each level but 0 on the pairs of its roads that cross on the core by mistake.
+
+    Two roads that cross have a common vertex, as a junction on a deck has. Without one, one of them lies on
+    another level in truth, and the surface of both is a compromise.
+
+    - `areas`, `shapes`, `numbers` ``(n,)``: valid polygons of roads, the polygons or lines that they were
+      made of, and their levels. Areas that only close wedges between roads have the shape None.
+    """
+    on_core, notes = shapely.box(*core.bounds), list[str]()
+    for number in np.unique(numbers[numbers != 0]).tolist():
+        own = np.flatnonzero((numbers == number) & ~shapely.is_missing(shapes))
+        pairs = shapely.STRtree(areas[own]).query(areas[own], predicate="overlaps").T
+        found = []
+        for pair in own[pairs[pairs[:, 0] < pairs[:, 1]]]:
+            common = shapely.intersection(*areas[pair])
+            if shapely.intersects(common, on_core) and _cross(areas[pair], shapes[pair], common):
+                found.append((*areas[pair], common))
+        if found:
+            first = " and ".join(map(place, found[0][:2]))
+            which, beyond = ("upper", number + 1) if number > 0 else ("lower", number - 1)
+            notes.append(
+                f"segment: {count(len(found), 'pair')} of roads of level {number} cross without a common "
+                f"vertex, such as those around {first}, at {place(found[0][2])}; give the {which} one "
+                f"level {beyond}, or both a vertex there if it is a junction"
+            )
+    return tuple(notes)
+
+
+def _cross(pair: Lines, shapes: Lines, common: shapely.Geometry) -> bool:
+    """Return whether two roads have parts on both sides of each other, and no junction."""
+    if common.area > MOST_SHARED * shapely.area(pair).min():
+        return False
+    for road in pair:
+        parts = shapely.get_parts(shapely.difference(road, common))
+        if np.count_nonzero(shapely.area(parts) >= PART_M2) < 2:
+            return False
+    one, other = (shapely.MultiPoint(shapely.get_coordinates(shape)) for shape in shapes)
+    shared = shapely.intersection(one, shapely.buffer(other, SAME_M))
+    return not shapely.dwithin(shared, common, SAME_M)
+
+
+def place(area: shapely.Geometry) -> str:
+    """Return the centre of an area for a message."""
+    x, y = shapely.get_coordinates(shapely.centroid(area))[0]
+    return f"E {x:.0f} N {y:.0f}"

@@ -57,7 +57,7 @@ def with_levels(meshes: Mapping[int, Mesh]) -> Mesh:
 def highest_first(mesh: Mesh) -> NDArray[np.int32]:
     """Return the faces of a mesh, ``(F, 3)``, those of the highest level first.
 
-    Where several faces are above a place, `tasks.metrics.vertical_distance` takes the height of the first.
+    Where several faces are above a place, `tasks.metrics.mesh_distance` takes the height of the first.
     """
     return mesh.faces if mesh.level is None else mesh.faces[np.argsort(-mesh.level, kind="stable")]
 

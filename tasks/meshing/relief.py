@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
-from flexroad.tasks.metrics.vertical_distance import at_nodes
+from flexroad.tasks.metrics.mesh_distance import at_nodes
 from flexroad.tasks.types import Bools, Floats
 
 Faces = NDArray[np.int32]

@@ -3,23 +3,34 @@
 The lines run half-way between the centres of cells with data and of cells beyond the survey ("marching
 squares"), and are simplified by less than the distance to any centre. So every centre with data stays inside,
 every other one outside, and the lines follow the limit to within a cell.
+
+The edges of kerbs and walls are found alike. Each is two lines side by side, one on each height.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import shapely
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.lazy import lazy
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Bools, Floats
 
 rasterio = lazy("rasterio")
 
 TOLERANCE = 0.3
 """Largest distance by which the lines are simplified (cells): centres are at least 0.35 cells away."""
+LEAST_M = 0.08
+"""Smaller steps have no line (m): they are within the noise of a surface model."""
+CELLS = 10
+"""Connected steps of fewer cells have no line: they are noise, or single objects."""
+APART = 0.2
+"""Distance of the two lines of an edge (cells)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,3 +117,38 @@ def _covered(lines: shapely.MultiLineString, area: shapely.Polygon, outside: Boo
     cells = np.bincount(number.ravel(), minlength=len(parts) + 1)
     beyond = np.bincount(number.ravel(), outside.ravel(), len(parts) + 1)
     return shapely.MultiPolygon(list(parts[(2 * beyond < cells)[1:]]))
+
+
+def breaklines(
+    surface: SteppedSurface, local: Bounds
+) -> tuple[shapely.MultiLineString, Callable[[Floats], Floats]]:
+    """Return the edges of the steps of a surface, and a function of points, ``(n, 2)``.
+
+    It returns their heights (m) by the side of the lines on which they lie.
+
+    - `local`: west, south, east and north of the tile, from the origin of its cells (m).
+    """
+    cells = surface.cells
+    # The median leaves straight edges where they are. Noise of single cells would break lines into pieces.
+    large = np.abs(scipy.ndimage.median_filter(surface.steps, 3)) >= LEAST_M
+    # Lines end before the border of the tile: those of the neighbour need not meet them there.
+    large[[0, -1]], large[:, [0, -1]] = False, False
+    parts, _ = scipy.ndimage.label(large)
+    size = np.bincount(parts.ravel())
+    high = large & (size[parts] >= CELLS)
+    corner = cells.west - cells.origin[0], cells.north - cells.origin[1]
+    level = survey_limit(high, corner, cells.cell, local)
+    edges = shapely.get_parts(level.lines)
+    sides = [shapely.offset_curve(edges, side * APART / 2 * cells.cell) for side in (-1, 1)]
+    lines = shapely.get_parts(np.concatenate(sides)) if len(edges) else edges
+    nearest = surface.steps
+    if high.any():
+        at = scipy.ndimage.distance_transform_edt(~high, return_distances=False, return_indices=True)
+        nearest = surface.steps[tuple(at)]
+
+    def height(points: Floats) -> Floats:
+        place = (points + cells.origin).T
+        step = nearest[cells.cells(*place)]
+        return np.asarray(surface.smooth(*place) + np.where(level.covers(points), 0.0, step))
+
+    return shapely.multilinestrings(lines), height

@@ -12,6 +12,7 @@ has their height.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -20,14 +21,20 @@ from pydantic import Field
 from flexroad.tasks import options as base
 from flexroad.tasks.metrics import mesh_check
 from flexroad.tasks.metrics.dihedral import mean_angles
-from flexroad.tasks.metrics.mesh_distance import mesh_distances
-from flexroad.tasks.metrics.point_to_mesh import nearest
-from flexroad.tasks.metrics.statistics import mean, nmad
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape, nearest
 from flexroad.tasks.roads.rasterise import cells
+from flexroad.tasks.spline.moving import MovingNurbs
 from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadMask, Surface, TileData
 
 VERSION = 3
+
+GAUSSIAN = 1.4826
+"""Standard deviation of a Gaussian divided by its median absolute deviation."""
+OFF_CENTRE = 0.25
+"""Distance of the places from the centre of their cell, to the east and to the north (cells). Meshes have
+vertices at centres and corners of cells and half-way between, where they meet the surface by construction."""
+FIGURES = ("mesh_p95_road_m", "mesh_max_road_m", "mesh_p95_terrain_m", "mesh_max_terrain_m")
+"""Names of the distances in `Metrics`."""
 
 
 class Options(base.Options):
@@ -75,13 +82,16 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
     for number in mesh.numbers:
         mesh_check.check(mesh.at(number))
     triangles, mesh = len(mesh.faces), mesh.at(0)
-    truth = _truth(data, options)
+    truth = data.dtm if data.reference is None else data.reference
+    if options.truth == "dsm":
+        truth = data.dsm
     reference_road = data.reference_road if options.classes == "reference" else None
     is_road = road.mask if reference_road is None else reference_road
     window = data.grid.window(data.core)
     heights = np.ascontiguousarray(truth[window]) - mesh.origin[2]
     if road.levels:
-        heights[_below_decks(road)] = np.nan
+        decks = [level.areas for level in road.levels if level.number > 0]
+        heights[cells(np.array(decks, object), road.core)] = np.nan
     difference = drape(mesh, data.core) - heights
     has_truth, has_both = np.isfinite(heights), np.isfinite(difference)
     classes = is_road[window], ~is_road[window]
@@ -98,7 +108,7 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
         rmse_road_m=float(np.sqrt(mean(on_road**2))),
         rmse_terrain_m=float(np.sqrt(mean(on_terrain**2))),
         nmad_road_m=nmad(on_road),
-        p95_road_m=float(np.percentile(np.abs(on_road), 95)) if on_road.size else float("nan"),
+        p95_road_m=percentile(np.abs(on_road), 95),
         nearest_road_m=mean(distances_3d[has_both & classes[0]]),
         nearest_terrain_m=mean(distances_3d[has_both & classes[1]]),
         mad_road_deg=angles[0],
@@ -108,18 +118,6 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
         completeness=mean(has_both[has_truth]),
         **mesh_distances(mesh, surface, road),
     )
-
-
-def _truth(data: TileData, options: Options) -> Floats:
-    if options.truth == "dsm":
-        return data.dsm
-    return data.dtm if data.reference is None else data.reference
-
-
-def _below_decks(road: RoadMask) -> Bools:
-    """Return the core's cells below decks, ``(H, W)``."""
-    decks = [level.areas for level in road.levels if level.number > 0]
-    return cells(np.array(decks, object), road.core)
 
 
 def _distances_3d(mesh: Mesh, data: TileData, heights: Floats, difference: Floats) -> Floats:
@@ -147,3 +145,38 @@ def _angles(mesh: Mesh, data: TileData, is_road: Bools) -> tuple[float, float]:
         chosen = chosen[np.isfinite(chosen)]
         means.append(mean(chosen) if of_class.any() else float("nan"))
     return means[0], means[1]
+
+
+def mesh_distances(mesh: Mesh, surface: Surface, road: RoadMask) -> dict[str, float]:
+    """Return the vertical distances of a mesh from its surface, steps included, by the names `FIGURES` (m).
+
+    - `road`: its raw mask classes the places, one in each cell of the core.
+    - result: 95th percentile and largest distance per class; NaN for a class without a place on the mesh, and
+      for a surface whose heights are not above their places (`MovingNurbs`).
+    """
+    if isinstance(surface, MovingNurbs):
+        return dict.fromkeys(FIGURES, float("nan"))
+    core = road.core
+    shift = OFF_CENTRE * core.cell
+    places = replace(core, west=core.west + shift, north=core.north + shift)
+    heights = surface.lattice(places.eastings, places.northings) - mesh.origin[2]
+    distances = np.abs(drape(mesh, places) - heights)
+    is_road, known = road.mask[road.grid.window(core)], np.isfinite(distances)
+    parts = [distances[known & cells] for cells in (is_road, ~is_road)]
+    figures = (percentile(part, percent) for part in parts for percent in (95, 100))
+    return dict(zip(FIGURES, figures, strict=True))
+
+
+def mean(values: Floats | Bools) -> float:
+    """Return the mean; NaN if there are no values."""
+    return float(values.mean()) if values.size else float("nan")
+
+
+def nmad(values: Floats) -> float:
+    """Return the normalised median absolute deviation from the median; NaN if there are no values."""
+    return float(GAUSSIAN * np.median(np.abs(values - np.median(values)))) if values.size else float("nan")
+
+
+def percentile(values: Floats, percent: float) -> float:
+    """Return a percentile; NaN if there are no values."""
+    return float(np.percentile(values, percent)) if values.size else float("nan")

@@ -152,6 +152,8 @@ def encode_style(band: Band) -> bytes:
 def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: Any) -> bytes:
     if values.shape != grid.shape:
         raise TaskError(f"{band.name} of {values.shape} cells does not fit a grid of {grid.shape}")
+    # A raster of one block is not filled up to a larger one.
+    longest = max(grid.shape)
     profile = {
         "driver": "COG",
         "dtype": band.dtype,
@@ -163,7 +165,7 @@ def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: A
         "compress": "deflate",
         "level": LEVEL,
         "nodata": band.nodata,
-        "blocksize": _block(grid),
+        "blocksize": min(BLOCK, longest + -longest % BLOCK_MULTIPLE),
     }
     with rasterio.io.MemoryFile() as file:
         with file.open(**profile, **options) as raster:
@@ -171,12 +173,6 @@ def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: A
             describe(raster, 1, band)
         encoded: bytes = file.read()
     return encoded
-
-
-def _block(grid: Grid) -> int:
-    """Return the size of the blocks: a raster of one block is not filled up to a larger one."""
-    longest = max(grid.shape)
-    return min(BLOCK, longest + -longest % BLOCK_MULTIPLE)
 
 
 def describe(raster: Any, number: int, band: Band) -> None:

@@ -7,26 +7,24 @@ one should be checked first. A local fault appears as a patch of road that is fa
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flexroad.catalog.grid import Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.levels.seen import level_data, level_road
-from flexroad.tasks.metrics.statistics import mean, nmad
-from flexroad.tasks.quality.estimate import Compared, compare
-from flexroad.tasks.quality.flagged import flagged_cells
+from flexroad.tasks.metrics.evaluate import mean, nmad, percentile
+from flexroad.tasks.quality.estimate import compare
+from flexroad.tasks.quality.flagged import bends, edge_steps, flagged_cells, largest_patch, worst_piece
 from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.quality.holdout import Refit, holdout
 from flexroad.tasks.quality.structures import STRUCTURE_FLAGS, structures
-from flexroad.tasks.quality.worst import worst_piece
 from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
-from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
+from flexroad.tasks.types import Floats, Quality, RoadClusters, RoadMask, Surface, TileData
 
 VERSION = 6
 
@@ -136,28 +134,32 @@ def _assess(
 ) -> Quality:
     """Return the figures of one level."""
     cells = compare(data, road, clusters, surface, options.dsm_dtm_tolerance_m, only_road=True)
-    on_road, kept, classes, height = cells.on_road, cells.kept, cells.classes, cells.height
-    estimate, cell = cells.estimate, data.core.cell
+    on_road, kept, classes, cell = cells.on_road, cells.kept, cells.classes, data.core.cell
+    worst_m, worst = worst_piece(cells.estimate, on_road, data.core)
+    unexplained = largest_patch(on_road & (cells.deviation > options.dsm_dtm_tolerance_m))
     residuals, to_dtm = _finite(cells.off_dsm[kept]), _finite(cells.off_dtm[on_road])
-    figures = {
-        "residual_median_m": _quantile(residuals, 50),
+    figures: dict[str, Any] = {
+        "residual_median_m": percentile(residuals, 50),
         "residual_nmad_m": nmad(residuals),
-        "residual_p95_m": _quantile(np.abs(residuals), 95),
-        "curvature_per_m": _largest(_second_differences(height, on_road) / cell**2),
-        "edge_step_m": _quantile(_edge_steps(cells.smooth, on_road, cells.goes_on), 95),
+        "residual_p95_m": percentile(np.abs(residuals), 95),
+        "curvature_per_m": percentile(_finite(bends(cells.height, on_road)) / cell**2, 100),
+        "edge_step_m": percentile(_finite(edge_steps(cells)), 95),
         "measured_road": mean(classes[on_road] == HeightSource.MEASURED),
         "dtm_road": mean(classes[on_road] == HeightSource.DTM),
         "inferred_road": mean(classes[on_road] == HeightSource.INFERRED),
         "dropped_road": mean(~kept[on_road]),
-        "dsm_excess_m": _quantile(_finite(cells.excess[kept]), 50),
-        "off_dtm_m": _quantile(to_dtm, 50),
+        "dsm_excess_m": percentile(_finite(cells.excess[kept]), 50),
+        "off_dtm_m": percentile(to_dtm, 50),
         "off_dtm_road": mean(np.abs(to_dtm) > options.dsm_dtm_tolerance_m),
-        "bounded_weights": _share_at_bound(surface),
-        "error_estimate_m": mean(_finite(estimate[on_road])),
-        **_worst(cells, data.core),
-        **asdict(holdout(data, road, clusters, refit, options.dsm_dtm_tolerance_m, options.holdout)),
-        "max_unexplained_area_m2": _largest_patch(on_road & (cells.deviation > options.dsm_dtm_tolerance_m))
-        * cell**2,
+        "bounded_weights": mean(np.abs(np.log(surface.W)) > MAX_LOG_WEIGHT * (1 - 1e-9))
+        if isinstance(surface, NurbsSurface)
+        else np.nan,
+        "error_estimate_m": mean(_finite(cells.estimate[on_road])),
+        "worst_error_estimate_m": worst_m,
+        "worst_easting": worst[0],
+        "worst_northing": worst[1],
+        **holdout(data, road, clusters, refit, options.dsm_dtm_tolerance_m, options.holdout),
+        "max_unexplained_area_m2": np.count_nonzero(unexplained) * cell**2,
     }
     judged = figures | {"inferred_road": mean(cells.lacking[on_road])}
     flags = [flag for flag, name in FLAGS.items() if judged[name] > LIMITS[flag]]
@@ -168,13 +170,6 @@ def _assess(
         flags = [NO_ROAD, *flags]
     flagged = flagged_cells(cells, cell, LIMITS, options.dsm_dtm_tolerance_m, flags)
     return Quality(**figures, flags=tuple(flags), height_source=classes, flagged=flagged)
-
-
-def _worst(cells: Compared, core: Grid) -> dict[str, float]:
-    """Return the largest estimate of a piece of road (m), and where; NaN without road."""
-    worst = worst_piece(cells.estimate, cells.on_road, core)
-    found = (worst.estimate_m, worst.easting, worst.northing) if worst else (float("nan"),) * 3
-    return dict(zip(("worst_error_estimate_m", "worst_easting", "worst_northing"), found, strict=True))
 
 
 def cell_errors(
@@ -218,47 +213,5 @@ def top_errors(
     return estimate, classes
 
 
-def _second_differences(height: Floats, on_road: Bools) -> Floats:
-    """Return absolute second differences along rows and columns of three road cells each, ``(n,)``, m."""
-    parts = []
-    for z, road in ((height, on_road), (height.T, on_road.T)):
-        second_difference = z[2:] - 2 * z[1:-1] + z[:-2]
-        parts.append(np.abs(second_difference[road[2:] & road[1:-1] & road[:-2]]))
-    return _finite(np.concatenate(parts))
-
-
-def _edge_steps(height: Floats, on_road: Bools, goes_on: Bools) -> Floats:
-    """Return the distance of each first cell beside the road to the line of the last two on it, ``(n,)``.
-
-    At an abutment there is none: the road goes on as a deck or in a tunnel.
-    """
-    parts, beside = [], ~(on_road | goes_on)
-    for z, road, edge in ((height, on_road, beside), (height.T, on_road.T, beside.T)):
-        for profile, on, out in ((z, road, edge), (z[::-1], road[::-1], edge[::-1])):
-            step = profile[2:] - 2 * profile[1:-1] + profile[:-2]
-            parts.append(np.abs(step[out[2:] & on[1:-1] & on[:-2]]))
-    return _finite(np.concatenate(parts))
-
-
-def _largest_patch(cells: Bools) -> int:
-    """Return the number of cells in the largest connected patch."""
-    patches, _ = scipy.ndimage.label(cells)
-    return int(np.bincount(patches[cells], minlength=1).max())
-
-
-def _share_at_bound(surface: Surface) -> float:
-    if not isinstance(surface, NurbsSurface):
-        return float("nan")
-    return mean(np.abs(np.log(surface.W)) > MAX_LOG_WEIGHT * (1 - 1e-9))
-
-
 def _finite(values: Floats) -> Floats:
     return values[np.isfinite(values)]
-
-
-def _largest(values: Floats) -> float:
-    return float(values.max()) if values.size else float("nan")
-
-
-def _quantile(values: Floats, percent: float) -> float:
-    return float(np.percentile(values, percent)) if values.size else float("nan")

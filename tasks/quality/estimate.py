@@ -89,13 +89,11 @@ def scatter(dsm: Floats, dtm: Floats, kept: Bools, cell: float) -> Floats:
     share = _share_around(valid, size)
     # From a height near by: squares of heights above the sea lose digits.
     level = float(np.mean(dsm[valid])) if valid.any() else 0.0
-    return np.fmin(*(_deviation_around(heights, valid, share, size) for heights in (dsm - dtm, dsm - level)))
-
-
-def _deviation_around(values: Floats, valid: Bools, share: Floats, size: int) -> Floats:
-    """Return the standard deviation of the valid values in a square around each cell, ``(H, W)``."""
-    mean, square = (_mean_around(own, valid, share, size) for own in (values, values**2))
-    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)))
+    deviations = []
+    for heights in (dsm - dtm, dsm - level):
+        mean, square = (_mean_around(own, valid, share, size) for own in (heights, heights**2))
+        deviations.append(np.sqrt(np.maximum(square - mean**2, 0.0)))
+    return np.fmin(*deviations)
 
 
 def climbed(smooth: Floats, dtm: Floats, kept: Bools, cell: float, dsm_dtm_tolerance_m: float) -> Bools:
@@ -206,7 +204,13 @@ def compare(
     data, clusters = level_data(data, clusters), with_approaches(clusters)
     window = data.grid.window(data.core)
     fitted = with_road_heights(data, clusters)
-    every = height_source(data, road, _with_ground(clusters, surface, data), dsm_dtm_tolerance_m)
+    own = clusters
+    if isinstance(surface, SteppedSurface) and own.beside is not None and own.dtm_invalid is not None:
+        # The DTM is valid where the surface has a step up to it.
+        invalid = own.dtm_invalid.copy()
+        invalid[window] &= ~own.beside[window]
+        own = replace(own, dtm_invalid=invalid)
+    every = height_source(data, road, own, dsm_dtm_tolerance_m)
     classes, below = every[window], hidden(road.levels, clusters.number, data.grid)
     on_road = road.mask[window] & (classes != HeightSource.NONE)
     kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
@@ -242,15 +246,6 @@ def _lacking(road: Bools, classes: NDArray[np.uint8], below: Bools, cell: float)
         known = road & ((classes == HeightSource.MEASURED) | (classes == HeightSource.DTM))
         lacking[by_deck] = distances(by_deck, known) * cell > TUNNEL_M / 2
     return np.asarray(lacking)
-
-
-def _with_ground(clusters: RoadClusters, surface: Surface, data: TileData) -> RoadClusters:
-    """Return the clusters with the DTM valid where the surface has a step up to it."""
-    if not isinstance(surface, SteppedSurface) or clusters.beside is None or clusters.dtm_invalid is None:
-        return clusters
-    stepped = np.zeros(data.grid.shape, np.bool_)
-    stepped[data.grid.window(data.core)] = clusters.beside[data.grid.window(data.core)]
-    return replace(clusters, dtm_invalid=clusters.dtm_invalid & ~stepped)
 
 
 def heights_fitted(data: TileData, clusters: RoadClusters) -> Floats:

@@ -1,16 +1,21 @@
-"""The cells of a tile that raise its flags: what a point or a road passes there."""
+"""The cells of a tile that raise its flags, and the places to look at first.
+
+The worst error is that of a connected piece of road, not of a single cell.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.quality.estimate import Compared
-from flexroad.tasks.quality.worst import EVERY_WAY, PIECE_M2
-from flexroad.tasks.roads.union_find import least_cells
+from flexroad.tasks.roads.union_find import Roots, find, least_cells, unite
 from flexroad.tasks.types import Bools, Floats
 
 Bits = NDArray[np.uint16]
@@ -21,6 +26,14 @@ LOCAL_FLAGS = (
 """Flags of `tasks.quality.assess` that have places; the others concern the complete tile."""
 UNKNOWN = np.uint16(1 << 15)
 """Of a tile whose flags are not known: its result is of an earlier version."""
+PIECE_M2 = 25.0
+"""Area of road that a mean over the tile hides, and that a car or a survey notices (m2)."""
+EVERY_WAY = np.ones((3, 3), bool)
+"""Neighbours of a cell: those at its corners, too."""
+AROUND_M = 10.0
+"""Side of the square over which errors are added up to find where most of them lie (m)."""
+Place = tuple[float, float]
+"""Easting and northing of the centre of a cell (m)."""
 
 
 def flagged_cells(
@@ -46,8 +59,8 @@ def flagged_cells(
         "error-estimate": road & (cells.estimate > limits["error-estimate"]),
         "worst-error": _pieces(road & (cells.estimate > limits["worst-error"]), PIECE_M2, cell),
         "patch": _pieces(road & (cells.deviation > dsm_dtm_tolerance_m), limits["patch"], cell),
-        "spike": bend(cells.height, road) > limits["spike"] * cell**2,
-        "edge-step": edge_step(cells.smooth, road, cells.goes_on) > limits["edge-step"],
+        "spike": (bends(cells.height, road) > limits["spike"] * cell**2).any(axis=0),
+        "edge-step": (edge_steps(cells) > limits["edge-step"]).any(axis=0),
         "loose": cells.kept & (np.abs(cells.off_dsm) > limits["loose"]),
         "off-dtm": road & (np.abs(cells.off_dtm) > dsm_dtm_tolerance_m),
         "inferred": cells.lacking,
@@ -70,24 +83,28 @@ def passed(bits: Bits) -> int:
     return int(np.bitwise_or.reduce(bits, axis=None, initial=0))
 
 
-def bend(height: Floats, road: Bools) -> Floats:
-    """Return the larger second difference of each cell, along its row or column, if all three are road."""
-    largest = np.zeros(height.shape)
-    for z, on, out in ((height, road, largest), (height.T, road.T, largest.T)):
-        middle = np.abs(z[2:] - 2 * z[1:-1] + z[:-2])
-        out[1:-1] = np.fmax(out[1:-1], np.where(on[2:] & on[1:-1] & on[:-2], middle, 0.0))
-    return largest
+def bends(height: Floats, road: Bools, last: Bools | None = None) -> Floats:
+    """Return absolute second differences (m) at the middle of three cells, ``(k, H, W)``; NaN elsewhere.
+
+    They run along rows and along columns over three cells of the road. With ``last`` only two of them are
+    road, the third one is of those cells, and they run in all four directions.
+    """
+    found = np.full((2 if last is None else 4, *height.shape), np.nan)
+    end = road if last is None else last
+    ways: list[Callable[[Any], Any]] = [np.asarray, np.transpose, np.flipud, lambda z: z.T[::-1]]
+    for out, way in zip(found, ways, strict=False):
+        z, on, beyond = way(height), way(road), way(end)
+        bend = np.abs(z[2:] - 2 * z[1:-1] + z[:-2])
+        way(out)[1:-1] = np.where(beyond[2:] & on[1:-1] & on[:-2], bend, np.nan)
+    return found
 
 
-def edge_step(height: Floats, road: Bools, goes_on: Bools) -> Floats:
-    """Return how far the cell beside the road lies off the line of the last two on it, at the last one."""
-    steps, beside = np.zeros(height.shape), ~(road | goes_on)
-    for z, on, off, out in ((height, road, beside, steps), (height.T, road.T, beside.T, steps.T)):
-        for profile, inside, outside, into in ((z, on, off, out), (z[::-1], on[::-1], off[::-1], out[::-1])):
-            step = np.abs(profile[2:] - 2 * profile[1:-1] + profile[:-2])
-            at_edge = outside[2:] & inside[1:-1] & inside[:-2]
-            into[1:-1] = np.fmax(into[1:-1], np.where(at_edge, step, 0.0))
-    return steps
+def edge_steps(cells: Compared) -> Floats:
+    """Return how far the cell beside the road lies off the line of the last two on it, ``(4, H, W)``, m.
+
+    It is given at the last one. At an abutment there is none: the road goes on as a deck or in a tunnel.
+    """
+    return bends(cells.smooth, cells.on_road, ~(cells.on_road | cells.goes_on))
 
 
 def _pieces(cells: Bools, area_m2: float, cell: float) -> Bools:
@@ -95,3 +112,104 @@ def _pieces(cells: Bools, area_m2: float, cell: float) -> Bools:
     parts, _ = scipy.ndimage.label(cells, EVERY_WAY)
     sizes = np.bincount(parts.ravel())
     return np.asarray(cells & (sizes[parts] >= least_cells(area_m2, cell)))
+
+
+def worst_piece(estimate: Floats, road: Bools, grid: Grid) -> tuple[float, Place]:
+    """Return the largest value (m) that the estimates of `PIECE_M2` of connected road reach, or NaN.
+
+    And the cell with the largest estimate in that piece. Of a tile whose largest connected road is smaller
+    than `PIECE_M2` the piece is that road.
+
+    - `estimate`: estimated error (m), finite on the road.
+    - `road`: road cells.
+    - `grid`: the grid of both.
+    """
+    parts, number = scipy.ndimage.label(road, EVERY_WAY)
+    if not number:
+        return np.nan, (np.nan, np.nan)
+    least = min(least_cells(PIECE_M2, grid.cell), float(np.bincount(parts[road]).max()))
+    members = np.flatnonzero(road)
+    values = estimate.ravel()[members]
+    # Equal estimates in the order of cells, so that the place does not depend on how they are sorted.
+    order = members[np.argsort(-values, kind="stable")]
+    last = _last_of_piece(order, np.full(road.size, -1, np.int32), road.shape[1], least)
+    value = float(estimate.ravel()[last])
+    parts, _ = scipy.ndimage.label(road & (estimate >= value), EVERY_WAY)
+    piece = parts == parts.ravel()[last]
+    return value, _highest(np.where(piece, estimate, -np.inf), grid)
+
+
+@compiled()
+def _last_of_piece(order: NDArray[np.intp], roots: Roots, cols: int, least: float) -> int:
+    """Return the first cell, in the given order, with which a connected piece has ``least`` cells."""
+    sizes = np.ones(roots.size, np.int32)
+    rows = roots.size // cols
+    for i in order:
+        roots[i] = i
+        row, col = i // cols, i % cols
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            for c in range(max(col - 1, 0), min(col + 2, cols)):
+                j = r * cols + c
+                if roots[j] < 0:
+                    continue
+                a, b = find(roots, i), find(roots, j)
+                if a != b:
+                    unite(roots, a, b)
+                    sizes[min(a, b)] = sizes[a] + sizes[b]
+        if sizes[find(roots, i)] >= least:
+            return int(i)
+    return int(order[-1])
+
+
+def places(cells: Compared, grid: Grid, dsm_dtm_tolerance_m: float) -> dict[str, Place]:
+    """Return the place of the worst cell, or of the middle of the largest patch, by flag.
+
+    - `cells`: the surface beside DSM and DTM, in the cells of ``grid``.
+    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
+    - result: easting and northing (m) by flag, whether it is raised or not. Flags without a place are absent:
+      those of the complete tile (``weights``, ``no-road``) and those of which the tile has no cell.
+    """
+    road = cells.on_road
+    scores = {
+        "error-estimate": _around(np.where(road, cells.estimate, 0.0), grid.cell),
+        "patch": _depth(largest_patch(road & (cells.deviation > dsm_dtm_tolerance_m))),
+        "spike": np.fmax.reduce(bends(cells.height, road)),
+        "edge-step": np.fmax.reduce(edge_steps(cells)),
+        "loose": np.where(cells.kept, np.abs(cells.off_dsm), 0.0),
+        "off-dtm": _around(
+            np.where(road & (np.abs(cells.off_dtm) > dsm_dtm_tolerance_m), 1.0, 0.0), grid.cell
+        ),
+        "inferred": _depth(largest_patch(cells.lacking)),
+        "dropped": _depth(largest_patch(road & ~cells.kept)),
+    }
+    found = dict[str, Place]()
+    for flag, score in scores.items():
+        score = np.nan_to_num(score, nan=0.0)
+        if score.max() > 0:
+            found[flag] = _highest(score, grid)
+    _, worst = worst_piece(cells.estimate, road, grid)
+    return found | {"worst-error": worst} if road.any() else found
+
+
+def _highest(score: Floats, grid: Grid) -> Place:
+    """Return the centre of the cell with the highest score."""
+    row, col = np.unravel_index(int(np.argmax(score)), score.shape)
+    return float(grid.eastings[col]), float(grid.northings[row])
+
+
+def _around(values: Floats, cell: float) -> Floats:
+    """Return the mean over a square around each cell."""
+    size = 2 * max(1, round(AROUND_M / cell / 2)) + 1
+    return np.asarray(scipy.ndimage.uniform_filter(np.nan_to_num(values), size, mode="constant"))
+
+
+def largest_patch(cells: Bools) -> Bools:
+    """Return the cells of the largest connected patch, ``(H, W)``."""
+    patches, number = scipy.ndimage.label(cells)
+    return np.asarray(patches == 1 + np.argmax(np.bincount(patches[cells])[1:])) if number else cells
+
+
+def _depth(cells: Bools) -> Floats:
+    """Return the distance of each cell to the outside of its patch (cells); largest in the middle."""
+    # Cells beyond the tile are outside, too.
+    return np.asarray(scipy.ndimage.distance_transform_edt(np.pad(cells, 1))[1:-1, 1:-1])

@@ -50,7 +50,7 @@ def height_source(
 
 
 def of_faces(
-    classes: NDArray[np.uint8], road: RoadMask, mesh: Mesh, others: Sequence[tuple[int, Quality]] = ()
+    classes: NDArray[np.uint8], road: RoadMask, mesh: Mesh, others: Sequence[tuple[int, Quality]]
 ) -> NDArray[np.uint8]:
     """Return the `HeightSource` of the core cell under the centroid of each face, ``(F,)``.
 

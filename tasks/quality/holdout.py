@@ -6,7 +6,7 @@ The intervals of `quality.estimate` should cover 90% of the squares, summed over
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.levels.seen import level_data
-from flexroad.tasks.metrics.statistics import mean
+from flexroad.tasks.metrics.evaluate import mean
 from flexroad.tasks.quality.estimate import INTERVAL, SQUARE_M, compare, heights_fitted
 from flexroad.tasks.types import Bools, RoadClusters, RoadMask, Surface, TileData
 
@@ -27,18 +27,6 @@ Refit = Callable[[TileData, RoadClusters], Surface]
 """Fits data of the tile as its surface was fitted."""
 
 
-@dataclass(frozen=True)
-class Holdout:
-    """The fit without the withheld squares, compared with their mean heights."""
-
-    holdout_squares: float
-    """Number of the squares; NaN if none were to be withheld."""
-    holdout_error_m: float
-    """Mean absolute difference of surface and heights."""
-    holdout_covered: float
-    """Share of the squares whose difference is within the 90% interval of the estimate."""
-
-
 def holdout(
     data: TileData,
     road: RoadMask,
@@ -46,21 +34,22 @@ def holdout(
     refit: Refit | None,
     dsm_dtm_tolerance_m: float,
     share: float,
-) -> Holdout:
+) -> dict[str, float]:
     """Fit without a share of the road's squares, and compare the surface and its error estimate with them.
 
     - `data`, `road`, `clusters`: as in `tasks.quality.assess.assess`.
     - `refit`: the fit; not needed if ``share`` is 0.
     - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     - `share`: share of the squares that are withheld, from 0 to 1.
+    - result: the figures of `Quality` by name.
     """
     if not share or refit is None:
-        return Holdout(np.nan, np.nan, np.nan)
+        return _figures(np.nan, np.nan, np.nan)
     seen = level_data(data, clusters)
     window, kept = data.grid.window(data.core), clusters.mask & np.isfinite(seen.dsm)
     squares = withheld_squares(kept[window], data.core, share)
     if not (squares >= 0).any():
-        return Holdout(0.0, np.nan, np.nan)
+        return _figures(0.0, np.nan, np.nan)
     away = np.zeros(data.grid.shape, np.bool_)
     away[window] = squares >= 0
     rest = _without(data, away)
@@ -68,7 +57,7 @@ def holdout(
         surface = refit(rest, clusters)
     except TaskError:
         # Too few heights are left for a second fit; the tile has its surface all the same.
-        return Holdout(0.0, np.nan, np.nan)
+        return _figures(0.0, np.nan, np.nan)
     cells = compare(rest, road, clusters, surface, dsm_dtm_tolerance_m, only_road=True)
     off = cells.height - heights_fitted(seen, clusters)[window]
     counted = (squares >= 0) & kept[window]
@@ -76,7 +65,11 @@ def holdout(
     count = np.bincount(number)
     difference = np.abs(np.bincount(number, off[counted]) / count)
     estimate = np.bincount(number, cells.estimate[counted]) / count
-    return Holdout(len(count), mean(difference), mean(difference <= INTERVAL * estimate))
+    return _figures(len(count), mean(difference), mean(difference <= INTERVAL * estimate))
+
+
+def _figures(squares: float, error_m: float, covered: float) -> dict[str, float]:
+    return {"holdout_squares": squares, "holdout_error_m": error_m, "holdout_covered": covered}
 
 
 def withheld_squares(kept: Bools, core: Grid, share: float) -> NDArray[np.int64]:

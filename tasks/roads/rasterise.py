@@ -17,7 +17,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.io.vectors import Query, encoding_notes, has_place, read_near
-from flexroad.tasks.roads import level_numbers, widths
+from flexroad.tasks.roads import attributes
 from flexroad.tasks.roads.attributes import NO, is_yes
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
@@ -34,7 +34,7 @@ SAME_M = 0.01
 """Ends of lines within this distance are the same (m)."""
 
 
-class Options(widths.Options):
+class Options(attributes.Options):
     """Selection of road features, and the width of lines."""
 
     layer: str | None = Field(
@@ -116,10 +116,10 @@ def roads(source: Source | None, grid: Grid, options: Options, levels: bool = Fa
             "or `flexroad prepare`"
         )
     # Both portals of a tunnel that reaches the grid are seen.
-    reach = max(widths.MAX_WIDTH_M / 2, FARTHEST_M if levels else 0.0)
+    reach = max(attributes.MAX_WIDTH_M / 2, FARTHEST_M if levels else 0.0)
     west, south, east, north = grid.bounds
     bounds = (west - reach, south - reach, east + reach, north + reach)
-    names = columns(options) + (level_numbers.COLUMNS if levels else ())
+    names = columns(options) + (attributes.LEVEL_COLUMNS if levels else ())
     layer = options.layer or source.sublayer
     parts, notes = list[Roads](), list[str]()
     for path in source.paths:
@@ -137,7 +137,7 @@ def roads(source: Source | None, grid: Grid, options: Options, levels: bool = Fa
 
 def columns(options: Options) -> tuple[str, ...]:
     """Return the columns, or OSM tags, that a selection of roads and their widths need, in lower case."""
-    of_width = (*options.width_columns, *options.lane_columns, *widths.WIDTH_CLASS_COLUMNS)
+    of_width = (*options.width_columns, *options.lane_columns, *attributes.WIDTH_CLASS_COLUMNS)
     names = (*of_width, *options.class_columns, *CLASS_TAGS, BRIDGE, AREA, *HIDDEN_TAGS)
     return tuple(dict.fromkeys(name.lower() for name in names))
 
@@ -155,7 +155,7 @@ def _from_table(table: Any, options: Options, levels: bool) -> Roads:
     is_area = shapely.get_type_id(parts) == 3
     lines, of_line = parts[is_line], row[is_line]
     rows, row_of = np.unique(of_line, return_inverse=True)
-    width, notes = widths.widths(table.iloc[rows], classes[rows], options)
+    width, notes = attributes.widths(table.iloc[rows], classes[rows], options)
     half = width[row_of] / 2
     joints, joint_bridge, joint_level = _joints(lines, half, bridge[is_line], level[is_line])
     strips = shapely.buffer(lines, half, quad_segs=8, cap_style="flat", join_style="round")
@@ -177,7 +177,7 @@ def selected(
     """
     numbers, notes = np.zeros(len(table), np.int64), tuple[str, ...]()
     if levels:
-        numbers, notes = level_numbers.level_numbers(table)
+        numbers, notes = attributes.level_numbers(table)
     classes = _classes(table, options.class_columns)
     chosen = _is_road(table, classes, options, numbers < 0)
     return table[chosen], classes[chosen], numbers[chosen], notes

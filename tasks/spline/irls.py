@@ -137,22 +137,16 @@ class HuberObjective:
         return step, float(np.vdot(slope, step))
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """The result of `minimise`."""
-
-    z: Floats
-    """Control heights, ``(m, n)``, m."""
-    losses: list[float]
-    """The loss at the start and after each step (m); it never rises."""
-
-
-def minimise(loss: HuberObjective, start: Floats, iterations: int, tolerance: float) -> Solution:
+def minimise(
+    loss: HuberObjective, start: Floats, iterations: int, tolerance: float
+) -> tuple[Floats, list[float]]:
     """Minimise the loss: stop when a step lowers it by at most ``tolerance`` of it, or after ``iterations``.
 
     - `start` ``(m, n)``: control heights (m); not changed.
     - `iterations`: largest number of steps, at least 1.
     - `tolerance`: relative decrease of the loss at which to stop.
+    - `z` ``(m, n)``: control heights (m).
+    - `losses`: the loss at the start and after each step (m); it never rises.
     """
     lines = to_lines(start, loss.degree)
     residuals, bend = loss.heights(lines) - loss.objective.target, loss.bend(lines)
@@ -178,7 +172,7 @@ def minimise(loss: HuberObjective, start: Floats, iterations: int, tolerance: fl
         if least <= floor_m and decrease <= tolerance * losses[-2]:
             break
         precision = min(LOOSE, max(TIGHT, 0.1 * decrease / losses[-2]))
-    return Solution(from_lines(lines, loss.shape[0], loss.degree), losses)
+    return from_lines(lines, loss.shape[0], loss.degree), losses
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,18 +64,14 @@ def border_points(
         on_road, elsewhere = (_at(road, (t[axis] + nudge) / cell) for t in (fine, coarse))
         regular = np.concatenate([fine[axis][on_road], coarse[axis][~elsewhere]])
         ends = coarse[axis][[0, -1]]
-        marks = _marks(edge, cell, ends, raw)
+        marks = np.round(edge.limits * cell, DECIMALS)
+        if raw:
+            marks = np.concatenate([marks, edge.crossings[apart(edge.crossings, marks, SAME_M)]])
+        marks = np.sort(marks[apart(marks, ends, SAME_M)])
+        marks = marks[np.diff(marks, prepend=-np.inf) >= SAME_M]
         along = np.unique(np.concatenate([regular[apart(regular, marks, apart_m)], marks, ends]))
         sides.append(_placed(along, ends, axis, at, local))
     return np.concatenate(sides)
-
-
-def _marks(edge: Edge, cell: float, ends: Floats, crossed: bool) -> Floats:
-    """Return where the survey ends on an edge and, if asked for, outlines cross it (m from its start)."""
-    marks = np.round(edge.limits * cell, DECIMALS)
-    if crossed:
-        marks = np.concatenate([marks, edge.crossings[apart(edge.crossings, marks, SAME_M)]])
-    return _spaced(marks[apart(marks, ends, SAME_M)])
 
 
 def _placed(along: Floats, ends: Floats, axis: int, at: float, local: Bounds) -> Floats:
@@ -89,12 +85,6 @@ def apart(positions: Floats, others: Floats, distance_m: float) -> Bools:
     """Return which positions on a line, ``(n,)``, have a distance (m) from all others, ``(m,)``."""
     away = np.abs(positions[:, None] - others).min(axis=1, initial=np.inf)
     return np.asarray(away >= distance_m)
-
-
-def _spaced(positions: Floats) -> Floats:
-    """Return ascending positions on a line, without those within `SAME_M` of the one before."""
-    ordered = np.sort(positions)
-    return ordered[np.diff(ordered, prepend=-np.inf) >= SAME_M]
 
 
 def on_border(points: Floats, local: Bounds) -> Bools:

@@ -93,37 +93,23 @@ def moving(surface: NurbsSurface, uniform: bool = False) -> MovingNurbs:
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Weights without bounds, as a function of the variables of the fit."""
-
-    start: float
-    """Variable of the weight 1."""
-    value: Callable[[Floats], Floats]
-    """The weights of the variables."""
-    slope: Callable[[Floats], Floats]
-    """Derivatives of the weights by the variables."""
-
-    def loss(self, objective: Objective) -> Callable[[Floats], tuple[float, Floats]]:
-        """Return the loss (m) and its gradient as a function of heights and variables, ``(2, m, n)``."""
-
-        def at(variables: Floats) -> tuple[float, Floats]:
-            loss, by_z, by_w = objective.by_weight(variables[0], self.value(variables[1]))
-            return loss, np.stack([by_z, by_w * self.slope(variables[1])])
-
-        return at
-
-
-def _softplus(s: Floats) -> Floats:
-    return np.asarray(np.logaddexp(0.0, s))
-
-
-def _logistic(s: Floats) -> Floats:
-    return np.asarray(np.exp(-np.logaddexp(0.0, -s)))
-
-
-WEIGHTS = {
-    "softplus": Weights(math.log(math.e - 1), _softplus, _logistic),
-    "unbounded": Weights(1.0, np.asarray, np.ones_like),
-}
+Weights = tuple[float, Callable[[Floats], Floats], Callable[[Floats], Floats]]
+"""Weights without bounds by the variables of the fit: the variable of weight 1, the weights, their slopes."""
+WEIGHTS: dict[str, Weights] = {
+    "softplus": (
+        math.log(math.e - 1), lambda s: np.logaddexp(0.0, s), lambda s: np.exp(-np.logaddexp(0.0, -s)),
+    ),
+    "unbounded": (1.0, np.asarray, np.ones_like),
+}  # fmt: skip
 """By the names of the option ``weights``."""
+
+
+def loss_by_variables(objective: Objective, weights: Weights) -> Callable[[Floats], tuple[float, Floats]]:
+    """Return the loss (m) and its gradient as a function of heights and variables, ``(2, m, n)``."""
+    _, value, slope = weights
+
+    def at(variables: Floats) -> tuple[float, Floats]:
+        loss, by_z, by_w = objective.by_weight(variables[0], value(variables[1]))
+        return loss, np.stack([by_z, by_w * slope(variables[1])])
+
+    return at

@@ -20,8 +20,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.roads.distances import distances, within
 from flexroad.tasks.roads.road_height import ground_heights
 from flexroad.tasks.spline.frame import Frame, rounded
-from flexroad.tasks.spline.lattice import Lattice, Range
-from flexroad.tasks.spline.space import surface_on
+from flexroad.tasks.spline.space import Lattice, Range, surface_on
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, Surface, TileData
 
@@ -164,7 +163,12 @@ def with_steps(beside: Beside, surface: NurbsSurface, core: Grid) -> SteppedSurf
     """
     spline = surface.lattice(core.eastings, core.northings)
     rise, smoothed = beside.dsm - spline, beside.dtm - spline
-    shown = beside.cells & ((np.abs(rise) <= SAME_M) | _is_open(beside.dsm, beside.dtm))
+    # The DTM is smoothed: beside a wall it has not reached the full height of the ground above or below it.
+    low, high = _around_dtm(beside.dtm)
+    reach = OPEN_M + ROUNDED * np.maximum(high - low, 0.0)
+    away = np.minimum(np.abs(beside.dsm - low), np.abs(beside.dsm - high))
+    is_open = (np.abs(beside.dsm - beside.dtm) <= OPEN_M) | (away <= reach)
+    shown = beside.cells & ((np.abs(rise) <= SAME_M) | is_open)
     steps = np.where(beside.cells, smoothed, 0.0)
     near = np.isfinite(beside.dsm)
     around = _around(np.where(shown, rise, np.nan), near)
@@ -191,15 +195,6 @@ def _alike(around: Floats, own: Floats) -> Floats:
     """
     weights = np.where(np.isfinite(around), np.exp(-0.5 * ((around - own[:, None]) / ALIKE_M) ** 2), 0.0)
     return np.asarray((weights * np.nan_to_num(around)).sum(axis=1) / weights.sum(axis=1))
-
-
-def _is_open(dsm: Floats, dtm: Floats) -> Bools:
-    """Return the cells whose DSM is the DTM's height, or at a wall that of the ground above or below it."""
-    low, high = _around_dtm(dtm)
-    # The DTM is smoothed: beside the wall it has not reached the full height.
-    reach = OPEN_M + ROUNDED * np.maximum(high - low, 0.0)
-    away = np.minimum(np.abs(dsm - low), np.abs(dsm - high))
-    return np.asarray((np.abs(dsm - dtm) <= OPEN_M) | (away <= reach))
 
 
 def _around_dtm(dtm: Floats) -> tuple[Floats, Floats]:

@@ -376,7 +376,7 @@ def test_border_leaves_out_file_in_other_crs(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     (east,), (north,) = transform(UTM, "EPSG:25833", [GRID.west - 10], [GRID.north + 10])
     write(tmp_path / "other.tif", relief(40, 40), east, north, crs="EPSG:25833")
-    ground = load_border(tile(tmp_path, dtm=("other.tif", "dtm.tif")), GRID)
+    ground = load_border(tile(tmp_path, dtm=("other.tif", "dtm.tif")), GRID, Options())
     np.testing.assert_array_equal(ground.dtm, relief(seed=9))
 
 
@@ -465,7 +465,7 @@ def test_load_border_resamples_as_for_the_tile(tmp_path, cell, shift):
     place = rasters.index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=250).tiles[0]
     whole = load(place, Options(halo_m=20))
     for border in border_of(place.grid, 30):
-        around = load_border(place.around(border.grid, border.within(200)), place.grid)
+        around = load_border(place.around(border.grid, border.within(200)), place.grid, Options())
         west, south = (max(whole.grid.bounds[k], around.grid.bounds[k]) for k in (0, 1))
         east, north = (min(whole.grid.bounds[k], around.grid.bounds[k]) for k in (2, 3))
         common = Grid(UTM, west, north, 1.0, int(east - west), int(north - south))
@@ -537,7 +537,7 @@ def test_load_road_height_is_read_as_asked(tmp_path, dtm, chosen, has_layer, is_
         assert (data.road_height is not None) == is_read
         if is_read:
             np.testing.assert_array_equal(data.road_height, heights)
-    assert load_border(place, GRID).road_height is None
+    assert load_border(place, GRID, Options()).road_height is None
 
 
 def test_load_without_required_road_height_fails(tmp_path, dtm):

@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from flexroad.tasks.metrics.mesh_check import faults
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.sample import Options, sample
 from tests.crossing import GROUND_M, RISE, WEST, Crossing
 from tests.mesh_union import Union

@@ -34,7 +34,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.options import Options
-from flexroad.tasks.roads import coregistration, level_numbers, rasterise
+from flexroad.tasks.roads import attributes, coregistration, rasterise
 from flexroad.tasks.types import TileData
 from flexroad.tools.check.likely_decks import Deck, likely_decks
 
@@ -250,12 +250,12 @@ def _named(data: TileData, options: rasterise.Options) -> NDArray[np.object_]:
     source = data.roads
     if source is None:
         return np.empty(0, object)
-    shapes, layer, names = [], options.layer or source.sublayer, level_numbers.COLUMNS
+    shapes, layer, names = [], options.layer or source.sublayer, attributes.LEVEL_COLUMNS
     for path in source.paths:
         table = read_near(
             Query(path, layer, options.where, names, source.crs, data.grid.crs), data.grid.bounds
         )
-        numbers, _ = level_numbers.level_numbers(table)
+        numbers, _ = attributes.level_numbers(table)
         shapes.append(table.geometry.to_numpy()[numbers > 0])
     areas: NDArray[np.object_] = shapely.buffer(np.concatenate(shapes), options.default_width_m / 2)
     return areas

@@ -22,9 +22,8 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import types
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.vectors import Query, encoding_notes, read_near
-from flexroad.tasks.roads import level_numbers, rasterise, widths
+from flexroad.tasks.roads import attributes, rasterise
 from flexroad.tasks.roads import routes as routing
-from flexroad.tasks.roads.attributes import has_value
 from flexroad.tasks.roads.routes import CentreLine, Route
 from flexroad.tasks.segment import vector
 from flexroad.tools.export.georeference import LocalFrame
@@ -197,7 +196,7 @@ def read_centre_lines(
     - `levels`: whether to read levels. Roads below level 0 are then kept, whatever ``options.tunnels`` says.
     """
     names = (*rasterise.columns(options), *NAMES, *DIRECTIONS, JUNCTION)
-    names += level_numbers.COLUMNS if levels else ()
+    names += attributes.LEVEL_COLUMNS if levels else ()
     found: dict[bytes, CentreLine] = {}
     areas, notes = 0, list[str]()
     for path in source.paths:
@@ -219,8 +218,8 @@ def from_table(table: Any, options: rasterise.Options, levels: bool = False) -> 
     is_line = np.isin(kinds, (1, 2)) & (shapely.length(shapes) > 0)
     rows, row_of = np.unique(row[is_line], return_inverse=True)
     table, classes, numbers = table.iloc[rows], classes[rows], numbers[rows]
-    width, notes = widths.widths(table, classes, options)
-    lanes = [int(number) if np.isfinite(number) else None for number in widths.lanes(table, options)]
+    width, notes = attributes.widths(table, classes, options)
+    lanes = [int(number) if np.isfinite(number) else None for number in attributes.lanes(table, options)]
     way, name = _direction(table, classes), _texts(table, NAMES)
     lines = []
     for shape, k in zip(shapes[is_line], row_of, strict=True):
@@ -245,5 +244,5 @@ def _texts(table: Any, names: tuple[str, ...]) -> list[str]:
     texts = [""] * len(table)
     for name in names:
         for k, value in enumerate(table.get(name, ())):
-            texts[k] = texts[k] or (str(value).strip() if has_value(value) else "")
+            texts[k] = texts[k] or (str(value).strip() if attributes.has_value(value) else "")
     return texts

@@ -28,8 +28,8 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.worker.evaluator import SourceChanged
 from flexroad.pipeline.worker.exports import tile_texture
-from flexroad.tasks.io.vertical import vertical_crs
-from flexroad.tasks.metrics.mesh_distance import FIGURES
+from flexroad.tasks.io.dsm_and_dtm import vertical_crs
+from flexroad.tasks.metrics.evaluate import FIGURES
 from flexroad.tasks.products.glb import Texture
 from flexroad.tools.export.aerial import Aerial
 from flexroad.tools.export.georeference import Datum, Georeference

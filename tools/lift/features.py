@@ -15,7 +15,7 @@ from flexroad.catalog.lazy import lazy
 from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.quality.flagged import Bits, passed
-from flexroad.tasks.roads import level_numbers
+from flexroad.tasks.roads import attributes
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.lift.lines import STEP_M, Line, largest, steepest
 from flexroad.tools.lift.network import ANY, Numbers, along, filled, of_levels
@@ -50,7 +50,7 @@ class Feature:
 
 def level_columns(names: Iterable[str]) -> list[str]:
     """Return the columns of a layer that say the level of a feature; none if nothing does."""
-    known = level_numbers.COLUMNS
+    known = attributes.LEVEL_COLUMNS
     own = [name for name in names if name.lower() in known]
     # OSM's layer orders what crosses; by itself it is no level, and often something else.
     return own if any(name.lower() != "layer" for name in own) else []
@@ -63,7 +63,7 @@ def wanted_levels(columns: Mapping[str, Sequence[Any]], count: int) -> list[int]
     table = pd.DataFrame(
         {name.lower(): pd.Series(list(values), dtype=object) for name, values in columns.items()}
     )
-    return [int(number) for number in level_numbers.level_numbers(table)[0]]
+    return [int(number) for number in attributes.level_numbers(table)[0]]
 
 
 def percent_columns(row: Lifted) -> tuple[float | None, float | None, float | None]:

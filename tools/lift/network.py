@@ -18,7 +18,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from flexroad.pipeline.run.points import Heights
-from flexroad.tasks.roads.level_numbers import OSM_TAGS, level_numbers
+from flexroad.tasks.roads.attributes import OSM_TAGS, level_numbers
 from flexroad.tasks.types import Floats
 from flexroad.tools.lift.lines import stretches
 

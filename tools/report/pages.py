@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from flexroad.catalog.text import printable
 from flexroad.pipeline.store.tables import csv_text
-from flexroad.tasks.quality.places import Place
+from flexroad.tasks.quality.flagged import Place
 from flexroad.tools.report.content import DECKS_MEANING, ESTIMATE_MEANING, HOLDOUT, MESHES, Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")

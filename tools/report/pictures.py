@@ -23,7 +23,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, peek_statuses, untracked
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.types import Mesh
 from flexroad.tools.report.content import Content

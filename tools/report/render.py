@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flexroad.catalog import Grid
+from flexroad.tasks.quality.flagged import Place
 from flexroad.tasks.quality.height_source import HeightSource
-from flexroad.tasks.quality.places import Place
 from flexroad.tasks.types import Bools, Floats
 
 log = logging.getLogger(__name__)

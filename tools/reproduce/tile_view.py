@@ -17,7 +17,7 @@ from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.metrics.dihedral import mean_angles
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.types import Bools, Floats, Mesh, Metrics
 
 EIGHT = np.ones((3, 3), dtype=bool)

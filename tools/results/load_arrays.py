@@ -19,8 +19,7 @@ from flexroad.catalog.scan.cell_values import has_fractions, values_note
 from flexroad.catalog.text import edges
 from flexroad.catalog.tile import HIGHEST_M, LOWEST_M
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.dsm_and_dtm import below_ground_note
-from flexroad.tasks.io.height_offset import offset_note
+from flexroad.tasks.io.dsm_and_dtm import below_ground_note, offset_note
 from flexroad.tasks.io.height_units import UNITS, absurd_note, remove_absurd, smaller_unit_fault
 from flexroad.tasks.io.raster import RasterWindow, misalignment, resample_to
 from flexroad.tasks.io.raster_grid import RasterGrid

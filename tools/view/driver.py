@@ -30,7 +30,7 @@ from flexroad.pipeline.run.status import TileStatus, Track, ended, peek_statuses
 from flexroad.pipeline.store.records import LEVELS
 from flexroad.pipeline.worker.exports import tile_photo
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.io.dsm_and_dtm import vertical_crs
 from flexroad.tasks.load import layer_source
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import glb

@@ -145,7 +145,7 @@ def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Bac
         raise
     except Exception as error:  # transformers raises many types for damaged files
         raise TaskError(
-            f"cannot read the weights in {folder}: {_one_line(error)}; {_remedy(name)}"
+            f"cannot read the weights in {folder}: {' '.join(str(error).split())[:200]}; {_remedy(name)}"
         ) from error
     if info["missing_keys"]:
         raise TaskError(f"{folder}: weights lack {len(info['missing_keys'])} arrays; {_remedy(name)}")
@@ -153,7 +153,9 @@ def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Bac
         raise TaskError(
             f"{folder}: patches of {model.config.patch_size} pixels, not {PATCH}; {_remedy(name)}"
         )
-    identity = _identity(model)
+    ends = (model.embeddings.patch_embeddings.projection.weight, model.layernorm.weight, model.layernorm.bias)
+    content = b"".join(end.detach().float().cpu().numpy().tobytes() for end in ends)
+    identity = hashlib.sha256(content).hexdigest()[:16]
     with gpu_memory():
         model = model.eval().requires_grad_(False).to(target)
     return Backbone(name, model, target, half, identity)
@@ -187,14 +189,3 @@ def _model_class(folder: Path, name: str) -> Any:
         raise TaskError(f"{folder} holds a model of type {model_type!r}, not one of {', '.join(MODEL_TYPES)}")
     # Import only the model's module: importing all of transformers takes seconds.
     return dinov2.Dinov2Model if model_type == "dinov2" else dinov2_with_registers.Dinov2WithRegistersModel
-
-
-def _identity(model: Any) -> str:
-    """Return a hash of the model's first and last weights: patch embedding and final layer norm."""
-    ends = (model.embeddings.patch_embeddings.projection.weight, model.layernorm.weight, model.layernorm.bias)
-    content = b"".join(end.detach().float().cpu().numpy().tobytes() for end in ends)
-    return hashlib.sha256(content).hexdigest()[:16]
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

@@ -149,12 +149,12 @@ def check(head: Head, backbone: Backbone) -> None:
     )
 
 
-def predictor(head: Head, backbone: Backbone, class_name: str = "road") -> Predict:
-    """Return a function: windows -> probability of a class for each of their pixels.
+def predictor(head: Head, backbone: Backbone) -> Predict:
+    """Return a function: windows -> probability of road for each of their pixels.
 
     The logits of the patches are interpolated to the pixels (bilinear), as in DINOv2's segmentation heads.
     """
-    row = head.about.classes.index(class_name)
+    row = head.about.classes.index("road")
     weight = torch.from_numpy(head.weight[row]).to(backbone.device)
     bias = float(head.bias[row])
 

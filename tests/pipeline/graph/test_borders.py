@@ -28,7 +28,7 @@ from flexroad.tasks import load
 from flexroad.tasks.border import ENDS, BorderStages
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import stage_module
-from flexroad.tasks.spline.lattice import Lattice
+from flexroad.tasks.spline.space import Lattice
 from flexroad.tools.synthetic import prepared
 from flexroad.tools.synthetic.scenes import MADE, write_scenes
 

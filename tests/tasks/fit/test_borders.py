@@ -92,7 +92,7 @@ def fit_together(world, monkeypatch):
     u, v = (-k, 2 * n + k), (-j, 2 * m + j)
     free = np.full((2 * m + 2 * j + 3, 2 * n + 2 * k + 3), np.nan)
     start = AROUND_M + 500, AROUND_M
-    control = smoothing_spline._control_heights(data, filtered(data)[1], lattice, start, u, v, free, OPTIONS)
+    control = smoothing_spline._fitted(data, filtered(data)[1], lattice, start, u, v, free, OPTIONS)[1]
     return control[j : j + 2 * m + 3, k : k + 2 * n + 3]
 
 

@@ -113,7 +113,7 @@ def test_border_is_the_same_for_all_tiles_that_share_it(damage, fault, survey, t
     seen = {}
     for tile in survey.values():
         for border in border_of(tile.grid, 30):
-            ground = load_border(tile.around(border.grid, border.within(200)), tile.grid)
+            ground = load_border(tile.around(border.grid, border.within(200)), tile.grid, Options())
             first = seen.setdefault(border.grid, ground)
             np.testing.assert_array_equal(ground.dsm, first.dsm)
     assert len(seen) < 8 * len(survey)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Grid, Layer, Tile
-from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.io.dsm_and_dtm import vertical_crs
 from tests.make_rasters import UTM, write
 
 GRID = Grid(UTM, 295500.0, 5629480.0, 1.0, 20, 20)

@@ -6,7 +6,7 @@ import shapely
 import shapely.affinity
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.levels.overlaps import crossing_notes
+from flexroad.tasks.levels.abutments import crossing_notes
 from flexroad.tasks.roads.rasterise import Options, roads
 from flexroad.tasks.types import Source
 from tests.make_roads import GRID as FILE_GRID

@@ -4,7 +4,7 @@ import numpy as np
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.meshing.parts import highest_first, part, texture_coordinates, with_levels
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.types import Mesh
 from tests.crossing import DECK_M, RISE, SOUTH, WEST, Crossing
 

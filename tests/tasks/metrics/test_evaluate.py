@@ -12,8 +12,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import MeshFault
 from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.evaluate import Options, evaluate
-from flexroad.tasks.metrics.point_to_mesh import nearest
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape, nearest
 from flexroad.tasks.sample import Options as SampleOptions
 from flexroad.tasks.sample import sample
 from flexroad.tasks.types import Mesh, Metrics, RoadMask, TileData

@@ -74,11 +74,11 @@ def test_of_faces_uses_cell_under_centroid():
         GRID.crs, (*GRID.origin, 0.0), vertices, np.arange(6, dtype=np.int32).reshape(2, 3), np.ones(2, bool)
     )
     np.testing.assert_array_equal(
-        of_faces(classes, street(), mesh), [HeightSource.MEASURED, HeightSource.DTM]
+        of_faces(classes, street(), mesh, ()), [HeightSource.MEASURED, HeightSource.DTM]
     )
     beyond = np.where(COL < 30, HeightSource.MEASURED, HeightSource.NONE).astype(np.uint8)
     np.testing.assert_array_equal(
-        of_faces(beyond, street(), mesh), [HeightSource.MEASURED, HeightSource.INFERRED]
+        of_faces(beyond, street(), mesh, ()), [HeightSource.MEASURED, HeightSource.INFERRED]
     )
 
 

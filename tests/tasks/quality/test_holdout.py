@@ -10,7 +10,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality.estimate import INTERVAL, heights_fitted
-from flexroad.tasks.quality.holdout import INSET_M, Holdout, holdout, withheld_squares
+from flexroad.tasks.quality.holdout import INSET_M, holdout, withheld_squares
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 from flexroad.tools.prepare.points.to_rasters import Options
 from flexroad.tools.synthetic import SceneOptions, make_scene
@@ -53,9 +53,9 @@ def test_holdout_of_nothing_does_not_fit():
         raise AssertionError
 
     data, road, clusters = tile(1)
-    assert np.isnan(holdout(data, road, clusters, refit, 0.3, 0.0).holdout_squares)
+    assert np.isnan(holdout(data, road, clusters, refit, 0.3, 0.0)["holdout_squares"])
     nowhere = replace(clusters, labels=np.zeros_like(clusters.labels))
-    assert holdout(data, road, nowhere, refit, 0.3, 0.1).holdout_squares == 0
+    assert holdout(data, road, nowhere, refit, 0.3, 0.1)["holdout_squares"] == 0
 
 
 def test_holdout_without_enough_heights_for_a_second_fit_counts_no_square():
@@ -63,7 +63,7 @@ def test_holdout_without_enough_heights_for_a_second_fit_counts_no_square():
         raise TaskError("fewer cells than control points")
 
     data, road, clusters = tile(1)
-    assert holdout(data, road, clusters, refit, 0.3, 0.5).holdout_squares == 0
+    assert holdout(data, road, clusters, refit, 0.3, 0.5)["holdout_squares"] == 0
 
 
 def test_holdout_hides_squares_from_fit():
@@ -78,9 +78,9 @@ def test_holdout_hides_squares_from_fit():
         return Heights(heights_fitted(data, clusters) + hidden)
 
     result = holdout(data, road, clusters, refit, 0.3, 0.2)
-    assert result.holdout_squares > 10
-    assert result.holdout_error_m == pytest.approx(1)
-    assert result.holdout_covered == 0
+    assert result["holdout_squares"] > 10
+    assert result["holdout_error_m"] == pytest.approx(1)
+    assert result["holdout_covered"] == 0
 
 
 @pytest.mark.slow
@@ -95,8 +95,8 @@ def refit(data, clusters):
     return smoothing_spline.fit(data, clusters, smoothing_spline.Options(bending_m3=30, spacing_m=3.6))
 
 
-def covered(results: Iterable[Holdout]) -> float:
-    squares, shares = zip(*((one.holdout_squares, one.holdout_covered) for one in results), strict=True)
+def covered(results: Iterable[dict[str, float]]) -> float:
+    squares, shares = zip(*((one["holdout_squares"], one["holdout_covered"]) for one in results), strict=True)
     assert sum(squares) > 300
     return float(np.average(shares, weights=squares))
 

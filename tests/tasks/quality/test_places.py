@@ -6,7 +6,7 @@ import pytest
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.quality.assess import Options, assess
 from flexroad.tasks.quality.estimate import compare
-from flexroad.tasks.quality.places import places
+from flexroad.tasks.quality.flagged import places
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 2.0, 120, 100)
@@ -32,7 +32,9 @@ def found(surface=LEVEL, dsm=LEVEL, dtm=LEVEL, kept=STREET):
     given = data, RoadMask(GRID, GRID, STREET, NOWHERE), RoadClusters(GRID, kept.astype(np.int32), None)
     options = Options()
     cells = compare(*given, GivenHeights(surface), options.dsm_dtm_tolerance_m)
-    return assess(*given, GivenHeights(surface), options).flags, places(cells, GRID, options)
+    return assess(*given, GivenHeights(surface), options).flags, places(
+        cells, GRID, options.dsm_dtm_tolerance_m
+    )
 
 
 def changed(rows, cols, metres):

@@ -7,8 +7,7 @@ import scipy
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import nurbs
 from flexroad.tasks.quality.assess import Options, assess
-from flexroad.tasks.quality.flagged import flag_names
-from flexroad.tasks.quality.worst import PIECE_M2, worst_piece
+from flexroad.tasks.quality.flagged import PIECE_M2, flag_names, worst_piece
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 120, 120)
@@ -113,12 +112,12 @@ def test_worst_piece_equals_search_over_all_thresholds(seed, cell):
     grid = Grid("EPSG:25832", 0.0, 100.0, cell, 30, 24)
     road = rng.random(grid.shape) < 0.7
     estimate = scipy.ndimage.gaussian_filter(rng.random(grid.shape), 1).round(2)
-    found = worst_piece(estimate, road, grid)
+    value, (easting, northing) = worst_piece(estimate, road, grid)
     largest = np.bincount(scipy.ndimage.label(road, np.ones((3, 3)))[0][road]).max()
-    assert found.estimate_m == naive(estimate, road, min(PIECE_M2 / cell**2, largest))
-    cells = grid.cells(np.array([found.easting]), np.array([found.northing]))
+    assert value == naive(estimate, road, min(PIECE_M2 / cell**2, largest))
+    cells = grid.cells(np.array([easting]), np.array([northing]))
     assert road[cells][0]
-    assert estimate[cells][0] >= found.estimate_m
+    assert estimate[cells][0] >= value
 
 
 def test_worst_piece_of_small_road_is_that_road():
@@ -126,12 +125,11 @@ def test_worst_piece_of_small_road_is_that_road():
     road[10:12, 10:15] = True
     estimate = np.where(road, 0.2, 9.0)
     estimate[11, 12] = 0.4
-    found = worst_piece(estimate, road, GRID)
-    assert (found.estimate_m, found.easting, found.northing) == (0.2, GRID.west + 12.5, GRID.north - 11.5)
-    assert worst_piece(estimate, ~EVERY, GRID) is None
+    assert worst_piece(estimate, road, GRID) == (0.2, (GRID.west + 12.5, GRID.north - 11.5))
+    assert np.isnan(worst_piece(estimate, ~EVERY, GRID)[0])
 
 
 def test_single_wrong_cells_are_no_worst_piece():
     values = np.full(GRID.shape, 0.05)
     values[::7, ::7] = 5.0
-    assert worst_piece(values, EVERY, GRID).estimate_m == 0.05
+    assert worst_piece(values, EVERY, GRID)[0] == 0.05

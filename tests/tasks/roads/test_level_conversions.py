@@ -9,7 +9,7 @@ import pyogrio
 import pytest
 from shapely import LineString, box
 
-from flexroad.tasks.roads.level_numbers import level_numbers
+from flexroad.tasks.roads.attributes import level_numbers
 
 PAGE = Path(__file__).parents[3] / "docs" / "levels.md"
 COMMANDS = [

@@ -4,7 +4,7 @@ import pytest
 import shapely
 
 from flexroad.tasks.io.vectors import Query, read_near
-from flexroad.tasks.roads.level_numbers import COLUMNS, level_numbers
+from flexroad.tasks.roads.attributes import LEVEL_COLUMNS, level_numbers
 from flexroad.tools.synthetic.crossings import Crossings
 from tests.make_town import CRS, OPTIONS, write_streets
 
@@ -136,7 +136,7 @@ def test_level_numbers_mixed_rows_and_empty_table():
 def test_level_numbers_of_an_osm_file_are_those_of_its_decks_and_tunnels(tmp_path):
     """GDAL packs most of the tags into one column."""
     around = (500_000, 5_600_000, 500_500, 5_600_500)
-    query = Query(write_streets(tmp_path / "town.osm", around), None, None, COLUMNS, None, CRS)
+    query = Query(write_streets(tmp_path / "town.osm", around), None, None, LEVEL_COLUMNS, None, CRS)
     town = read_near(query, around)
     levels, notes = level_numbers(town)
     assert notes == ()

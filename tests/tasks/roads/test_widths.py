@@ -10,8 +10,8 @@ from pydantic import ValidationError
 from shapely import LineString
 
 from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.attributes import Options, metres, widths
 from flexroad.tasks.roads.rasterise import roads
-from flexroad.tasks.roads.widths import Options, metres, widths
 from tests.make_roads import GRID, on_grid, tile, write
 
 

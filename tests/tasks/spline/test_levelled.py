@@ -9,9 +9,8 @@ import shapely
 from flexroad.catalog.grid import Grid
 from flexroad.pipeline.store import codec
 from flexroad.tasks.spline.frame import Corner, Edge
-from flexroad.tasks.spline.lattice import Lattice
 from flexroad.tasks.spline.levelled import LevelledSurface
-from flexroad.tasks.spline.space import surface_on
+from flexroad.tasks.spline.space import Lattice, surface_on
 from flexroad.tasks.types import Level, LevelSpline, RoadClusters, RoadMask
 
 GRID = Grid("EPSG:25832", 500000.0, 5600060.0, 1.0, 60, 60)

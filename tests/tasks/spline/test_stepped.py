@@ -12,7 +12,7 @@ from flexroad.pipeline.store import codec
 from flexroad.tasks import sample
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.metrics.mesh_check import check
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.spline.stepped import between
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData

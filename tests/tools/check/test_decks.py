@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from flexroad.catalog import Grid, Tile
-from flexroad.tasks.roads.level_numbers import level_numbers
+from flexroad.tasks.roads.attributes import level_numbers
 from flexroad.tools.check import catalog as catalog_check
 from flexroad.tools.check.likely_decks import Deck
 from flexroad.tools.synthetic.crossings import Crossings

@@ -9,7 +9,7 @@ import pytest
 
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.store.tables import read_metrics
-from flexroad.tasks.metrics.mesh_distance import FIGURES
+from flexroad.tasks.metrics.evaluate import FIGURES
 from flexroad.tools.export.driver import export
 from flexroad.tools.export.formats import FORMATS
 from flexroad.tools.export.source import select

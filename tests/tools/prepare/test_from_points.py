@@ -13,7 +13,7 @@ from flexroad.catalog import Catalog, CatalogError, Grid
 from flexroad.catalog.crs import vertical
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.io.dsm_and_dtm import vertical_crs
 from flexroad.tasks.load import Options as LoadOptions
 from flexroad.tasks.load import load
 from flexroad.tools.prepare import from_points as points

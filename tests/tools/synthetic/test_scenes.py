@@ -9,7 +9,7 @@ import rasterio
 from flexroad.catalog import Catalog
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.load import Options, load
-from flexroad.tasks.roads.level_numbers import level_numbers
+from flexroad.tasks.roads.attributes import level_numbers
 from flexroad.tasks.segment import vector
 from flexroad.tools.synthetic import make_scene
 from flexroad.tools.synthetic.crossings import Crossings, make_crossings

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.types import Bools, Floats, Mesh
 
 Window = tuple[slice, slice]

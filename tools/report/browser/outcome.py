@@ -13,9 +13,9 @@ from typing import Any
 import pandas as pd
 
 from flexroad.catalog.text import count, printable
-from flexroad.tasks.io.height_offset import is_offset
+from flexroad.tasks.io.dsm_and_dtm import is_offset
 from flexroad.tasks.quality.assess import FLAGS, LIMITS, NO_ROAD
-from flexroad.tasks.quality.places import Place
+from flexroad.tasks.quality.flagged import Place
 from flexroad.tasks.quality.structures import BELOW, LEAST_RISE_M, NO_ABUTMENT, NO_RISE
 from flexroad.tools.report.browser.tiles import STATES, TileTable, short
 from flexroad.tools.report.content import Content
@@ -126,7 +126,7 @@ def reasons(row: Mapping[str, Any], places: Mapping[str, Place], notes: Sequence
     """Return a tile's flags in words.
 
     - `row`: the tile's row of metrics.parquet.
-    - `places`: place of each flag, as far as known (`flexroad.tasks.quality.places.places`).
+    - `places`: place of each flag, as far as known (`flexroad.tasks.quality.flagged.places`).
     - `notes`: notes on the sources of the tile: a DSM that lies off the DTM as a whole is why roads are
       dropped.
     """

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexroad.tasks.spline.lattice import Lattice
+from flexroad.tasks.spline.space import Lattice
 from flexroad.tasks.spline.surface import NurbsSurface, basis, basis_matrix, exact, uniform_knots
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.meshing.breaklines import APART, breaklines
+from flexroad.tasks.meshing.survey_limit import APART, breaklines
 from flexroad.tasks.spline.stepped import SteppedSurface
 
 CELLS = Grid("EPSG:25832", 500000.0, 5600030.0, 1.0, 30, 30)
@@ -25,15 +25,15 @@ def level(steps) -> SteppedSurface:
 
 
 def test_noise_of_single_cells_has_no_line():
-    assert breaklines(level(NOISE), LOCAL).lines.is_empty
+    assert breaklines(level(NOISE), LOCAL)[0].is_empty
 
 
 @pytest.mark.parametrize("step", [0.3, -4.0])
 def test_edge_with_noise_has_two_lines_with_its_heights(step):
-    found = breaklines(level(np.where(HIGH, step, 0.0) + 0.3 * NOISE), LOCAL)
-    _, low, _, high = found.lines.bounds
+    lines, height = breaklines(level(np.where(HIGH, step, 0.0) + 0.3 * NOISE), LOCAL)
+    _, low, _, high = lines.bounds
     assert (low, high) == pytest.approx((10 - APART / 2, 20 + APART / 2))
     # Two lines around a block that ends one cell from the border of the tile.
-    assert found.lines.length == pytest.approx(2 * 2 * (28 + 10), rel=0.05)
+    assert lines.length == pytest.approx(2 * 2 * (28 + 10), rel=0.05)
     sides = np.array([[15.5, 20 - APART / 2], [15.5, 20 + APART / 2]])
-    np.testing.assert_allclose(found.height(sides), [100 + step, 100], atol=0.2)
+    np.testing.assert_allclose(height(sides), [100 + step, 100], atol=0.2)
