@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats
@@ -191,7 +191,7 @@ def profiles(grid: HeightGrid) -> Profiles:
 
 
 def _pieces(s: Floats, values: Floats, tolerance: float) -> Floats:
-    return cubic_pieces(s, values, CubicSpline(s, values)(s, 1), tolerance)
+    return cubic_pieces(s, values, scipy.interpolate.CubicSpline(s, values)(s, 1), tolerance)
 
 
 def profile_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
