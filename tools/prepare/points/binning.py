@@ -7,6 +7,7 @@ ground under it. A single point far above all around it is a spike.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,10 +60,23 @@ def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
     A point on the border of two cells belongs to the eastern or southern one. Rounding does not change that,
     so all grids of the same lattice give the same result.
     """
-    row = np.floor((grid.north - northing) / grid.cell + NUDGE)
-    col = np.floor((easting - grid.west) / grid.cell + NUDGE)
-    inside = (row >= 0) & (row < grid.height) & (col >= 0) & (col < grid.width)
-    return np.where(inside, row * grid.width + col, -1).astype(np.int64)
+    cells: Cells = _bins(
+        np.asarray(easting), np.asarray(northing), grid.west, grid.north, grid.cell, grid.height, grid.width
+    )
+    return cells
+
+
+@compiled()
+def _bins(
+    easting: Floats, northing: Floats, west: float, north: float, cell: float, rows: int, cols: int
+) -> Cells:
+    cells = np.full(easting.size, -1, np.int64)
+    for i in range(easting.size):
+        col = math.floor((easting[i] - west) / cell + NUDGE)
+        row = math.floor((north - northing[i]) / cell + NUDGE)
+        if 0 <= row < rows and 0 <= col < cols:
+            cells[i] = row * cols + col
+    return cells
 
 
 def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats, ...]:
@@ -127,15 +141,27 @@ def top_layer(
     - `highest`: highest point per cell, ``(H, W)``, m; NaN where there is none.
     - `depth_m`: points up to this much below the highest one belong to the top layer (m).
     """
-    inside = cells >= 0
-    cells = cells[inside]
-    below = height[inside] - highest.ravel()[cells]
-    cells, below = cells[below >= -depth_m], below[below >= -depth_m]
-    count = np.bincount(cells, minlength=highest.size)
+    count, below, squared = _sums(cells, height, highest.ravel(), depth_m)
     with np.errstate(invalid="ignore"):
-        mean, square = (np.bincount(cells, values, highest.size) / count for values in (below, below * below))
+        mean, square = below / count, squared / count
     spread = np.sqrt(np.maximum(square - mean**2, 0.0))
     return np.stack([highest + mean.reshape(shape), count.reshape(shape), spread.reshape(shape)])
+
+
+@compiled()
+def _sums(cells: Cells, height: Floats, highest: Floats, depth_m: float) -> tuple[Floats, Floats, Floats]:
+    """Return number, sum and sum of squares of the heights relative to the highest, per cell."""
+    count, below, squared = np.zeros_like(highest), np.zeros_like(highest), np.zeros_like(highest)
+    for i in range(cells.size):
+        c = cells[i]
+        if c < 0:
+            continue
+        z = height[i] - highest[c]
+        if z >= -depth_m:
+            count[c] += 1.0
+            below[c] += z
+            squared[c] += z * z
+    return count, below, squared
 
 
 def photo(points: Points, grid: Grid, fill_m: float) -> Orthophoto:
