@@ -35,10 +35,10 @@ def test_compare_with_literal_run_adds_column_and_factors():
     comparison = compare(replace(data, literal=literal))
     sections = {section.title: section for section in comparison.sections}
     table = sections["Table II: L2"].table.set_index("variant")
-    assert table.at["w/o DTM Height source", "L2 road (m), literal (2 tiles)"].startswith("9.344 [")
+    assert table.at["w/o DTM Support", "L2 road (m), literal (2 tiles)"].startswith("9.344 [")
     factors = sections["Table II: factors from the paper"].table.set_index("variant")
     # Two of the row's four figures are 16 times the paper's: the mean factor is 16 to the power of a half.
-    assert factors.loc["w/o DTM Height source"].tolist() == ["1.00", "4.00", "1.00", "4.00"]
+    assert factors.loc["w/o DTM Support"].tolist() == ["1.00", "4.00", "1.00", "4.00"]
     assert factors.at["all", "figures, literal"] == f"{4 ** (1 / 19):.2f}"
     assert "2 tiles" in sections["Table II: factors from the paper"].line
     assert comparison.numbers.data.str.endswith("; read literally").sum() == (3 + 19) * len(FIGURES)

@@ -68,7 +68,7 @@ def test_run_of_some_tiles_and_rerun_of_the_failed_one(run, survey):
 def test_run_into_a_folder_with_other_files_raises(run, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "mine.txt").write_text("")
-    with pytest.raises(flexroad.ConfigError, match=r"has other files, such as mine.txt"):
+    with pytest.raises(flexroad.ConfigError, match=r"has files that are not of a run, such as mine.txt"):
         run()
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexroad.catalog import CatalogError, Grid
+from flexroad.catalog import Grid
 from flexroad.tasks import TaskError
 from flexroad.tools.prepare.points.to_rasters import Options
 from flexroad.tools.synthetic import Kind, Scene, SceneOptions, block, make_scene
@@ -36,11 +36,7 @@ def test_block_is_near_square_and_on_the_absolute_grid():
     assert all(grid.shape == (250, 250) for _, grid in tiles)
 
 
-def test_block_cell_not_dividing_tile_raises():
-    (_, grid), *_ = block(1, size_m=40, cell=0.5)
-    assert grid.shape == (80, 80)
-    with pytest.raises(CatalogError, match="whole number"):
-        block(1, size_m=40, cell=0.3)
+def test_block_of_no_tiles_is_empty():
     assert block(0) == []
 
 

@@ -142,7 +142,7 @@ def test_link_restores_camera_and_layers(run, page):
         {"wait": SETTLED},
         {"drag": [400, 350, 460, 310]},
         {"press": "input[name=terrain]"},
-        {"press": "[data-key=height source]"},
+        {"press": "[data-key=support]"},
         {"wait": "() => location.hash.includes('hide=terrain')"},
         {"shot": MIDDLE},
         {"eval": "location.hash"},
@@ -158,7 +158,7 @@ def test_link_restores_camera_and_layers(run, page):
 def test_each_setting_changes_the_picture(run, page):
     switches = [
         "[data-key=class]",
-        "[data-key=height source]",
+        "[data-key=support]",
         "[data-key=estimate]",
         "[data-key=photo]",
         "input[name=wire]",
