@@ -84,7 +84,7 @@ def encode_tile(
             "cols": cols,
         },
         "corners": np.round(corners, 8).tolist(),
-        "height_source": _packed(height_source[thinned, thinned].tobytes()),
+        "support": _packed(height_source[thinned, thinned].tobytes()),
         "dsm": _heights(dsm, thinned),
         "dtm": _heights(dtm, thinned),
         "estimate": _estimate(estimate, thinned),
