@@ -26,13 +26,12 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tasks.roads.routes import Route
-from flexroad.tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats, HeightAt
 from flexroad.tools.export import opencrg, opendrive
 from flexroad.tools.export import reference_line as lines
 from flexroad.tools.export.georeference import LocalFrame
 from flexroad.tools.export.network import Network, network
 from flexroad.tools.export.profiles import (
-    HeightAt,
     HeightGrid,
     Profiles,
     across,

@@ -8,7 +8,6 @@ slope. What a road has beside that (crown, ruts, kerbs, bumps) is missed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +15,9 @@ import scipy
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats, HeightAt
 from flexroad.tools.export.reference_line import ReferenceLine
 
-HeightAt = Callable[[Floats, Floats], Floats]
-"""Heights (m) of the surface at x and y of the reference line's coordinates; NaN where it has none."""
 TOLERANCE_M = 0.0005
 """Largest distance of a profile from the straight lines that fit the cross-sections (m)."""
 

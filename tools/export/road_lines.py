@@ -23,7 +23,7 @@ from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.vectors import vector_date
 from flexroad.tasks.quality.height_source import HeightSource
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Floats, HeightAt
 from flexroad.tools.export import reference_line as lines
 from flexroad.tools.export.along_roads import (
     RouteUnit,
@@ -37,7 +37,6 @@ from flexroad.tools.export.along_roads import (
     write_units,
 )
 from flexroad.tools.export.network import network
-from flexroad.tools.export.profiles import HeightAt
 from flexroad.tools.export.reference_line import ReferenceLine
 from flexroad.tools.export.source import Options, Source
 from flexroad.tools.export.tile_outputs import (
