@@ -11,7 +11,9 @@ from hypothesis import settings
 
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.run.record import Run
 from tests import changed, command_line, gpu
+from tests.builders import copy_run, finish_run
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts background jobs with Ctrl-C ignored, and the processes of the tests would inherit that.
@@ -107,6 +109,18 @@ def made_survey(tmp_path_factory) -> Path:
 def survey(made_survey, tmp_path) -> Path:
     """The catalog of a copy of the survey, for tests to change."""
     return shutil.copytree(made_survey, tmp_path / "survey") / "catalog.parquet"
+
+
+@pytest.fixture(scope="session")
+def light_run(made_survey, tmp_path_factory) -> Run:
+    """A finished run of the four tiles with a light configuration; tests only read it."""
+    return finish_run(tmp_path_factory.mktemp("light") / "run", made_survey)
+
+
+@pytest.fixture
+def own_run(light_run, made_survey, tmp_path) -> Run:
+    """A copy of the finished run with a survey of its own, for tests to change."""
+    return copy_run(light_run, made_survey, tmp_path)
 
 
 @pytest.fixture

@@ -7,13 +7,6 @@ import pandas as pd
 
 from flexroad.pipeline.store.tables import read_metrics
 
-LIGHT = {
-    "extends": "defaults",
-    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
-    "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
-}
-"""A configuration that takes a fraction of a second for a tile of 60 m."""
-
 
 def rows(out: Path) -> pd.DataFrame:
     return read_metrics(out).drop(columns="seconds")

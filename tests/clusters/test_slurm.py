@@ -16,9 +16,10 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, clusters
 from flexroad.pipeline.execute.clusters import open_cluster
 from flexroad.tools.synthetic.scenes import write_scenes
+from tests.builders import LIGHT
 from tests.dask_processes import until
 from tests.slurm_daemons import slurm_daemons
-from tests.whole_run import LIGHT, assert_whole, item_times
+from tests.whole_run import assert_whole, item_times
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 

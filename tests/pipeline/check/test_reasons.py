@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from flexroad.catalog import Catalog
-from tests.whole_run import LIGHT
+from tests.builders import LIGHT
 
 
 @pytest.fixture

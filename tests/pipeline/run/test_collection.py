@@ -16,7 +16,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.collection import write_collection
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from tests.whole_run import LIGHT
+from tests.builders import LIGHT
 
 RASTERS = ("height", "road", "height_source")
 

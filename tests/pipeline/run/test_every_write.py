@@ -17,8 +17,9 @@ import yaml
 from flexroad.pipeline.run.lock import Owner
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests import command_line
+from tests.builders import LIGHT
 from tests.faulty_files import FAULTS, Faulty, Operation, intercepted
-from tests.whole_run import LIGHT, assert_whole, item_times, temporary_files
+from tests.whole_run import assert_whole, item_times, temporary_files
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 

@@ -32,9 +32,10 @@ from flexroad.pipeline.run.events import EventLog
 from flexroad.pipeline.run.lock import Owner, run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from tests.builders import LIGHT
 from tests.dask_processes import wait_for
 from tests.permissions import permissions_enforced
-from tests.whole_run import LIGHT, assert_whole, rows, times
+from tests.whole_run import assert_whole, rows, times
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 

@@ -12,7 +12,7 @@ from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tools.report.content import gather
 from flexroad.tools.report.pictures import tile_pictures
-from tests.whole_run import LIGHT
+from tests.builders import LIGHT
 
 
 @pytest.fixture

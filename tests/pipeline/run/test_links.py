@@ -11,7 +11,7 @@ from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from tests.whole_run import LIGHT
+from tests.builders import LIGHT
 
 SERIAL = ("--executor", "serial")
 

@@ -15,7 +15,8 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.store.tables import read_metrics
-from tests.whole_run import LIGHT, assert_whole
+from tests.builders import LIGHT
+from tests.whole_run import assert_whole
 
 GONE = "its results are missing: "
 

@@ -14,7 +14,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.collection import write_mosaics
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from tests.whole_run import LIGHT
+from tests.builders import LIGHT
 
 
 @pytest.fixture(scope="module")

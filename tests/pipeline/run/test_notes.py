@@ -13,7 +13,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.products import TileProducts
-from tests.whole_run import LIGHT
+from tests.builders import LIGHT
 
 CLEANED = "dsm: 2 cells outside -500..9000 m taken as nodata"
 """The note of `load` on the survey."""

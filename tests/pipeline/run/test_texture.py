@@ -18,7 +18,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.worker.exports import NO_PHOTO
-from tests.whole_run import LIGHT
+from tests.builders import LIGHT
 
 CELL = 0.5
 TEXTURED = compose({**LIGHT, "export": {"texture": True}}, "light")

@@ -14,8 +14,9 @@ from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from tests.builders import LIGHT
 from tests.dask_processes import wait_for
-from tests.whole_run import LIGHT, assert_whole
+from tests.whole_run import assert_whole
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 

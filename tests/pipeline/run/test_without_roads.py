@@ -22,8 +22,8 @@ from flexroad.tasks.products import npz
 from flexroad.tasks.quality.assess import NO_ROAD
 from flexroad.tools.report.content import WITH_ROADS, gather
 from flexroad.tools.report.steps import edge_steps
+from tests.builders import LIGHT
 from tests.conftest import QUICK
-from tests.whole_run import LIGHT
 
 BARE = (0, 3)
 """Numbers of the tiles without roads: opposite corners of the survey, each beside two tiles with roads."""

@@ -27,8 +27,8 @@ from flexroad.tools.export.source import Options, aerial_of, select
 from flexroad.tools.export.tiles3d import placed
 from flexroad.tools.export.tileset import Node, blocks
 from flexroad.tools.synthetic.scenes import write_scenes
+from tests.builders import LIGHT
 from tests.validators.gltf import gltf_issues
-from tests.whole_run import LIGHT
 
 OFFSET_M = 47.5
 OPTIONS = Options(Datum("offset", str(OFFSET_M)))

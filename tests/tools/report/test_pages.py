@@ -12,7 +12,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tools.report.content import gather
 from flexroad.tools.report.pages import markdown, markdown_page, template
-from tests.whole_run import LIGHT
+from tests.builders import LIGHT
 
 EVIL = "\x1b[2J<img src=x>`a` *b* _c_ [d](e) f|g ~h~ &amp; \nx"
 

@@ -1,0 +1,96 @@
+"""Small objects of the program for tests: grids, tiles, masks, clusters, surfaces and finished runs."""
+
+import shutil
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from flexroad.catalog import Catalog, Grid
+from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.config.loading import compose
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
+from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+
+CRS = "EPSG:25832"
+WEST, NORTH = 295500.0, 5629500.0
+
+LIGHT = {
+    "extends": "defaults",
+    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
+    "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
+}
+"""A configuration that takes a fraction of a second for a tile of 60 m."""
+
+
+def make_grid(
+    width: int = 60,
+    height: int = 50,
+    cell: float = 1.0,
+    west: float = WEST,
+    north: float = NORTH,
+    crs: str = CRS,
+) -> Grid:
+    return Grid(crs, west, north, cell, width, height)
+
+
+def grid_of(values: np.ndarray, cell: float = 1.0) -> Grid:
+    """Return a grid that has the shape of an array."""
+    return make_grid(values.shape[1], values.shape[0], cell)
+
+
+def make_tile(dsm: np.ndarray, dtm: np.ndarray | None = None, cell: float = 1.0, **layers: Any) -> TileData:
+    """Return the data of a tile; without a DTM the DSM is both."""
+    grid = layers.pop("grid", None) or grid_of(dsm, cell)
+    return TileData("made", grid, grid, dsm.copy(), (dsm if dtm is None else dtm).copy(), **layers)
+
+
+def make_mask(road: np.ndarray, cell: float = 1.0, outside: np.ndarray | None = None) -> RoadMask:
+    grid = grid_of(road, cell)
+    return RoadMask(grid, grid, road, np.zeros(road.shape, bool) if outside is None else outside)
+
+
+def make_clusters(road: np.ndarray, cell: float = 1.0, **cells: Any) -> RoadClusters:
+    """Return the road as one cluster."""
+    return RoadClusters(grid_of(road, cell), road.astype(np.int32), **cells)
+
+
+def make_surface(
+    shape: tuple[int, int] = (12, 14),
+    degree: tuple[int, int] = (3, 3),
+    knots: Literal["clamped", "uniform"] = "clamped",
+    weights: bool = True,
+    seed: int = 0,
+    bounds: tuple[float, float, float, float] = (295500.5, 5629250.5, 295749.5, 5629499.5),
+    relief_m: float = 2.0,
+) -> NurbsSurface:
+    """Return a NURBS surface with random heights and weights. ``shape`` counts rows and columns."""
+    rng = np.random.default_rng(seed)
+    rows, columns = shape
+    w = np.exp(rng.uniform(-1, 1, shape)) if weights else np.ones(shape)
+    along_u, along_v = (
+        clamped_knots(n, p) if knots == "clamped" else uniform_knots(0, n - p, p)
+        for n, p in ((columns, degree[0]), (rows, degree[1]))
+    )
+    heights = rng.normal(0, relief_m, shape)
+    return NurbsSurface(CRS, bounds, degree, along_u, along_v, w * heights, w, 150.25, (WEST, 5629250.0))
+
+
+def finish_run(folder: Path, survey: Path, config: Config | None = None, tiles: int = 4) -> Run:
+    """Run the first tiles of a survey in this process, with ``LIGHT`` unless a configuration is given."""
+    catalog = Catalog(Catalog.read(survey / "catalog.parquet").tiles[:tiles])
+    run = Run.create(folder, config or compose(LIGHT, "light"), catalog)
+    run_tiles(run, SerialExecutor())
+    return run
+
+
+def copy_run(made: Run, survey: Path, folder: Path) -> Run:
+    """Return a copy of a finished run with a survey of its own, both in a folder."""
+    own = shutil.copytree(survey, folder / "survey")
+    shutil.copytree(made.path, folder / "run")
+    ids = {tile.id for tile in made.catalog.tiles}
+    tiles = [tile for tile in Catalog.read(own / "catalog.parquet").tiles if tile.id in ids]
+    return Run.create(folder / "run", made.config, Catalog(tuple(tiles)))
