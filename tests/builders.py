@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 
 from flexroad.catalog import Catalog, Grid
-from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.config.loading import compose
+from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
