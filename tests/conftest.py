@@ -13,7 +13,7 @@ from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.run.record import Run
 from tests import changed, command_line, gpu
-from tests.builders import copy_run, finish_run
+from tests.builders import LIGHT, copy_run, finish_run
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts background jobs with Ctrl-C ignored, and the processes of the tests would inherit that.
@@ -127,6 +127,14 @@ def own_run(light_run, made_survey, tmp_path) -> Run:
 def quick_config(tmp_path) -> Path:
     path = tmp_path / "quick.yaml"
     path.write_text(yaml.safe_dump(QUICK, sort_keys=False))
+    return path
+
+
+@pytest.fixture(scope="session")
+def light_config(tmp_path_factory) -> Path:
+    """The file of ``LIGHT``."""
+    path = tmp_path_factory.mktemp("config") / "light.yaml"
+    path.write_text(yaml.safe_dump(LIGHT, sort_keys=False))
     return path
 
 

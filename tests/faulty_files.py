@@ -32,10 +32,6 @@ class Operation:
     """Where data are written, or the new size of a truncated file (bytes)."""
     data: bytes = b""
 
-    @property
-    def is_temporary(self) -> bool:
-        return self.path.suffix == ".tmp" or ".probe-" in self.path.name
-
 
 Observer = Callable[[Operation], None]
 

@@ -37,10 +37,14 @@ def item_times(out: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in out.glob("tiles/*/item.json")}
 
 
+def assert_equal(out: Path, other: Path) -> None:
+    pd.testing.assert_frame_equal(rows(out), rows(other), check_exact=True)
+    assert products(out) == products(other)
+
+
 def assert_whole(out: Path, undisturbed: Path, killed: int = 0) -> None:
     """The run equals the undisturbed one, without a lock; a killed worker may leave one temporary file."""
-    pd.testing.assert_frame_equal(rows(out), rows(undisturbed), check_exact=True)
-    assert products(out) == products(undisturbed)
+    assert_equal(out, undisturbed)
     assert json.loads((out / "summary.json").read_text())["exit_code"] == 0
     assert len(temporary_files(out)) <= killed
     assert not (out / "lock.json").exists()

@@ -11,6 +11,7 @@ from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
+from flexroad.tools.synthetic.scenes import write_scenes
 
 VARIANTS = 21
 NODES = {
@@ -34,37 +35,39 @@ def test_ablation_graph_has_expected_node_counts(survey):
     assert Counter(node.stage for node in graph.nodes.values()) == NODES
 
 
+def variants(name, tile):
+    """Return the nodes of each variant by stage."""
+    return Pattern.of(load_config(name)).graph(tile).variants
+
+
 def test_main_variants_equal_those_of_paper_configuration(survey):
     tile = Catalog.read(survey).tiles[0]
-    ours, paper = (Pattern.of(load_config(name)).graph(tile).variants for name in ("ablation", "paper"))
+    ours, paper = (variants(name, tile) for name in ("ablation", "paper"))
     for variant in ("plane", "rgt", "flexroad"):
         del ours[variant]["evaluate"], paper[variant]["evaluate"]
         assert ours[variant] == paper[variant]
 
 
-@pytest.mark.parametrize("name", ["ablation_true", "ablation_dsm"])
-def test_other_truth_changes_only_evaluation(survey, name):
-    tile = Catalog.read(survey).tiles[0]
-    ours, true = (Pattern.of(load_config(config)).graph(tile).variants for config in ("ablation", name))
-    assert ours.keys() == true.keys()
-    for variant, nodes in ours.items():
-        assert {stage for stage in nodes if nodes[stage] != true[variant][stage]} == {"evaluate"}
+NURBS = {"fit", "sample", "evaluate", "assess"}
 
 
-def test_literal_changes_only_the_nurbs_and_what_follows(survey):
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("ablation_true", {"evaluate"}), ("ablation_dsm", {"evaluate"}), ("literal", NURBS)],
+)
+def test_other_configuration_changes_only_its_stages(survey, name, expected):
+    """Another truth changes the evaluation; `literal` the NURBS and what follows."""
     tile = Catalog.read(survey).tiles[0]
-    ours, literal = (Pattern.of(load_config(name)).graph(tile).variants for name in ("ablation", "literal"))
-    assert ours.keys() == literal.keys()
+    ours, other = (variants(config, tile) for config in ("ablation", name))
+    assert ours.keys() == other.keys()
     for variant, nodes in ours.items():
-        changed = {stage for stage in nodes if nodes[stage] != literal[variant][stage]}
-        same = variant in ("plane", "rgt", "wo_nurbs")
-        assert changed == (set() if same else {"fit", "sample", "evaluate", "assess"}), variant
+        changed = {stage for stage in nodes if nodes[stage] != other[variant][stage]}
+        without_nurbs = name == "literal" and variant in ("plane", "rgt", "wo_nurbs")
+        assert changed == (set() if without_nurbs else expected), variant
 
 
 @pytest.fixture(scope="module")
 def one_tile(tmp_path_factory):
-    from flexroad.tools.synthetic.scenes import write_scenes
-
     return Catalog.read(write_scenes(tmp_path_factory.mktemp("one"), 1, seed=5, size_m=80))
 
 

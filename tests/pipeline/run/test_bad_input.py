@@ -1,12 +1,9 @@
-"""Invalid input, disks and arguments: each gives one clear line, and fails no more than its tile."""
+"""Invalid input and arguments: each gives one clear line, and fails no more than its tile."""
 
-import io
 import json
 import os
 import re
-import shutil
-import subprocess
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,76 +13,43 @@ import rasterio
 from affine import Affine
 from rasterio.warp import transform_bounds
 
+import flexroad as library
 from flexroad.catalog import Catalog, Grid, Tile
-from flexroad.pipeline.config.loading import compose
-from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tools.synthetic import prepared
-from tests.command_line import PROCESS, Said, error_lines
-from tests.conftest import QUICK
+from flexroad.tools.synthetic.scenes import write_scenes
+from tests import command_line
 from tests.make_rasters import write
 
-
-@pytest.fixture
-def run(flexroad, survey, quick_config, tmp_path):
-    """Run the survey, by default with the quick configuration into ``tmp_path/run``."""
-
-    def call(*arguments, config=quick_config, catalog=survey, out=tmp_path / "run") -> Said:
-        return flexroad(
-            "run", "--config", config, "--catalog", catalog, "--out", out, "--executor", "serial", *arguments
-        )
-
-    return call
+SERIAL = ("--executor", "serial")
 
 
 def layer(tile: Tile, name: str) -> Path:
-    """Return the first file of a layer."""
-    files = tile.layer(name)
-    assert files is not None
-    return tile.paths(files)[0]
+    return Path(tile.root) / name / f"{tile.id}.tif"
 
 
-def values(path: Path) -> np.ndarray:
-    with rasterio.open(path) as raster:
+def values(tile: Tile, name: str) -> np.ndarray:
+    with rasterio.open(layer(tile, name)) as raster:
         return raster.read(1)
 
 
 def rewrite(tile: Tile, name: str, array, **options) -> None:
-    path = layer(tile, name)
-    path.unlink()
+    layer(tile, name).unlink()
     options = {"west": tile.grid.west, "north": tile.grid.north, "crs": tile.grid.crs} | options
-    write(path, array, options.pop("west"), options.pop("north"), **options)
+    write(layer(tile, name), array, options.pop("west"), options.pop("north"), **options)
 
 
-# --- one tile's input ---------------------------------------------------------------------------------
-
-
-def _absent(tile: Tile) -> None:
-    layer(tile, "dsm").unlink()
-
-
-def _zero_bytes(tile: Tile) -> None:
-    layer(tile, "dtm").write_bytes(b"")
-
-
-def _truncated(tile: Tile) -> None:
+def truncated(tile):
     path = layer(tile, "dsm")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def _a_folder(tile: Tile) -> None:
-    layer(tile, "dsm").unlink()
-    layer(tile, "dsm").mkdir()
-
-
-def _a_pipe(tile: Tile) -> None:
+def a_pipe(tile):
     layer(tile, "dsm").unlink()
     os.mkfifo(layer(tile, "dsm"))
 
 
-def _a_vrt_of_the_web(tile: Tile) -> None:
+def a_vrt_of_the_web(tile):
     layer(tile, "dtm").write_text(
         '<VRTDataset rasterXSize="60" rasterYSize="60"><VRTRasterBand dataType="Float32" band="1">'
         "<SimpleSource><SourceFilename>/vsicurl/http://127.0.0.1:9/a.tif</SourceFilename></SimpleSource>"
@@ -93,650 +57,246 @@ def _a_vrt_of_the_web(tile: Tile) -> None:
     )
 
 
-def _a_text(tile: Tile) -> None:
-    layer(tile, "road_mask").write_text("<html>404 Not Found</html>")
-
-
-def _elsewhere(tile: Tile) -> None:
-    rewrite(tile, "dsm", values(layer(tile, "dsm")), west=tile.grid.west + 10_000)
-
-
-def _other_crs(tile: Tile) -> None:
+def other_crs(tile):
     west, _, _, north = transform_bounds(tile.grid.crs, "EPSG:25833", *tile.grid.bounds)
-    rewrite(tile, "dtm", values(layer(tile, "dtm")), west=west, north=north, crs="EPSG:25833")
+    rewrite(tile, "dtm", values(tile, "dtm"), west=west, north=north, crs="EPSG:25833")
 
 
-def _in_feet(tile: Tile) -> None:
-    rewrite(tile, "dtm", values(layer(tile, "dtm")) / 0.3048, unit="ft")
-
-
-def _in_fathoms(tile: Tile) -> None:
-    rewrite(tile, "dsm", values(layer(tile, "dsm")), unit="fathom")
-
-
-def _void(tile: Tile) -> None:
-    rewrite(tile, "dsm", np.full(tile.grid.shape, np.nan, np.float32), nodata=np.nan)
-
-
-def _thin(tile: Tile) -> None:
-    heights = values(layer(tile, "dsm"))
+def thin(tile):
+    heights = values(tile, "dsm")
     heights[6:] = np.nan
     rewrite(tile, "dsm", heights, nodata=np.nan)
 
 
-def _absurd(tile: Tile) -> None:
+def absurd(tile):
     heights = np.full(tile.grid.shape, 1e30, np.float32)
     heights[::2], heights[:, ::3], heights[5] = -1e30, np.inf, -np.inf
     rewrite(tile, "dsm", heights)
 
 
-def _bare_mask(tile: Tile) -> None:
+def bare_mask(tile):
     rewrite(tile, "road_mask", np.ones((30, 30), np.uint8), crs=None, transform=Affine.identity())
 
 
-def _rotated(tile: Tile) -> None:
-    turned = Affine.translation(tile.grid.west, tile.grid.north) @ Affine.rotation(30) @ Affine.scale(1, -1)
-    rewrite(tile, "dsm", values(layer(tile, "dsm")), transform=turned)
+def not_listed(tile):
+    return replace(tile, layers=tuple(layer for layer in tile.layers if layer.name != "dtm"))
 
 
-@dataclass(frozen=True)
-class Fault:
-    damage: object
-    name: str
-    """The layer whose file is at fault."""
-    message: str
-    stage: str = "load"
-    kind: str = "TaskError"
-
-
-FAULTS = (
-    Fault(_absent, "dsm", "is missing; restore it or build the catalog again"),
-    Fault(_zero_bytes, "dtm", "cannot be read: .*; fetch it again"),
-    Fault(_truncated, "dsm", "cannot be read: .*; fetch it again"),
-    Fault(_a_folder, "dsm", "is not a regular file; replace it by one"),
-    Fault(_a_pipe, "dsm", "is not a regular file; replace it by one"),
-    Fault(_a_vrt_of_the_web, "dtm", "is a VRT, which only names other files"),
-    Fault(_a_text, "road_mask", "cannot be read: .*; fetch it again"),
-    Fault(_elsewhere, "dsm", "does not reach the tile now: it lies at .*; build the catalog again"),
-    Fault(_other_crs, "dtm", "is in EPSG:25833, the tile in EPSG:25832; .*gdalwarp -t_srs EPSG:25832"),
-    Fault(_in_feet, "dtm", "has heights in metre, dtm .* in ft; convert one, or correct its unit"),
-    Fault(_in_fathoms, "dsm", "has the unit 'fathom', which is not a supported unit of height; convert it"),
-    Fault(_void, "dsm", "has only nodata on this tile; leave the tile out"),
-    Fault(_thin, "dsm", r"has 10.0% valid cells on this tile, below 25%; lower load.min_valid"),
-    Fault(_absurd, "dsm", "has only nodata on this tile; leave the tile out"),
-    Fault(_bare_mask, "road_mask", "no georeference and has 30 x 30 cells, the tile 60 x 60; give it"),
-    Fault(_rotated, "dsm", "is rotated; turn it north up with gdalwarp"),
-)
-
-
-OTHERWISE = {
-    _absent: "missing: FILE (1 tile); restore it or build the catalog again",
-    _a_folder: "not a regular file: FILE (1 tile); replace it by one",
-    _a_pipe: "not a regular file: FILE (1 tile); replace it by one",
-    _other_crs: "1 of 4 tiles would fail: dtm is in EPSG:25833, not EPSG:25832; reproject it, or make the "
-    "catalog with --reproject: TILE",
-    _thin: "1 of 4 tiles would fail: a DSM height in less than 25% of the cells (load.min_valid): TILE",
+FAULTS = {
+    "absent": (lambda tile: layer(tile, "dsm").unlink(), "dsm", "is missing; restore it"),
+    "truncated": (truncated, "dsm", "cannot be read: .*; fetch it again"),
+    "a pipe": (a_pipe, "dsm", "is not a regular file"),
+    "a VRT of the web": (a_vrt_of_the_web, "dtm", "is a VRT, which only names other files"),
+    "another CRS": (other_crs, "dtm", "is in EPSG:25833, the tile in EPSG:25832"),
+    "in feet": (
+        lambda tile: rewrite(tile, "dtm", values(tile, "dtm") / 0.3048, unit="ft"),
+        "dtm",
+        "has heights in metre, dtm .* in ft; convert one, or correct its unit",
+    ),
+    "thin": (thin, "dsm", "has 10.0% valid cells on this tile"),
+    "absurd": (absurd, "dsm", "has only nodata on this tile"),
+    "bare mask": (bare_mask, "road_mask", "no georeference and has 30 x 30 cells"),
+    "not listed": (not_listed, "", "the tile has no dtm"),
 }
-"""What `catalog check` says where it does not say what the run does."""
+"""Function that damages a tile, the layer whose file is at fault, and a part of the message.
+
+Other faults of a raster are in `tests/tasks/io/test_mosaic.py`.
+"""
+COMMON = {"absent", "a pipe", "another CRS", "thin", "not listed"}
+"""Faults that `catalog check` counts, in words of its own."""
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.damage.__name__.lstrip("_"))
-def test_load_broken_file_fails_only_its_tile_and_is_named_by_the_check(
-    fault, run, flexroad, survey, quick_config, tmp_path
-):
-    tile = Catalog.read(survey).tiles[1]
-    fault.damage(tile)
-    file = str(layer(tile, fault.name))
-    check = flexroad("catalog", "check", survey, "--config", quick_config).expected(1)
-    (line,) = (line for line in check.out.splitlines() if line.startswith("warning: "))
-    if expected := OTHERWISE.get(fault.damage):
-        assert line == "warning: " + expected.replace("FILE", file).replace("TILE", tile.id)
-    else:
-        assert re.search(f"^warning: {tile.id} would fail: .*{fault.message}", line)
-        assert f"{fault.name}/{tile.id}.tif" in line
-    assert_only_tile_failed(run(), tile, fault, flexroad, tmp_path / "run", file)
-
-
-def assert_only_tile_failed(result: Said, tile: Tile, fault: Fault, flexroad, out: Path, file: str) -> None:
-    assert result.code == 1
-    (line,) = result.errors
-    assert line.startswith(f"failed {tile.id}: {fault.stage}: {fault.kind}: ")
-    assert re.search(fault.message, line)
-    assert line.endswith(f"  [{file}]" if file else line[-1])
-    assert "3 done (0 cached), 1 failed, 0 pending" in result.out
-
-    rows = read_metrics(out)
-    bad = rows[rows.tile_id == tile.id]
-    assert list(bad.status) == ["failed"] * 3
-    assert set(rows[rows.tile_id != tile.id].status) == {"done"}
-    assert bad.error.str.contains(fault.message).all()
-    assert bad.triangles.isna().all()
-    (row,) = pd.read_csv(out / "failures.csv", keep_default_na=False).to_dict("records")
-    assert (row["tile_id"], row["stage"], row["kind"], row["file"]) == (
-        tile.id, fault.stage, fault.kind, file,
-    )  # fmt: skip
-    status = json.loads(flexroad("status", out, "--json").out)
-    assert (status["done"], status["failed"]) == (3, 1)
-    assert [failure["message"] for failure in status["failures"]] == [row["message"]]
-    text = flexroad("status", out)
-    assert text.code == 0
-    assert line.removeprefix("failed ") in text.out
-
-
-@pytest.mark.parametrize("name", ["dsm", "road_mask"])
-def test_truncated_file_fails_only_its_tile_of_several_that_list_it(name, run, flexroad, survey, tmp_path):
-    """A catalog of rasters lists the neighbouring files for each tile, for use with a halo."""
-    catalog = survey.parent / "cut.json"
-    arguments = ["--road-mask", "road_mask/*.tif", "--tile-size", 60, "-o", catalog]
-    flexroad("catalog", "rasters", survey.parent, "--dsm", "dsm/*.tif", "--dtm", "dtm/*.tif", *arguments)
-    first = Catalog.read(catalog).tiles[0]
-    assert len(first.layer(name).files) == 4
-    path = survey.parent / name / f"{first.id}.tif"
-    path.write_bytes(path.read_bytes()[:300])
-    fault = Fault(None, name, f"{name} {name}/{first.id}.tif cannot be read: .*; fetch it again")
-    assert_only_tile_failed(run(catalog=catalog), first, fault, flexroad, tmp_path / "run", str(path))
-    halo = tmp_path / "halo.yaml"
-    halo.write_text("extends: defaults\nload: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
-    result = run(catalog=catalog, config=halo)
-    assert [line.split(":")[0] for line in result.errors] == [f"failed {first.id}"]
-    other = Catalog.read(catalog).tiles[3].id
-    item = json.loads((tmp_path / "run" / "tiles" / other / "item.json").read_text())
-    (note,) = item["properties"]["flexroad:notes"]
-    line = f"a file that the tile does not need was left out: {name} {name}/{first.id}.tif cannot be read"
-    assert note.startswith(line)
-
-
-@pytest.mark.parametrize(
-    ("name", "stage", "message"),
-    [
-        ("dsm", "load", "the tile has no dsm; give its files to `flexroad catalog` with --dsm"),
-        ("dtm", "load", "the tile has no dtm; give its files to `flexroad catalog` with --dtm"),
-    ],
-)
-def test_tile_without_layer_fails_alone(name, stage, message, run, flexroad, survey, tmp_path):
-    tiles = list(Catalog.read(survey).tiles)
-    tiles[1] = replace(tiles[1], layers=tuple(layer for layer in tiles[1].layers if layer.name != name))
-    Catalog(tuple(tiles)).write(survey)
-    fault = Fault(None, name, message, stage)
-    assert_only_tile_failed(run(), tiles[1], fault, flexroad, tmp_path / "run", "")
-
-
-# --- unusual but valid input --------------------------------------------------------------------------
-
-
-def _flat(tile: Tile) -> None:
-    rewrite(tile, "dsm", np.full(tile.grid.shape, 100, np.float32))
-
-
-def _above(tile: Tile) -> None:
-    rewrite(tile, "dsm", values(layer(tile, "dtm")) + np.float32(47))
-
-
-def _all_road(tile: Tile) -> None:
-    rewrite(tile, "road_mask", np.ones(tile.grid.shape, np.uint8))
-
-
-def _one_cell(tile: Tile) -> None:
+def one_cell(tile):
     mask = np.zeros(tile.grid.shape, np.uint8)
     mask[30, 30] = 1
     rewrite(tile, "road_mask", mask)
 
 
-def _small_mask(tile: Tile) -> None:
-    rewrite(tile, "road_mask", np.ones((30, 20), np.uint8))
-
-
-def _coarse_mask(tile: Tile) -> None:
-    rewrite(tile, "road_mask", np.ones((6, 6), np.uint8), cell=10)
-
-
-def _specks(tile: Tile) -> None:
-    heights = values(layer(tile, "dsm"))
+def specks(tile):
+    heights = values(tile, "dsm")
     heights[:3, :4] = [1e30, -1e30, np.inf, -np.inf]
     heights[5, 5] = np.nan
     rewrite(tile, "dsm", heights)
 
 
-@pytest.mark.parametrize(
-    ("damage", "note"),
-    [
-        (
-            _flat,
-            "the DSM is more than 1 m below the DTM in 100% of the cells and above it in 0%: are their files "
-            "swapped?",
-        ),
-        (_above, "the DSM lies 47.0 m above the DTM: ellipsoidal heights?"),
-        (_all_road, None),
-        (_one_cell, None),
-        (_small_mask, None),
-        (_coarse_mask, "road_mask resampled: its cells are 10 m, the tile's 1 m"),
-        (_specks, "dsm: 12 cells outside -500..9000 m taken as nodata"),
-    ],
+SWAPPED = (
+    "the DSM is more than 1 m below the DTM in 100% of the cells and above it in 0%: are their files swapped?"
 )
-def test_unusual_input_gives_finite_metrics(damage, note, run, survey, tmp_path):
-    tile = Catalog.read(survey).tiles[1]
-    damage(tile)
-    result = run("--tile", tile.id)
-    # The filter drops a road of one cell.
-    said = result.err.removeprefix("starting: 1 tile\n")
-    warning = {
-        _one_cell: "warning: no tile of this run has a road",
-        _above: "warning: the DSM lies 47.0 m above the DTM on 1 of 1 tile: ellipsoidal heights? ",
-    }.get(damage, "")
-    assert (result.code, said[: len(warning) or None]) == (0, warning)
-    rows = read_metrics(tmp_path / "run")
-    assert set(rows.status) == {"done"}
-    flexroad = rows[rows.variant == "flexroad"].iloc[0]
-    assert flexroad.l2_terrain_m < 1
-    assert flexroad.triangles > 50
-    item = json.loads((tmp_path / "run" / "tiles" / tile.id / "item.json").read_text())
-    assert item["properties"]["flexroad:notes"] == ([note] if note else [])
+UNUSUAL = {
+    "flat": (lambda tile: rewrite(tile, "dsm", np.full(tile.grid.shape, 100, np.float32)), SWAPPED),
+    "all road": (lambda tile: rewrite(tile, "road_mask", np.ones(tile.grid.shape, np.uint8)), None),
+    "one cell": (one_cell, None),
+    "small mask": (lambda tile: rewrite(tile, "road_mask", np.ones((30, 20), np.uint8)), None),
+    "coarse mask": (
+        lambda tile: rewrite(tile, "road_mask", np.ones((6, 6), np.uint8), cell=10),
+        "road_mask resampled: its cells are 10 m, the tile's 1 m",
+    ),
+    "specks": (specks, "dsm: 12 cells outside -500..9000 m taken as nodata"),
+}
+"""Valid input, and the note of the tile."""
+ODD_IDS = ("Köln 1/2", "../../escape", "...", "ü/" * 33)
 
 
-@pytest.mark.parametrize("cell", [0.5, 2.0])
-def test_other_cell_size_gives_correct_heights(cell, run, flexroad, tmp_path):
-    grid = Grid("EPSG:25832", 500_000, 5_600_040, cell, int(40 / cell), int(40 / cell))
-    catalog = tilted_ground(tmp_path / "folder", "a", grid)
-    result = run(catalog=catalog)
-    assert (result.code, result.errors) == (0, [])
-    rows = read_metrics(tmp_path / "run").set_index("variant")
-    assert rows.triangles["rgt"] == 2 * np.ceil(40 - cell) ** 2
-    assert (rows.l2_road_m < 0.05).all()
-    assert (rows.completeness > 0.99).all()
-    points = tmp_path / "points.csv"
-    points.write_text("easting,northing\n500020,5600020\n500010,5600030\n")
-    answer = flexroad("query", tmp_path / "run", "--points", points).out.splitlines()
-    for line in answer[1:]:
-        easting, northing, height, *_ = map(float, line.split(",")[:3])
-        assert height == pytest.approx(plane(easting, northing), abs=0.1)
+@pytest.fixture(scope="module")
+def damaged(light_config, tmp_path_factory):
+    """A run of tiles with one oddity each: the tiles by its name, the folder, and what the run said."""
+    folder = tmp_path_factory.mktemp("damaged")
+    causes = FAULTS | UNUSUAL
+    made = Catalog.read(write_scenes(folder / "survey", len(causes) + len(ODD_IDS), seed=3, size_m=60)).tiles
+    tiles = {cause: causes[cause][0](tile) or tile for cause, tile in zip(causes, made, strict=False)}
+    tiles |= {odd: replace(tile, id=odd) for odd, tile in zip(ODD_IDS, made[len(causes) :], strict=True)}
+    catalog = folder / "survey" / "catalog.parquet"
+    Catalog(tuple(tiles.values())).write(catalog)
+    before = set(folder.rglob("*"))
+    words = ("--catalog", catalog, "--config", light_config, "--out", folder / "run", *SERIAL)
+    said = command_line.call("run", *words).expected(1)
+    new = [path for path in set(folder.rglob("*")) - before if path != folder / "run"]
+    assert all(path.is_relative_to(folder / "run") for path in new)
+    return tiles, folder / "run", said
+
+
+def test_run_of_damaged_files_fails_their_tiles_alone(damaged, flexroad):
+    tiles, out, said = damaged
+    counts = f"{len(tiles) - len(FAULTS)} done (0 cached, 1 without roads), {len(FAULTS)} failed, 0 pending"
+    assert counts in said.out
+    rows = read_metrics(out)
+    bad = rows.tile_id.isin([tiles[fault].id for fault in FAULTS])
+    assert set(rows[bad].status) == {"failed"}
+    assert rows[bad].triangles.isna().all()
+    assert set(rows[~bad].status) == {"done"}
+    failures = pd.read_csv(out / "failures.csv", keep_default_na=False)
+    status = json.loads(flexroad("status", out, "--json").out)
+    assert [failure["message"] for failure in status["failures"]] == list(failures.message)
+    shown = flexroad("status", out).expected(0).out
+    assert all(line.removeprefix("failed ") in shown for line in said.errors)
+
+
+@pytest.fixture(scope="module")
+def checked(damaged, light_config):
+    """The warnings of `catalog check` for the same tiles, which it names five at a time."""
+    warnings, causes = [], [*FAULTS]
+    path = damaged[1].parent / "survey" / "part.parquet"
+    for start in range(0, len(causes), 5):
+        Catalog(tuple(damaged[0][cause] for cause in causes[start : start + 5])).write(path)
+        said = command_line.call("catalog", "check", path, "--config", light_config).expected(1)
+        # Files of the other tiles are listed, too.
+        told = [line for line in said.out.splitlines() if line.startswith("warning: ")]
+        warnings += [line for line in told if "(0 tiles)" not in line]
+    return warnings
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_file_at_fault_is_named_by_run_and_check(fault, damaged, checked):
+    tiles, out, said = damaged
+    tile, (_, name, message) = tiles[fault], FAULTS[fault]
+    failures = pd.read_csv(out / "failures.csv", keep_default_na=False).set_index("tile_id")
+    row = failures.loc[tile.id]
+    file = str(layer(tile, name)) if name else ""
+    assert (row.stage, row.kind, row.file) == ("load", "TaskError", file)
+    assert re.search(message, row.message)
+    end = f"  [{file}]" if file else ""
+    assert f"failed {tile.id}: load: TaskError: {row.message}{end}" in said.errors
+    (warning,) = (line for line in checked if tile.id in line)
+    if fault not in COMMON:
+        assert warning == f"warning: {tile.id} would fail: {row.message}"
+
+
+@pytest.mark.parametrize("change", UNUSUAL)
+def test_unusual_input_gives_finite_metrics(change, damaged):
+    tiles, out, _ = damaged
+    tile, (_, note) = tiles[change], UNUSUAL[change]
+    rows = read_metrics(out).set_index(["tile_id", "variant"])
+    found = rows.loc[tile.id, "flexroad"]
+    assert found.l2_terrain_m < 1
+    assert found.triangles > 50
+    item = json.loads((out / "tiles" / tile.id / "item.json").read_text())
+    notes = item["properties"]["flexroad:notes"]
+    assert notes == ([note] if note else [])
+
+
+def test_tile_id_invalid_as_file_name_gets_safe_folder(damaged, flexroad):
+    tiles, out, _ = damaged
+    folders = list((out / "tiles").iterdir())
+    assert len(folders) == len(tiles)
+    for folder in folders:
+        assert all(path.is_file() for path in folder.iterdir())
+    for odd in ODD_IDS:
+        assert "nothing had changed" in flexroad("rerun", out, "--tile", odd, *SERIAL).out
 
 
 def plane(easting, northing):
     return 100 + 0.05 * (easting - 500_000) - 0.02 * (northing - 5_600_000)
 
 
-def tilted_ground(folder: Path, tile_id: str, grid: Grid) -> Path:
+def tilted_ground(folder: Path, grid: Grid) -> Path:
     """Write a tile of a plane; return its catalog."""
     heights = plane(grid.eastings[None, :], grid.northings[:, None])
     road = np.zeros(grid.shape, bool)
     road[grid.height // 4 : grid.height // 2 + 1] = True
-    tile = prepared.write_tile(folder, tile_id, grid, {"dsm": heights, "dtm": heights, "road_mask": road})
+    tile = prepared.write_tile(folder, "a", grid, {"dsm": heights, "dtm": heights, "road_mask": road})
     Catalog((tile,)).write(folder / "catalog.json")
     return folder / "catalog.json"
 
 
-def test_tile_of_2_by_2_cells_fails_only_nurbs(run, tmp_path):
-    catalog = tilted_ground(tmp_path / "tiny", "tiny", Grid("EPSG:25832", 500_000, 5_600_002, 1.0, 2, 2))
-    result = run(catalog=catalog, config="paper")
-    assert result.code == 1
-    (line,) = result.errors
-    assert line == (
-        "failed tiny: fit: TaskError: 2 x 2 cells are fewer than 35 x 35 control points; "
-        "lower fit.control_points or raise fit.spacing_m"
-    )
+@pytest.mark.parametrize("cell", [0.5, 2.0])
+def test_other_cell_size_gives_correct_heights(cell, flexroad, quick_config, tmp_path):
+    grid = Grid("EPSG:25832", 500_000, 5_600_040, cell, int(40 / cell), int(40 / cell))
+    words = ("--catalog", tilted_ground(tmp_path / "folder", grid), "--config", quick_config)
+    flexroad("run", *words, "--out", tmp_path / "run", *SERIAL).expected(0)
+    rows = read_metrics(tmp_path / "run").set_index("variant")
+    assert rows.triangles["rgt"] == 2 * np.ceil(40 - cell) ** 2
+    assert (rows.l2_road_m < 0.05).all()
+    assert (rows.completeness > 0.99).all()
+    x, y = np.array([500020.0, 500010.0]), np.array([5600020.0, 5600030.0])
+    np.testing.assert_allclose(library.open_run(tmp_path / "run").height(x, y), plane(x, y), atol=0.1)
+
+
+def test_tile_of_2_by_2_cells_fails_only_nurbs(flexroad, tmp_path):
+    catalog = tilted_ground(tmp_path / "tiny", Grid("EPSG:25832", 500_000, 5_600_002, 1.0, 2, 2))
+    words = ("run", "--catalog", catalog, *SERIAL, "--out")
+    said = flexroad(*words, tmp_path / "run", "--config", "paper").expected(1)
+    (line,) = said.errors
+    assert line.startswith("failed a: fit: TaskError: 2 x 2 cells are fewer than 35 x 35 control points; ")
     rows = read_metrics(tmp_path / "run").set_index("variant")
     assert dict(rows.status) == {"plane": "done", "rgt": "done", "flexroad": "failed"}
     config = tmp_path / "linear.yaml"
     config.write_text(
         "extends: defaults\nfit: {degree: 1, control_points: [2, 2]}\necsrc: {min_area_m2: 0}\n"
     )
-    assert run(catalog=catalog, config=config, out=tmp_path / "linear").code == 0
+    flexroad(*words, tmp_path / "linear", "--config", config).expected(0)
 
 
-@pytest.mark.parametrize("tile_id", ["Köln 1/2", "../../escape", "..."])
-def test_tile_id_invalid_as_file_name_gets_safe_folder(tile_id, run, flexroad, survey, tmp_path):
-    first, *_ = Catalog.read(survey).tiles
-    Catalog((replace(first, id=tile_id),)).write(survey)
-    before = {path for path in tmp_path.rglob("*") if "run" not in path.parts}
-    result = run()
-    assert (result.code, result.errors) == (0, [])
-    assert {path for path in tmp_path.rglob("*") if tmp_path / "run" not in (path, *path.parents)} == before
-    (folder,) = (tmp_path / "run" / "tiles").iterdir()
-    assert len(list(folder.iterdir())) == 7
-    assert all(path.is_file() for path in folder.iterdir())
-    assert list(read_metrics(tmp_path / "run").tile_id.unique()) == [tile_id]
-    again = flexroad("rerun", tmp_path / "run", "--tile", tile_id, "--executor", "serial")
-    assert "nothing had changed" in again.out
-
-
-def test_tile_given_twice_is_processed_once(run, survey, tmp_path):
-    tile = Catalog.read(survey).tiles[2].id
-    result = run("--tile", tile, tile, "--tile", tile)
-    assert result.code == 0
-    assert len(read_metrics(tmp_path / "run")) == 3
-
-
-# --- configurations -----------------------------------------------------------------------------------
-
-DEEP = "{a: " * 2000 + "1" + "}" * 2000
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("fit: {degre: 3}", "fit.degre: unknown key; did you mean degree?"),
-        ("fitt: {degree: 3}", "fitt: unknown key; did you mean fit?"),
-        ("variants: {a: {smple: uniform}}", "variants.a.smple: unknown key; did you mean sample?"),
-        ("fit: {degree: 35}", "fit.degree: input should be less than or equal"),
-        (
-            "fit: {method: nurbs, degree: 5, control_points: [5, 9]}",
-            "degree 5 needs more control points each way than 5 x 9",
-        ),
-        (
-            "fit: {method: nurbs, learning_rate: .inf}",
-            "fit.learning_rate: input should be a finite number, not inf",
-        ),
-        ("fit: bspline", "fit: there is no method 'bspline'"),
-        ("fit:\n\tdegree: 3", "not readable as YAML: .*line 2"),
-        ("- a", "expected a mapping of stages to options, but it is a list"),
-        ("variants: [a, b]", "variants: expected a mapping, not ['a', 'b']"),
-        ("load: 3", "load: expected a mapping of options, not 3"),
-        ("variants: {a/b: {}}", "variants.a/b: the name is part of file names; use letters, digits, - and _"),
-        ("export: {variants: []}", "export.variants: tuple should have at least 1 item"),
-        ("export: {variants: [b]}\nvariants: {a: {}}", "export.variants: no variant 'b', only a"),
-        ("extends: bad.yaml", "extends: the file extends itself"),
-        ("extends: [a]", "extends: expected a file or a shipped name, not ['a']"),
-        ("extends: papr", "did you mean paper?"),
-        (DEEP, "not readable as YAML"),
-    ],
-    ids=lambda value: value[:30],
-)
-def test_invalid_configuration_creates_no_run(text, message, run, tmp_path):
-    config = tmp_path / "bad.yaml"
-    config.write_text(text + "\n")
-    result = run(config=config)
-    assert result.code == 2
-    (line,) = result.errors
-    assert str(config) in line or "papr" in line
-    assert re.search(message if "*" in message else re.escape(message), line)
-    assert not (tmp_path / "run").exists()
-
-
-def test_empty_configuration_is_production(flexroad, tmp_path):
-    (tmp_path / "empty.yaml").write_text("")
-    result = flexroad("config", "show", tmp_path / "empty.yaml")
-    assert (result.code, result.errors) == (0, [])
-    assert result.out == flexroad("config", "show", "production").out
-    assert "method: smoothing_spline" in result.out
+# --- arguments ----------------------------------------------------------------------------------------
 
 
 def test_setting_without_a_name_is_shown_in_production(flexroad):
-    result = flexroad("config", "show", "--set", "fit.spacing_m=5").expected(0)
+    said = flexroad("config", "show", "--set", "fit.spacing_m=5").expected(0)
     production = flexroad("config", "show", "production").out
-    assert result.out == production.replace("spacing_m: 3.6", "spacing_m: 5.0") != production
-
-
-def test_extends_path_is_relative_to_file(flexroad, tmp_path):
-    (tmp_path / "parent.yaml").write_text("fit: {degree: 4}\n")
-    (tmp_path / "child.yaml").write_text("extends: parent.yaml\n")
-    assert "degree: 4" in flexroad("config", "show", tmp_path / "child.yaml").out
-
-
-@pytest.mark.parametrize("fit", ["{control_points: [100000, 100000]}", "{spacing_m: 1.0e-9}"])
-def test_too_many_control_points_fail_each_tile(fit, run, survey, tmp_path):
-    config = tmp_path / "huge.yaml"
-    config.write_text(f"extends: defaults\nfit: {fit}\n")
-    result = run(config=config)
-    assert result.code == 1
-    assert [line.split(": ")[0] for line in result.errors] == [
-        f"failed {tile.id}" for tile in Catalog.read(survey).tiles
-    ]
-    assert all("60 x 60 cells are fewer than" in line for line in result.errors)
-
-
-def test_second_configuration_replaces_rows_of_first(run, flexroad, quick_config, tmp_path):
-    other = tmp_path / "other.yaml"
-    other.write_text(
-        "extends: defaults\nfit: {control_points: [8, 8], iterations: 3}\nvariants: {smooth: {}}\n"
-    )
-    assert run().code == 0
-    assert run(config=other).code == 0
-    assert set(read_metrics(tmp_path / "run").variant) == {"smooth"}
-    assert "4 done" in flexroad("status", tmp_path / "run").out
-    back = run()
-    assert "4 tiles: 4 done" in back.out
-    assert set(read_metrics(tmp_path / "run").variant) == {"plane", "rgt", "flexroad"}
-
-
-# --- disks and folders --------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def mount(tmp_path):
-    """Function that mounts a temporary file system with given options; unmounted after the test."""
-    place = tmp_path / "disk"
-    place.mkdir()
-
-    def call(options: str) -> Path:
-        done = subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", options, "tmpfs", place],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode:
-            pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
-        return place
-
-    yield call
-    subprocess.run(["umount", place], capture_output=True, check=False)
-
-
-@pytest.mark.parametrize("size", ["100k", "300k"])
-def test_full_disk_fails_tiles_until_there_is_space(size, mount, run, flexroad, tmp_path):
-    out = mount(f"size={size}") / "run"
-    result = run(out=out)
-    assert result.code == 1
-    assert len({line.split(":")[0] for line in result.errors}) == len(result.errors) > 0
-    assert all(f"No space left on device: '{out}/" in line for line in result.errors)
-    assert not list(out.rglob("*.tmp"))
-    subprocess.run(["mount", "-o", "remount,size=20m", out.parent], check=True)
-    again = flexroad("rerun", out, "--executor", "serial")
-    assert again.code == 0
-    assert "4 tiles: 4 done" in again.out
-    assert set(read_metrics(out).status) == {"done"}
-
-
-def test_read_only_disk_allows_only_reading(mount, run, flexroad, survey, tmp_path):
-    disk = mount("size=20m")
-    assert run(out=disk / "run").code == 0
-    tile = Catalog.read(survey).tiles[0]
-    points = tmp_path / "points.csv"
-    points.write_text(f"easting,northing\n{tile.grid.west + 9},{tile.grid.south + 9}\n")
-    for artefact in (disk / "run" / "store").rglob("*.npz"):
-        artefact.unlink()
-    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
-    for out in (disk / "run", disk / "other"):
-        result = run(out=out)
-        assert result.code == 2
-        (line,) = result.errors
-        assert f"cannot write the run to {out}" in line
-        assert "Read-only file system" in line
-    assert "4 done" in flexroad("status", disk / "run").out
-    assert tile.id in flexroad("query", disk / "run", "--points", points).out
-    result = flexroad("report", disk / "run")
-    assert result.code == 2
-    assert "Read-only file system" in result.errors[0]
-    result = flexroad("catalog", "synthetic", "-o", disk / "scenes", "--tiles", 1)
-    assert (result.code, len(result.errors)) == (2, 1)
-
-
-def test_output_path_that_is_a_file_is_refused(run, flexroad, survey, tmp_path):
-    (tmp_path / "file").write_text("mine")
-    folder = survey.parent
-    rasters = ["catalog", "rasters", folder, "--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", 60, "-o"]
-    for result in (
-        run(out=tmp_path / "file"),
-        run(out=tmp_path / "file" / "run"),
-        run("--store", tmp_path / "file"),
-        flexroad("catalog", "synthetic", "-o", tmp_path / "file"),
-        flexroad(*rasters, tmp_path / "file" / "c.json"),
-    ):
-        assert result.code == 2
-        (line,) = result.errors
-        assert str(tmp_path / "file") in line
-    assert (tmp_path / "file").read_text() == "mine"
-
-
-# --- catalogs -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "is a folder; name its file"),
-        (b"", "is not a FlexRoad catalog"),
-        (b"PAR1 and no more", "is not a FlexRoad catalog"),
-    ],
-)
-def test_unreadable_catalog_is_refused(content, message, run, survey):
-    survey.unlink()
-    survey.mkdir() if content is None else survey.write_bytes(content)
-    result = run()
-    assert result.code == 2
-    (line,) = result.errors
-    assert str(survey) in line
-    assert message in line
-
-
-@pytest.mark.parametrize("size", ["0", "-5", "nan", "inf", "33.3"])
-def test_invalid_tile_size_is_refused(size, flexroad, survey, tmp_path):
-    arguments = ["--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", size, "-o", tmp_path / "c.json"]
-    result = flexroad("catalog", "rasters", survey.parent, *arguments)
-    assert result.code == 2
-    assert len(result.errors) == 1
-
-
-def test_catalog_with_moved_files_is_refused(run, flexroad, survey, tmp_path):
-    (survey.parent / "dsm").rename(tmp_path / "elsewhere")
-    result = run()
-    assert result.code == 2
-    assert re.search(
-        r"each of the 4 tiles lacks a file, for example tile \d+_\d+: .*dsm/\d+_\d+.tif;", result.err
-    )
-    (tmp_path / "elsewhere").rename(survey.parent / "dsm")
-    repaired = flexroad("rerun", tmp_path / "run", "--executor", "serial")
-    assert repaired.code == 0
-    assert "4 tiles: 4 done" in repaired.out
-
-
-def test_missing_file_that_all_tiles_list_fails_only_its_tile(run, survey, tmp_path):
-    """With a halo each of the four tiles lists the file, but it lies on one of them."""
-    first, *others = Catalog.read(survey).tiles
-    layer(first, "dsm").unlink()
-    halo = tmp_path / "halo.yaml"
-    halo.write_text("extends: defaults\nload: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
-    result = run(config=halo)
-    assert [line.split(":")[0] for line in result.errors] == [f"failed {first.id}"]
-    item = json.loads((tmp_path / "run" / "tiles" / others[0].id / "item.json").read_text())
-    assert any("a file that the tile does not need" in note for note in item["properties"]["flexroad:notes"])
-
-
-# --- changed and damaged runs -------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_missing_sources_keep_finished_results(run, flexroad, survey, tmp_path):
-    tile = Catalog.read(survey).tiles[0]
-    points = tmp_path / "points.csv"
-    points.write_text(f"easting,northing\n{tile.grid.west + 9},{tile.grid.south + 9}\n")
-    out = tmp_path / "run"
-    run()
-    whole = [flexroad("query", out, "--points", points).out, flexroad("report", out).out]
-    survey.rename(tmp_path / "kept.parquet")
-    shutil.rmtree(survey.parent)
-    assert [flexroad("query", out, "--points", points).out, flexroad("report", out).out] == whole
-    assert "4 tiles: 4 done" in flexroad("status", out).out
-    assert flexroad("report", out, "--format", "html").code == 0
-    lost = flexroad("query", out, "--points", points, "--variant", "rgt")
-    assert lost.code == 2
-    assert f"tile {tile.id}: load: TaskError: dsm dsm/{tile.id}.tif is missing" in lost.errors[0]
-    out.rename(tmp_path / "a moved run")
-    assert flexroad("query", tmp_path / "a moved run", "--points", points).out == whole[0]
-
-
-def test_deleted_store_keeps_finished_results(run, flexroad, survey, tmp_path):
-    tile = Catalog.read(survey).tiles[0]
-    points = tmp_path / "points.csv"
-    points.write_text(f"easting,northing\n{tile.grid.west + 9},{tile.grid.south + 9}\n")
-    out = tmp_path / "run"
-    run()
-    whole = flexroad("query", out, "--points", points).out
-    shutil.rmtree(out / "store")
-    assert flexroad("query", out, "--points", points).out == whole
-    assert flexroad("report", out).code == 0
-    assert not (out / "store").exists()
-    assert "nothing had changed" in flexroad("rerun", out, "--executor", "serial").out
-    assert flexroad("rerun", out, "--from", "fit", "--executor", "serial").code == 0
-    assert flexroad("query", out, "--points", points).out == whole
+    assert said.out == production.replace("spacing_m: 3.6", "spacing_m: 5.0") != production
 
 
 def test_relative_paths_work_from_other_folder(flexroad, survey, quick_config, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run = ["--catalog", "survey/catalog.parquet", "--out", "my runs/1", "--store", "shared", "--executor"]
-    result = flexroad("run", "--config", "quick.yaml", *run, "serial")
-    assert result.code == 0
-    assert "next: flexroad report 'my runs/1' --format html" in result.out
+    words = ("--catalog", "survey/catalog.parquet", "--out", "my runs/1", "--store", "shared", *SERIAL)
+    said = flexroad("run", "--config", "quick.yaml", *words).expected(0)
+    assert "next: flexroad report 'my runs/1' --format html" in said.out
     (tmp_path / "away").mkdir()
     monkeypatch.chdir(tmp_path / "away")
-    again = flexroad("rerun", "../my runs/1", "--from", "sample", "--executor", "serial")
+    again = flexroad("rerun", "../my runs/1", "--from", "sample", *SERIAL)
     assert "4 done (0 cached)" in again.out
     assert not list((tmp_path / "away").iterdir())
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "status", "message"),
-    [
-        ("run.json", "{}", 2, "is no run: run.json is missing or damaged"),
-        ("run.json", "[]", 2, "is no run: run.json is missing or damaged"),
-        ("config.yaml", "fit: {degre: 3}", 2, "fit.degre: unknown key"),
-        ("config.yaml", None, 2, "no configuration"),
-        ("catalog.parquet", "", 2, "is not a FlexRoad catalog"),
-        ("log.jsonl", 'null\n{"event": 3}\n{"ev', 0, "4 done"),
-        ("metrics.parquet", "", 0, "4 done"),
-        ("tiles/*/item.json", "{}", 0, "4 pending"),
-        ("tiles/*/item.json", "[", 0, "4 pending"),
-        ("tiles/*/*.glb", "", 0, "4 pending"),
-    ],
-)
-def test_damaged_run_is_reported_and_repaired(
-    name, content, status, message, run, flexroad, finished, made_survey, tmp_path
-):
-    out = shutil.copytree(finished, tmp_path / "run")
-    for path in list(out.glob(name)):
-        path.unlink() if content is None else path.write_text(content)
-    result = flexroad("status", out)
-    assert result.code == status
-    assert message in result.out + result.err
-    report = flexroad("report", out)
-    assert report.code == (2 if name == "metrics.parquet" else status)
-    repaired = run(catalog=made_survey / "catalog.parquet")
-    assert repaired.code == 0
-    assert "4 tiles: 4 done" in repaired.out
-    assert flexroad("report", out).code == 0
+RASTERS = "catalog rasters SURVEY --dsm dsm/* --dtm dtm/* -o"
 
 
-@pytest.mark.slow
-def test_simultaneous_runs_share_a_store(survey, quick_config, tmp_path):
-    arguments = ["--executor", "serial", "--config", quick_config, "--catalog", survey]
-    arguments += ["--store", tmp_path / "store"]
-    call = [*PROCESS, "run", *map(str, arguments), "--out"]
-    both = [
-        subprocess.Popen(
-            [*call, tmp_path / name], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
-        )
-        for name in "ab"
-    ]
-    stderr = [process.communicate()[1] for process in both]
-    assert [process.returncode for process in both] == [0, 0], stderr
-    # The standard error of a slow run also has progress lines.
-    assert [error_lines(text) for text in stderr] == [[], []]
-    tables = [read_metrics(tmp_path / name).drop(columns="seconds") for name in "ab"]
-    pd.testing.assert_frame_equal(*tables, check_exact=True)
-    assert not list(tmp_path.rglob("*.tmp"))
-
-
-# --- invalid arguments --------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def argument_paths(made_survey, light_run, tmp_path_factory):
+    """Paths by their placeholder in the tested commands."""
+    folder = tmp_path_factory.mktemp("slips")
+    (folder / "p.csv").write_text("a,b\n1,2\n")
+    names = {"CSV": "p.csv", "CSV/x.json": "p.csv/x.json", "X": "x", "X.json": "x.json", "X.txt": "x.txt"}
+    return {"RUN": light_run.path, "SURVEY": made_survey} | {key: folder / names[key] for key in names}
 
 
 @pytest.mark.parametrize(
@@ -757,73 +317,45 @@ def test_simultaneous_runs_share_a_store(survey, quick_config, tmp_path):
         ("catalog rasters SURVEY --dsm dsm/*.tiff --dtm dtm/* -o X.json", "no file matches --dsm"),
         ("catalog rasters SURVEY --dsm /nowhere/* --dtm dtm/* -o X.json", "no file matches --dsm"),
         ("catalog rasters nowhere --dsm dsm/* --dtm dtm/* -o X.json", "does not exist"),
-        ("catalog rasters SURVEY --dsm dsm/* --dtm dtm/* -o X.txt --tile-size 60", "ends in .parquet, .json"),
+        (f"{RASTERS} X.txt --tile-size 60", "ends in .parquet, .json"),
+        (f"{RASTERS} X.json --tile-size 0", ""),
+        (f"{RASTERS} X.json --tile-size -5", ""),
+        (f"{RASTERS} X.json --tile-size nan", ""),
+        (f"{RASTERS} X.json --tile-size inf", ""),
+        (f"{RASTERS} X.json --tile-size 33.3", ""),
+        (f"{RASTERS} CSV/x.json --tile-size 60", "p.csv"),
+        ("catalog synthetic -o CSV", "p.csv"),
     ],
 )
 def test_invalid_arguments_give_one_error(command, message, argument_paths, flexroad):
-    result = flexroad(*[argument_paths.get(word, word) for word in command.split()])
-    assert result.code == 2
-    assert message in result.err
-    assert len([line for line in result.err.splitlines() if "rror: " in line]) == 1
+    said = flexroad(*[argument_paths.get(word, word) for word in command.split()]).expected(2)
+    assert message in said.err
+    assert len([line for line in said.err.splitlines() if "rror: " in line]) == 1
 
 
-def test_query_points_outside_run_gives_note(run, flexroad, survey, tmp_path):
-    grid = Catalog.read(survey).tiles[0].grid
-    points = tmp_path / "points.csv"
-    points.write_text(f"easting,northing\n{grid.west + 9},{grid.south + 9}\n7.1,50.2\n,\ninf,0\n")
-    run()
-    result = flexroad("query", tmp_path / "run", "--points", points)
-    assert result.code == 0
-    assert result.err == "note: 3 points lie on no finished tile; their columns are empty\n"
-    table = pd.read_csv(io.StringIO(result.out))
-    assert list(table.height_m.isna()) == [False, True, True, True]
+# --- pipes --------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def finished(made_survey, tmp_path_factory) -> Path:
-    """The folder of a finished run, which tests must not change."""
-    out = tmp_path_factory.mktemp("finished") / "run"
-    made = Run.create(out, compose(QUICK, "quick"), Catalog.read(made_survey / "catalog.parquet"))
-    run_tiles(made, SerialExecutor())
-    return out
-
-
-@pytest.fixture(scope="module")
-def argument_paths(made_survey, finished, tmp_path_factory):
-    """Paths by their placeholder in the tested commands."""
-    folder = tmp_path_factory.mktemp("slips")
-    (folder / "p.csv").write_text("a,b\n1,2\n")
-    return {
-        "RUN": finished,
-        "CSV": folder / "p.csv",
-        "SURVEY": made_survey,
-        "X": folder / "x",
-        "X.json": folder / "x.json",
-        "X.txt": folder / "x.txt",
-    }
-
-
-@pytest.mark.parametrize("name", ["dsm", "roads"])
-def test_pipes_hang_neither_client_nor_worker_with_checksum(run, survey, tmp_path, name):
+@pytest.mark.parametrize(("name", "segment", "code"), [("dsm", "mask", 1), ("roads", "vector", 2)])
+def test_pipe_is_not_waited_for_with_checksum(name, segment, code, flexroad, survey, light_config, tmp_path):
+    """The file with roads is a file of all tiles: then the run stops before the first one."""
     tile = Catalog.read(survey).tiles[0]
-    layer(tile, name).unlink()
-    os.mkfifo(layer(tile, name))
-    config = compose({**QUICK, "segment": "vector"} if name == "roads" else QUICK, "x")
-    path = tmp_path / "x.yaml"
-    path.write_text(json.dumps(config.raw))
-    # The file with roads is that of all tiles: then the run stops before the first one.
-    said = run("--checksum", config=path).expected(2 if name == "roads" else 1)
+    path = tile.paths(tile.layer(name))[0]
+    path.unlink()
+    os.mkfifo(path)
+    words = ("--catalog", survey, "--config", light_config, "--set", f"segment={segment}", "--checksum")
+    said = flexroad("run", *words, "--out", tmp_path / "run", *SERIAL).expected(code)
     assert "is not a regular file; replace it by one" in said.errors[0]
 
 
-def test_catalog_or_run_that_is_a_pipe_is_refused(run, flexroad, survey, tmp_path):
+def test_catalog_or_run_that_is_a_pipe_is_refused(flexroad, own_run, light_config, tmp_path):
     pipe = tmp_path / "catalog.json"
     os.mkfifo(pipe)
-    assert "not a regular file" in run(catalog=pipe).expected(2).err
-    run().expected(0)
+    said = flexroad("run", "--catalog", pipe, "--config", light_config, "--out", tmp_path / "new")
+    assert "not a regular file" in said.expected(2).err
     for name in ("config.yaml", "catalog.parquet", "run.json"):
-        file = tmp_path / "run" / name
+        file = own_run.path / name
         kept = file.rename(tmp_path / name)
         os.mkfifo(file)
-        assert "not a regular file" in flexroad("status", tmp_path / "run").expected(2).err
+        assert "not a regular file" in flexroad("status", own_run.path).expected(2).err
         kept.replace(file)

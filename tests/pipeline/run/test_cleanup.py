@@ -5,11 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import yaml
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.storage.paths import listing
-from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run import cleanup
@@ -18,15 +17,11 @@ from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.store_users import runs_using, unregister
+from tests.builders import LIGHT
 
-QUICK = {
-    "extends": "defaults",
-    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
-    "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
-    "export": {"variants": ["rgt", "flexroad"], "formats": ["glb", "cog"]},
-}
-LATER = QUICK | {
-    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 4},
+NOW = LIGHT | {"export": {"variants": ["rgt", "flexroad"], "formats": ["glb", "cog"]}}
+LATER = LIGHT | {
+    "fit": LIGHT["fit"] | {"iterations": 4},
     "export": {"variants": ["flexroad"], "formats": ["glb", "npz"]},
 }
 
@@ -42,29 +37,27 @@ def catalog(made_survey) -> Catalog:
     return Catalog((one, two, replace(three, layers=broken)))
 
 
+def make(path: Path, catalog: Catalog, options: dict, tiles: int, store: Path | None = None) -> Run:
+    run = Run.create(path, compose(options, "c"), Catalog(catalog.tiles[:tiles]), store)
+    run_tiles(run, SerialExecutor())
+    return run
+
+
 @pytest.fixture(scope="module")
 def made(catalog, tmp_path_factory):
-    """Factory of finished runs with given options and number of tiles; equal runs are copied."""
+    """Return a run after some steps, each with its options and number of tiles; equal runs are copied."""
     cache: dict[str, Path] = {}
 
-    def make(path: Path, options: dict, tiles: int, store: Path | None = None) -> Run:
-        config = tmp_path_factory.mktemp("config") / "c.yaml"
-        config.write_text(yaml.safe_dump(options, sort_keys=False))
-        run = Run.create(path, load_config(config), Catalog(catalog.tiles[:tiles]), store)
-        run_tiles(run, SerialExecutor())
-        return run
-
-    def make_or_copy(path: Path, *steps: tuple[dict, int]) -> Run:
+    def copied(path: Path, *steps: tuple[dict, int]) -> Run:
         key = str(steps)
         if key not in cache:
             cache[key] = tmp_path_factory.mktemp("made") / "run"
             for options, tiles in steps:
-                make(cache[key], options, tiles)
+                make(cache[key], catalog, options, tiles)
         shutil.copytree(cache[key], path)
         return Run.open(path)
 
-    make_or_copy.into = make
-    return make_or_copy
+    return copied
 
 
 def files(folder: Path) -> set[str]:
@@ -82,9 +75,12 @@ def clean(run: Run, without=()) -> dict[str, set[str]]:
 
 def test_clean_leaves_files_of_a_new_run(made, tmp_path):
     """After a change of options and export, and after a tile left the catalog."""
-    run = made(tmp_path / "run", (QUICK, 3), (LATER, 3), (LATER, 2))
+    run = made(tmp_path / "run", (NOW, 3), (LATER, 3), (LATER, 2))
     fresh = made(tmp_path / "fresh", (LATER, 2))
     before = files(run.path)
+    with exclusive(run, (), print) as runs:
+        assert sum(1 for _ in find_garbage(runs)) > 5
+    assert files(run.path) == before
     deleted = clean(run)
     for part in ("store", "tiles"):
         assert files(run.path / part) == files(fresh.path / part)
@@ -101,24 +97,8 @@ def test_clean_leaves_files_of_a_new_run(made, tmp_path):
     assert (summary.cached, summary.done) == (2, 2)
 
 
-def test_run_after_clean_computes_no_additional_stage(made, tmp_path):
-    computed = []
-    for name in ("cleaned", "not"):
-        run = made(tmp_path / name, (QUICK, 3), (LATER, 3))
-        if name == "cleaned":
-            assert clean(run)
-        # Tiles without a marker are processed again, from the remaining artefacts.
-        for marker in (run.path / "tiles").glob("*/item.json"):
-            marker.unlink()
-        results = []
-        run_tiles(run, SerialExecutor(), watch=results.append)
-        computed.append([result.computed for result in results])
-    assert computed[0] == computed[1]
-    assert not any("evaluate" in stages for stages in computed[0])
-
-
 def test_clean_keeps_foreign_files_and_deletes_temporary_files(made, tmp_path):
-    run = made(tmp_path / "run", (QUICK, 3), (LATER, 3), (LATER, 2))
+    run = made(tmp_path / "run", (NOW, 3), (LATER, 3), (LATER, 2))
     gone = next(
         path for path in (run.path / "tiles").iterdir() if path.name not in {t.id for t in run.catalog.tiles}
     )
@@ -151,7 +131,7 @@ def test_clean_keeps_foreign_files_and_deletes_temporary_files(made, tmp_path):
 
 
 def test_clean_keeps_what_is_written_to_the_store_meanwhile(made, tmp_path, monkeypatch):
-    run = made(tmp_path / "run", (QUICK, 1), (LATER, 1))
+    run = made(tmp_path / "run", (NOW, 1), (LATER, 1))
     unneeded = clean(run)["artefacts"]
     name = f"{'ab' * 16}"
     old, new = (tmp_path / "run" / "store" / "fit" / name[:2] / f"{name[:-1]}{end}.npz" for end in "01")
@@ -178,19 +158,11 @@ def test_clean_keeps_what_is_written_to_the_store_meanwhile(made, tmp_path, monk
     assert new.name in {Path(path).name for path in clean(run)["artefacts"]}
 
 
-def test_find_garbage_deletes_nothing(made, tmp_path):
-    run = made(tmp_path / "run", (QUICK, 3), (LATER, 2))
-    before = listing(run.path)
-    with exclusive(run, (), print) as runs:
-        assert sum(1 for _ in find_garbage(runs)) > 5
-    assert listing(run.path) == before
-
-
-def test_clean_keeps_artefacts_of_other_runs_of_the_store(made, tmp_path):
+def test_clean_keeps_artefacts_of_other_runs_of_the_store(catalog, tmp_path):
     store, one, two = tmp_path / "store", tmp_path / "one", tmp_path / "two"
-    first = made.into(one, QUICK, 2, store)
+    first = make(one, catalog, NOW, 2, store)
     kept = files(store / "fit")
-    second = made.into(two, LATER, 2, store)
+    second = make(two, catalog, LATER, 2, store)
     assert set(runs_using(store)) == {one, two}
     assert not clean(first)
     assert not clean(second)
@@ -204,10 +176,10 @@ def test_clean_keeps_artefacts_of_other_runs_of_the_store(made, tmp_path):
     assert not clean(first)
 
 
-def test_clean_with_other_run_active_or_unreadable_raises(made, tmp_path):
+def test_clean_with_other_run_active_or_unreadable_raises(catalog, tmp_path):
     store, one, two = tmp_path / "store", tmp_path / "one", tmp_path / "two"
-    run = made.into(one, QUICK, 1, store)
-    made.into(two, QUICK, 1, store)
+    run = make(one, catalog, NOW, 1, store)
+    make(two, catalog, NOW, 1, store)
     with run_lock(two), pytest.raises(ConfigError, match=f"{two} is in use by pid"):
         clean(run)
     (two / "config.yaml").write_text("fit: {iterations: many}")
@@ -220,9 +192,8 @@ def test_clean_with_other_run_active_or_unreadable_raises(made, tmp_path):
     assert files(store) - {"runs/damaged.json"} == before
 
 
-def test_clean_keeps_artefacts_of_run_that_contains_the_store(made, tmp_path):
-    owner = made(tmp_path / "one", (QUICK, 2))
-    guest = made.into(tmp_path / "two", LATER, 1, owner.path / "store")
-    deleted = clean(guest)
-    assert not deleted
+def test_clean_keeps_artefacts_of_run_that_contains_the_store(made, catalog, tmp_path):
+    owner = made(tmp_path / "one", (NOW, 2))
+    guest = make(tmp_path / "two", catalog, LATER, 1, owner.path / "store")
+    assert not clean(guest)
     assert not clean(owner)

@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.cleanup import find_garbage
 from flexroad.pipeline.run.lock import Owner
@@ -21,11 +20,8 @@ from flexroad.pipeline.run.runner import _failures, _rows, plan_run, run_tiles
 from flexroad.pipeline.run.status import open_database, progress, recorded, summary
 from flexroad.pipeline.store.database import NAME
 from flexroad.pipeline.store.tables import read_metrics
+from tests.builders import finish_run
 
-LIGHT = {
-    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
-    "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
-}
 PAGE = 4096
 """Size of a page of the disk (bytes)."""
 DAMAGES = 2000
@@ -35,15 +31,15 @@ DAMAGES = 2000
 def made(made_survey, tmp_path_factory) -> Path:
     """The folder of a run, run twice: two cached tiles, one computed by the second run, one failed."""
     folder = tmp_path_factory.mktemp("damaged")
-    catalog = Catalog.read(shutil.copytree(made_survey, folder / "survey") / "catalog.parquet")
-    dsm = [tile.paths(tile.layer("dsm"))[0] for tile in catalog.tiles]
+    survey = shutil.copytree(made_survey, folder / "survey")
+    tiles = Catalog.read(survey / "catalog.parquet").tiles
+    dsm = [tile.paths(tile.layer("dsm"))[0] for tile in tiles]
     dsm[3].write_bytes(dsm[3].read_bytes()[:1000])
-    run = Run.create(folder / "run", compose(LIGHT, "light"), catalog)
-    run_tiles(run, SerialExecutor())
+    run = finish_run(folder / "run", survey)
     os.utime(dsm[2], (1, 1))
     counts = run_tiles(run, SerialExecutor())
     assert (counts.done, counts.cached, counts.failed) == (3, 2, 1)
-    return folder / "run"
+    return run.path
 
 
 @pytest.fixture
@@ -91,39 +87,27 @@ EACH = pytest.mark.parametrize("damage", [damage_figures, damage_json, damage_al
 
 
 @EACH
-def test_commands_on_damaged_database_print_the_same(damage, run, flexroad):
+def test_commands_on_damaged_database_say_and_write_the_same(damage, run, flexroad, tmp_path):
+    files = [tmp_path / "map.geojson", *(run.path / name for name in ("metrics.parquet", "failures.csv"))]
     commands = [
-        ("status", run.path),
+        ("status", run.path, "--geojson", files[0]),
         ("status", run.path, "--json"),
         ("clean", run.path, "--dry-run"),
         ("report", run.path, "--format", "md"),
     ]
     expected = [flexroad(*words) for words in commands]
-    report = (run.path / "report.md").read_text()
+    report, before = (run.path / "report.md").read_text(), [path.read_bytes() for path in files]
     for words, said in zip(commands, expected, strict=True):
         damage(run.path / NAME)
         assert flexroad(*words) == said
     assert (run.path / "report.md").read_text() == report
-
-
-@EACH
-def test_rerun_on_damaged_database_writes_the_same_tables(damage, run, flexroad):
-    before = {name: (run.path / name).read_bytes() for name in ("metrics.parquet", "failures.csv")}
     damage(run.path / NAME)
-    for name in before:
-        (run.path / name).unlink()
+    for path in files[1:]:
+        path.unlink()
     said = flexroad("rerun", run.path, "--executor", "serial").expected(1)
     assert "4 tiles: 3 done (3 cached), 1 failed, 0 pending; 0 new, 0 changed, 0 vanished" in said.out
-    assert {name: (run.path / name).read_bytes() for name in before} == before
+    assert [path.read_bytes() for path in files] == before
     assert summary(run).cached == 3
-
-
-def test_map_of_damaged_database_is_the_same(run, flexroad, tmp_path):
-    maps = [tmp_path / "whole.geojson", tmp_path / "damaged.geojson"]
-    for path in maps:
-        flexroad("status", run.path, "--geojson", path).expected(0)
-        damage_figures(run.path / NAME)
-    assert maps[0].read_bytes() == maps[1].read_bytes()
 
 
 def test_database_damaged_during_run_is_repaired(run):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from safetensors import safe_open
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
@@ -29,10 +30,9 @@ def place(tmp_path):
     first, second = Catalog.read(tmp_path / "scenes" / "catalog.parquet").tiles
     first.paths(first.layer("dop"))[0].unlink()
     dop = second.layer("dop").part([0])
-    first = replace(
-        first, layers=tuple(layer for layer in first.layers if layer.name != "dop"), nearby=(dop,)
-    )
-    second = replace(second, layers=tuple(dop if x.name == "dop" else x for x in second.layers))
+    others = [[layer for layer in tile.layers if layer.name != "dop"] for tile in (first, second)]
+    first = replace(first, layers=tuple(others[0]), nearby=(dop,))
+    second = replace(second, layers=(*others[1], dop))
     Catalog((first, second)).write(tmp_path / "scenes" / "catalog.parquet")
     folder = save_backbone(tmp_path / "backbone", registers=2)
     data = load.load(second, load.Options())
@@ -74,8 +74,6 @@ def test_run_with_dinov2_fails_only_tile_without_photo(place):
 @pytest.mark.slow
 def test_run_uses_backbone_named_in_head(place):
     """The backbone need not be given again, and the head's metadata is readable with safetensors alone."""
-    from safetensors import safe_open
-
     with safe_open(place / "head.safetensors", framework="numpy") as file:
         metadata = json.loads(file.metadata()["flexroad"])
     assert metadata["backbone"] == str(place / "backbone")

@@ -3,20 +3,18 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 
 import pandas as pd
 import psutil
 import pytest
 
-from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.store.tables import read_metrics
+from flexroad.tools.synthetic.scenes import write_scenes
+from tests.builders import finish_run
+from tests.command_line import PROCESS
 from tests.dask_processes import until
+from tests.whole_run import item_times, rows
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
@@ -30,8 +28,6 @@ variants: {plane: {fit: plane, sample: corners}, flexroad: {}}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    from flexroad.tools.synthetic.scenes import write_scenes
-
     path = tmp_path_factory.mktemp("kill")
     (path / "slow.yaml").write_text(CONFIG)
     write_scenes(path / "survey", 9, seed=5, size_m=80)
@@ -40,32 +36,14 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def undisturbed(folder) -> pd.DataFrame:
-    catalog = Catalog.read(folder / "survey" / "catalog.parquet")
-    run = Run.create(folder / "undisturbed", load_config(folder / "slow.yaml"), catalog)
-    run_tiles(run, SerialExecutor())
-    return read_metrics(run.path).drop(columns="seconds")
+    config = load_config(folder / "slow.yaml")
+    return rows(finish_run(folder / "undisturbed", folder / "survey", config, tiles=9).path)
 
 
-def command(folder, out) -> list[str]:
+@pytest.fixture
+def command(folder, tmp_path) -> list:
     words = ["--config", folder / "slow.yaml", "--catalog", folder / "survey" / "catalog.parquet"]
-    call = "from flexroad.pipeline.cli.main import main; main()"
-    return [
-        sys.executable,
-        "-c",
-        call,
-        "run",
-        *map(str, words),
-        "--out",
-        str(out),
-        "--executor",
-        "dask",
-        "--workers",
-        "2",
-    ]
-
-
-def markers(out) -> list:
-    return list(out.glob("tiles/*/item.json"))
+    return [*PROCESS, "run", *words, "--out", tmp_path / "run", "--executor", "dask", "--workers", "2"]
 
 
 def workers(pid: int) -> list[psutil.Process]:
@@ -73,42 +51,42 @@ def workers(pid: int) -> list[psutil.Process]:
     return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
 
 
+def assert_equal(out, undisturbed) -> None:
+    pd.testing.assert_frame_equal(rows(out), undisturbed, check_exact=True)
+
+
 @pytest.mark.parametrize("kill", [os.killpg, os.kill], ids=["with its workers", "alone"])
-def test_run_killed_resumes_to_same_tables(folder, undisturbed, tmp_path, kill):
+def test_run_killed_resumes_to_same_tables(command, undisturbed, tmp_path, kill):
     out = tmp_path / "run"
-    process = subprocess.Popen(command(folder, out), start_new_session=True, stderr=subprocess.DEVNULL)
-    until(lambda: len(markers(out)) >= 2)
+    process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
+    until(lambda: len(item_times(out)) >= 2)
     left = workers(process.pid)
     kill(process.pid, signal.SIGKILL)
     process.wait()
-    kept = {path: path.stat().st_mtime_ns for path in markers(out)}
+    kept = item_times(out)
     assert 2 <= len(kept) < 9
-    subprocess.run(command(folder, out), check=True, capture_output=True)
-    assert all(path.stat().st_mtime_ns == before for path, before in kept.items())
+    subprocess.run(command, check=True, capture_output=True)
+    assert kept.items() <= item_times(out).items()
     until(lambda: not any(worker.is_running() for worker in left))
-    table = read_metrics(out).drop(columns="seconds")
-    pd.testing.assert_frame_equal(table, undisturbed, check_exact=True)
+    assert_equal(out, undisturbed)
 
 
 @pytest.mark.parametrize("which", [slice(1), slice(None)], ids=["one", "all"])
-def test_run_workers_killed_completes(folder, undisturbed, tmp_path, which):
+def test_run_workers_killed_completes(command, undisturbed, tmp_path, which):
     out = tmp_path / "run"
-    process = subprocess.Popen(command(folder, out), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    until(lambda: len(markers(out)) >= 1)
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    until(lambda: item_times(out))
     for worker in workers(process.pid)[which]:
         worker.kill()
     assert process.wait(timeout=120) == 0
-    table = read_metrics(out).drop(columns="seconds")
-    pd.testing.assert_frame_equal(table, undisturbed, check_exact=True)
+    assert_equal(out, undisturbed)
 
 
 @pytest.mark.parametrize("signal_sent", ["ctrl-c", "kill"])
-def test_run_interrupted_ends_soon_and_keeps_done_tiles(folder, undisturbed, tmp_path, signal_sent):
+def test_run_interrupted_ends_soon_and_keeps_done_tiles(command, undisturbed, tmp_path, signal_sent):
     out = tmp_path / "run"
-    process = subprocess.Popen(
-        command(folder, out), start_new_session=True, stderr=subprocess.PIPE, text=True
-    )
-    until(lambda: len(markers(out)) >= 1)
+    process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True)
+    until(lambda: item_times(out))
     if signal_sent == "ctrl-c":
         # A terminal sends SIGINT to the workers, too; a user may press Ctrl-C several times.
         for _ in range(3):
@@ -120,8 +98,6 @@ def test_run_interrupted_ends_soon_and_keeps_done_tiles(folder, undisturbed, tmp
     assert process.returncode == 130
     assert "interrupted" in said
     assert "Traceback" not in said
-    rows = read_metrics(out)
-    assert 1 <= rows.tile_id.nunique() < 9
-    subprocess.run(command(folder, out), check=True, capture_output=True)
-    table = read_metrics(out).drop(columns="seconds")
-    pd.testing.assert_frame_equal(table, undisturbed, check_exact=True)
+    assert 1 <= rows(out).tile_id.nunique() < 9
+    subprocess.run(command, check=True, capture_output=True)
+    assert_equal(out, undisturbed)

@@ -3,12 +3,12 @@
 import io
 import json
 import subprocess
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import geopandas
 import numpy as np
 import pandas as pd
-import pyproj
 import pytest
 import rasterio
 import shapely
@@ -24,8 +24,9 @@ from flexroad.pipeline.run.cleanup import find_garbage
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.run.sampler import RunSampler
+from flexroad.pipeline.run.sampler import RunSampler, on_levels
 from flexroad.pipeline.run.status import peek_statuses
+from flexroad.tasks.levels.along_route import PlaceLevels
 from flexroad.tasks.products import npz
 from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.spline.levelled import LevelledSurface
@@ -38,7 +39,7 @@ from tests.command_line import call
 from tests.mesh_union import Union
 from tests.read_exports import on_mesh
 from tests.read_opendrive import numbers, plan, polynomial, quality_issues
-from tests.tools.export.test_landxml import surfaces as landxml_surfaces
+from tests.tasks.spline.test_levelled import GRID, SOUTH, WEST, made_surface
 from tests.tools.view.test_encoding import content, heights
 from tests.validators.gltf import gltf_issues
 from tests.validators.opendrive import by_sumo, in_crs
@@ -60,6 +61,11 @@ def run(tmp_path_factory):
     return made(tmp_path_factory.mktemp("levels"), SerialExecutor())
 
 
+def finished(run):
+    statuses = peek_statuses(run, run.catalog.tiles)
+    return [FinishedTile.of(run, status, run.config.export.variants[0]) for status in statuses]
+
+
 @pytest.fixture(scope="module")
 def cells(run):
     """Cell centres of the tiles, and the true heights of level 0 and 1 there."""
@@ -70,7 +76,7 @@ def cells(run):
     return (*at, world.height(0, *at), world.height(1, *at))
 
 
-def test_heights_are_those_of_the_level_that_is_asked_for(run, cells):
+def test_heights_and_normals_are_those_of_the_level_that_is_asked_for(run, cells):
     x, y, low, deck = cells
     view = flexroad.open_run(run.path)
     ground, above, top = view.height(x, y, 0), view.height(x, y, level=1), view.height(x, y)
@@ -82,12 +88,6 @@ def test_heights_are_those_of_the_level_that_is_asked_for(run, cells):
     np.testing.assert_array_equal(top, np.where(on, above, ground))
     assert np.isnan(view.height(x, y, 2)).all()
     assert view.height(x, y, -1).shape == x.shape
-
-
-def test_normals_are_those_of_the_highest_level(run, cells):
-    x, y, *_ = cells
-    view = flexroad.open_run(run.path)
-    on = np.isfinite(view.height(x, y, 1))
     assert view.normal(x, y)[on, 2].min() > 0.98
 
 
@@ -129,19 +129,33 @@ def test_profile_below_a_deck_has_the_grade_of_its_level(run, cells):
     assert table[table.level == 1].grade_percent.abs().max() < 15
 
 
-def test_rasters_and_archives_have_the_levels(run):
+def test_rasters_and_archives_have_the_levels(run, cells):
+    """Rasters show the highest level; the ground below decks has rasters of its own."""
+    x, y, *_ = cells
     view = flexroad.open_run(run.path)
     levelled = 0
-    for tile in run.catalog.tiles:
+    for tile in finished(run):
         folder = run.folder(tile.id).path
         surface = npz.decode(folder / f"{tile.id}_flexroad_surface.npz")
-        at = np.meshgrid(tile.grid.eastings, tile.grid.northings)
+        at = np.meshgrid(tile.tile.grid.eastings, tile.tile.grid.northings)
         with rasterio.open(folder / f"{tile.id}_flexroad_height.tif") as raster:
             np.testing.assert_allclose(raster.read(1), view.height(*at), atol=1e-4)
         if isinstance(surface, LevelledSurface):
             levelled += 1
             np.testing.assert_array_equal(surface.height(*at), view.height(*at, 0))
+        item = json.loads((folder / "item.json").read_bytes())
+        for name in ("height_level0", "height_source_level0"):
+            assert (name in item["assets"]) == (1 in tile.mesh.numbers)
     assert levelled > 0
+    with rasterio.open(run.path / "height.vrt") as top, rasterio.open(run.path / "height_level0.vrt") as low:
+        np.testing.assert_allclose(top.read(1), view.height(x, y), atol=1e-4)
+        np.testing.assert_allclose(low.read(1), view.height(x, y, 0), atol=1e-4)
+    with rasterio.open(run.path / "height_source.vrt") as file:
+        deck = file.read(1)[np.isfinite(view.height(x, y, 1))]
+    assert (deck == HeightSource.MEASURED).mean() > 0.5
+    assert (deck != HeightSource.NONE).all()
+    assert "height_level0" in json.loads((run.path / "collection.json").read_bytes())["assets"]
+    assert [waste.path.name for waste in find_garbage([run]) if waste.kind == "products"] == []
 
 
 def test_quality_of_tiles_with_decks_has_no_flags(run):
@@ -225,27 +239,6 @@ def test_stages_that_have_no_levels_are_refused(settings, message):
         load_config("production_vector", [*WITH_LEVELS, *settings])
 
 
-def test_rasters_show_the_highest_level_and_the_ground_below_decks(run, cells):
-    x, y, *_ = cells
-    view = flexroad.open_run(run.path)
-    with rasterio.open(run.path / "height.vrt") as top, rasterio.open(run.path / "height_level0.vrt") as low:
-        np.testing.assert_allclose(top.read(1), view.height(x, y), atol=1e-4)
-        np.testing.assert_allclose(low.read(1), view.height(x, y, 0), atol=1e-4)
-    with rasterio.open(run.path / "height_source.vrt") as file:
-        deck = file.read(1)[np.isfinite(view.height(x, y, 1))]
-    assert (deck == HeightSource.MEASURED).mean() > 0.5
-    assert (deck != HeightSource.NONE).all()
-
-
-def test_tiles_with_decks_alone_have_rasters_of_level_0(run):
-    for tile in finished(run):
-        item = json.loads((run.path / "tiles" / tile.id / "item.json").read_bytes())
-        assert ("height_level0" in item["assets"]) == (1 in tile.mesh.numbers)
-        assert ("height_source_level0" in item["assets"]) == (1 in tile.mesh.numbers)
-    assert "height_level0" in json.loads((run.path / "collection.json").read_bytes())["assets"]
-    assert [waste.path.name for waste in find_garbage([run]) if waste.kind == "products"] == []
-
-
 def test_meshes_of_levels_meet_on_borders_and_abutments(run):
     tiles = finished(run)
     inner_x, inner_y = max(t.tile.grid.west for t in tiles), min(t.tile.grid.north for t in tiles)
@@ -270,52 +263,35 @@ def on_abutments(mesh, level):
     return {tuple(vertex) for vertex in mesh.vertices[near].astype(np.float32).tolist()}
 
 
-def finished(run):
-    statuses = peek_statuses(run, run.catalog.tiles)
-    return [FinishedTile.of(run, status, run.config.export.variants[0]) for status in statuses]
-
-
-def test_exports_of_heights_have_the_highest_level(run, cells, tmp_path):
-    x, y, *_ = cells
-    view = flexroad.open_run(run.path)
-    top, deck = view.height(x, y), np.isfinite(view.height(x, y, 1))
-    call("export", run.path, "--format", "mosaic", "-o", tmp_path).expected(0)
-    with rasterio.open(next(tmp_path.rglob("height.tif"))) as file:
-        np.testing.assert_allclose(file.read(1), top, atol=1e-3)
-    with rasterio.open(next(tmp_path.rglob("normal.tif"))) as file:
-        assert file.read(3)[deck].min() > 0.98 / file.scales[0]
-    with rasterio.open(next(tmp_path.rglob("road.tif"))) as file:
-        assert file.read(1)[deck].mean() > 0.5
-
-
-@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("level", [None, 0, 1, 2])
 def test_mosaic_of_a_level_has_its_heights_alone(run, cells, level, tmp_path):
     x, y, *_ = cells
-    view = flexroad.open_run(run.path)
-    said = call("export", run.path, "--format", "mosaic", "-o", tmp_path, "--level", level).expected(0)
+    view, words = flexroad.open_run(run.path), () if level is None else ("--level", level)
+    said = call("export", run.path, "--format", "mosaic", "-o", tmp_path, *words).expected(0)
     assert ("no tile has a road of level 2" in said.err) == (level == 2)
     entry = json.loads((tmp_path / "export.json").read_bytes())["formats"]["mosaic"]
-    assert entry["level"] == level
-    expected = view.height(x, y, level)
+    assert entry.get("level") == level
+    expected, deck = view.height(x, y, level), np.isfinite(view.height(x, y, 1))
     known = np.isfinite(expected)
-    assert known.any() == (level < 2)
-    with rasterio.open(tmp_path / "mosaic" / "height.tif") as file:
-        np.testing.assert_allclose(file.read(1), expected, atol=1e-3)
-    with rasterio.open(tmp_path / "mosaic" / "road.tif") as file:
-        road = file.read(1)
+    assert known.any() == (level != 2)
+
+    def read(name, band=1):
+        with rasterio.open(tmp_path / "mosaic" / f"{name}.tif") as file:
+            return file.read(band), file.scales[0]
+
+    np.testing.assert_allclose(read("height")[0], expected, atol=1e-3)
+    (road, _), (up, scale) = read("road"), read("normal", 3)
     assert ((road == 255) == ~known).all()
-    with rasterio.open(tmp_path / "mosaic" / "height_source.tif") as file:
-        assert ((file.read(1) == HeightSource.NONE) == ~known).all()
-    with rasterio.open(tmp_path / "mosaic" / "normal.tif") as file:
-        assert ((file.read(3) == -32768) == ~known).all()
-    if level == 1:
-        assert (road[known] == 1).mean() > 0.5
+    assert ((read("height_source")[0] == HeightSource.NONE) == ~known).all()
+    assert ((up == -32768) == ~known).all()
+    if level in (None, 1):
+        assert (road[deck] == 1).mean() > 0.5
+        assert up[deck].min() > 0.98 / scale
 
 
 def test_smooth_formats_say_that_they_have_level_0(run, tmp_path):
     call("export", run.path, "--format", "step", "-o", tmp_path).expected(0)
-    rows = json.loads((tmp_path / "export.json").read_bytes())
-    assert "the surface is that of level 0" in json.dumps(rows)
+    assert "the surface is that of level 0" in (tmp_path / "export.json").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -418,15 +394,6 @@ def from_glb(run, below, folder):
     return on_meshes(meshes, below)
 
 
-def from_landxml(run, below, folder):
-    """The text alone: none of the programs reads LandXML."""
-    call("export", run.path, "--format", "landxml", "-o", folder).expected(0)
-    (file,) = (folder / "landxml").glob("*.xml")
-    surfaces = landxml_surfaces(file.read_bytes())
-    assert set(surfaces) == {"road", "ground", "road level 1"}
-    return on_meshes([(int(name.endswith("level 1")), *surfaces[name]) for name in surfaces], below)
-
-
 def from_cityjson(run, below, folder):
     """The program cjio, which joins the tiles."""
     call("export", run.path, "--format", "cityjson", "-o", folder).expected(0)
@@ -454,15 +421,6 @@ def from_opendrive(run, below, folder):
     return {0: places[near & (roads == lower)], 1: places[near & (roads == upper)]}
 
 
-def from_query(run, below, folder):
-    """The command line."""
-    points = folder / "points.csv"
-    pd.DataFrame(below, columns=["easting", "northing"]).to_csv(points, index=False)
-    answer = call("query", run.path, "--points", points, "--level", "all").expected(0).out
-    table = pd.read_csv(io.StringIO(answer)).set_index("level")[["easting", "northing", "height_m"]]
-    return {level: table.loc[level].to_numpy() for level in (0, 1)}
-
-
 def on_meshes(meshes, places):
     """Return places with the heights of both levels by meshes: level, vertices and faces."""
     heights = np.full((2, len(places)), np.nan)
@@ -472,7 +430,7 @@ def on_meshes(meshes, places):
     return {level: np.column_stack([places, heights[level]]) for level in (0, 1)}
 
 
-@pytest.mark.parametrize("opened", [from_glb, from_landxml, from_cityjson, from_opendrive, from_query])
+@pytest.mark.parametrize("opened", [from_glb, from_cityjson, from_opendrive])
 def test_every_export_of_a_crossing_has_both_heights_in_other_programs(opened, run, below, tmp_path):
     both = opened(run, below, tmp_path)
     for level, at_most in ((0, 0.06), (1, 0.02)):
@@ -509,63 +467,62 @@ def test_one_surface_of_tiles_with_decks_is_refused_with_a_remedy(run):
             assert view.surface(inside).height(x, y) == pytest.approx(float(view.height(x, y)), abs=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["net.xml", "osm"])
-def test_networks_of_sumo_and_osm_have_the_level_of_each_road(run, tmp_path, kind):
-    """By the heights of the roads that an edge meets, or by the tags of OSM."""
+def test_network_of_sumo_has_the_level_of_each_road(run, tmp_path):
+    """By the heights of the roads that an edge meets."""
     roads = Crossings(SEED).roads(flexroad.open_run(run.path).tiles.total_bounds)
-    source, out, report = tmp_path / f"a.{kind}", tmp_path / f"b.{kind}", tmp_path / "r.csv"
-    source.write_text(network(roads) if kind == "net.xml" else streets(roads))
+    edges = []
+    for number, road in enumerate(roads):
+        shape = " ".join(f"{x:.3f},{y:.3f}" for x, y in road.points)
+        edges.append(f'<edge id="{number}"><lane id="{number}_0" index="0" shape="{shape}"/></edge>')
+    place = '<location netOffset="0,0" projParameter="EPSG:25832"/>'
+    source, out, report = (tmp_path / name for name in ("a.net.xml", "b.net.xml", "r.csv"))
+    source.write_text("\n".join(["<net>", place, *edges, "</net>"]))
     call("lift", source, run.path, "-o", out, "--report", report).expected(0)
     levels = pd.read_csv(report, dtype=str, keep_default_na=False).set_index("id").levels
     ground, decks, below = RunSampler.open(run.path), 0, 0
     for number, road in enumerate(roads):
-        x, y, z = lifted(out, number).T
-        on = np.isfinite(z)
-        found, _ = ground.heights(x[on], y[on], steps=False)
-        low, deck = found.z if len(found.z) == 2 else (found.ground, np.full(on.sum(), np.nan))
+        shape = ElementTree.parse(out).getroot().find(f"edge[@id='{number}']/lane").get("shape")
+        lifted = [[*map(float, each.split(",")), np.nan][:3] for each in shape.split()]
+        x, y, z = np.array([point for point in lifted if np.isfinite(point[2])]).reshape(-1, 3).T
+        found, _ = ground.heights(x, y, steps=False)
+        low, deck = found.z if len(found.z) == 2 else (found.ground, np.full(len(x), np.nan))
         if road.level:
             decks += np.isfinite(deck).sum()
             assert "1" in levels[str(number)] or not len(deck)
         else:
             below += np.isfinite(deck).sum()
-            deck = np.full(on.sum(), np.nan)
+            deck = np.full(len(x), np.nan)
         # Beyond its abutments a road on a deck is on the ground.
-        np.testing.assert_allclose(z[on], np.where(np.isfinite(deck), deck, low), atol=0.006)
+        np.testing.assert_allclose(z, np.where(np.isfinite(deck), deck, low), atol=0.006)
     assert min(decks, below) > 0
 
 
-def network(roads) -> str:
-    """A network of SUMO with an edge for each road."""
-    edges = []
-    for number, road in enumerate(roads):
-        shape = " ".join(f"{x:.3f},{y:.3f}" for x, y in road.points)
-        edges.append(f'<edge id="{number}"><lane id="{number}_0" index="0" shape="{shape}"/></edge>')
-    return "\n".join(['<net><location netOffset="0,0" projParameter="EPSG:25832"/>', *edges, "</net>"])
+# --- heights of roads on several levels ---------------------------------------------------------------
+
+STEP_M = 0.5
 
 
-def streets(roads) -> str:
-    """An OSM file with a way for each road, and tags of bridges."""
-    to_degrees = pyproj.Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True)
-    nodes, ways = [], []
-    for number, road in enumerate(roads):
-        refs = ""
-        for lon, lat in zip(*to_degrees.transform(*road.points.T), strict=True):
-            nodes.append(f'<node id="{len(nodes) + 1}" lat="{lat:.10f}" lon="{lon:.10f}"/>')
-            refs += f'<nd ref="{len(nodes)}"/>'
-        bridge = '<tag k="bridge" v="yes"/>' if road.level else ""
-        ways.append(f'<way id="{number}">{refs}<tag k="highway" v="{road.highway}"/>{bridge}</way>')
-    return "\n".join(["<osm>", *nodes, *ways, "</osm>"])
-
-
-def lifted(path, number: int) -> np.ndarray:
-    """Easting, northing and height of the points of a road; NaN without height."""
-    root = ElementTree.parse(path).getroot()
-    if path.suffix == ".xml":
-        shape = root.find(f"edge[@id='{number}']/lane").get("shape")
-        return np.array([[*map(float, each.split(",")), np.nan][:3] for each in shape.split()])
-    nodes = {node.get("id"): node for node in root.findall("node")}
-    found = [nodes[each.get("ref")] for each in root.findall(f"way[@id='{number}']/nd")]
-    to_map = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:25832", always_xy=True)
-    x, y = to_map.transform(*([float(node.get(name)) for node in found] for name in ("lon", "lat")))
-    tags = [node.find("tag") for node in found]
-    return np.column_stack([x, y, [np.nan if tag is None else float(tag.get("v")) for tag in tags]])
+@pytest.mark.parametrize(
+    ("x", "y", "number", "own", "height", "step"),
+    [
+        (35, 24, 1, True, 107, 0),
+        (35, 29, 1, True, 107, 0),  # beside the deck
+        (35, 24, 0, True, 100, STEP_M),  # below it
+        (20, 24, 0, True, 107, STEP_M),  # on the approach, level 0 has the deck's surface
+        (20, 31, 1, False, 107, 0),  # beside the approach
+        (20, 34, 1, False, 100, STEP_M),  # farther away the deck's surface does not count
+        (46, 24, 1, False, 100, STEP_M),  # where no road goes on from the deck
+        (44, 24, 1, False, 107, 0),  # the deck is longer than its centre line
+        (35, 24, -1, True, np.nan, 0),  # a tunnel that was left out
+        (50, 24, -1, False, 100, STEP_M),
+        (50, 24, 2, True, 100, STEP_M),  # no deck of this level is known
+    ],
+)
+def test_height_is_that_of_the_level(x, y, number, own, height, step):
+    """A deck 7 m above the ground, from 25 to 45 m, with an approach from 9 m; and steps everywhere."""
+    steps = np.full(GRID.shape, STEP_M, np.float32)
+    surface = replace(made_surface(own=100.0, deck=107.0), steps=steps)
+    at = np.array([WEST + x, WEST + 55.0]), np.array([SOUTH + y, SOUTH + 24.0])
+    levels = PlaceLevels(np.array([number, 0], np.int8), np.array([own, True]))
+    np.testing.assert_allclose(on_levels(surface, *at, levels), [height, 100], atol=1e-9)
+    np.testing.assert_allclose(on_levels(surface, *at, levels, steps=True), [step, STEP_M], atol=1e-9)

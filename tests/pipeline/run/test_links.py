@@ -7,11 +7,8 @@ from pathlib import Path
 import pytest
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config.loading import compose
-from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import run_tiles
-from tests.builders import LIGHT
+from tests import command_line
+from tests.builders import finish_run
 
 SERIAL = ("--executor", "serial")
 
@@ -19,13 +16,9 @@ SERIAL = ("--executor", "serial")
 @pytest.fixture(scope="module")
 def made(made_survey, tmp_path_factory) -> Path:
     """The folder of a finished run of one tile, with a viewer and a report, for copying."""
-    from tests import command_line
-
-    folder = tmp_path_factory.mktemp("made") / "run"
-    catalog = Catalog(Catalog.read(made_survey / "catalog.parquet").tiles[:1])
-    run_tiles(Run.create(folder, compose(LIGHT, "light"), catalog), SerialExecutor())
-    command_line.call("view", folder).expected(0)
-    command_line.call("report", folder).expected(0)
+    folder = finish_run(tmp_path_factory.mktemp("made") / "run", made_survey, tiles=1).path
+    for command in ("view", "report"):
+        command_line.call(command, folder).expected(0)
     return folder
 
 
@@ -59,22 +52,14 @@ def tile_of(run: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "store",
-        "tiles",
-        "viewer",
-        "run.json",
-        "config.yaml",
-        "catalog.parquet",
-        "database.txt",
-        "log.jsonl",
-    ],
-)
-def test_link_at_the_top_of_a_run_ends_every_command(name, run, outside, flexroad, made_survey, quick_config):
+FOLDERS = ("store", "tiles", "viewer")
+FILES = ("run.json", "config.yaml", "catalog.parquet", "database.txt", "log.jsonl")
+
+
+@pytest.mark.parametrize("name", [*FOLDERS, *FILES])
+def test_link_at_the_top_of_a_run_ends_every_command(name, run, outside, flexroad, made_survey, light_config):
     target, before = lead_out(run / name, outside), contents(outside)
-    again = ("--catalog", made_survey / "catalog.parquet", "--config", quick_config, *SERIAL)
+    again = ("--catalog", made_survey / "catalog.parquet", "--config", light_config, *SERIAL)
     for words in (
         ("rerun", run, *SERIAL, "--from", "load"),
         ("run", "--out", run, *again),
@@ -83,8 +68,7 @@ def test_link_at_the_top_of_a_run_ends_every_command(name, run, outside, flexroa
         ("report", run),
         ("view", run),
     ):
-        said = flexroad(*words).expected(2)
-        (line,) = said.errors
+        (line,) = flexroad(*words).expected(2).errors
         assert f"{run / name} is a link that leads out of {run}, to {target}; " in line, words
     assert contents(outside) == before
     assert not (run / "lock.json").exists()
@@ -160,27 +144,21 @@ def test_link_in_the_viewer_is_not_written_through(name, run, outside, flexroad)
     assert contents(outside) == before
 
 
-def test_run_and_store_that_are_given_by_links_work(made_survey, tmp_path, flexroad):
+def test_run_and_store_that_are_given_by_links_work(made_survey, light_config, tmp_path, flexroad):
     disk = tmp_path / "disk"
     for name in ("run", "store"):
         (disk / name).mkdir(parents=True)
         (tmp_path / name).symlink_to(disk / name)
     (tmp_path / "mounted").symlink_to(disk)
-    config = tmp_path / "light.yaml"
-    config.write_text(json.dumps(LIGHT))
-    one = Catalog.read(made_survey / "catalog.parquet").tiles[0].id
-    words = ("--catalog", made_survey / "catalog.parquet", "--config", config, "--tile", one, *SERIAL)
+    catalog = made_survey / "catalog.parquet"
+    one = Catalog.read(catalog).tiles[0].id
+    words = ("--catalog", catalog, "--config", light_config, "--tile", one, *SERIAL)
     flexroad("run", "--out", tmp_path / "run", "--store", tmp_path / "store", *words).expected(0)
     assert list((disk / "store").rglob("*.npz"))
     for run in (tmp_path / "run", tmp_path / "mounted" / "run", disk / "run"):
-        for command in (
-            ("status",),
-            ("view",),
-            ("report",),
-            ("clean",),
-            ("rerun", *SERIAL, "--from", "export"),
-        ):
-            flexroad(command[0], run, *command[1:]).expected(0)
+        for command in ("status", "view", "report", "clean"):
+            flexroad(command, run).expected(0)
+        flexroad("rerun", run, *SERIAL, "--from", "export").expected(0)
     assert "1 cached" in flexroad("run", "--out", tmp_path / "run", *words).expected(0).out
 
 

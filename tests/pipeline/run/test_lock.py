@@ -1,5 +1,6 @@
 """The lock of a run: one owner at a time; a dead owner's lock is taken over, a living one's never."""
 
+import errno
 import json
 import os
 import signal
@@ -11,9 +12,11 @@ from dataclasses import replace
 
 import pytest
 
+from flexroad.catalog.storage.paths import parse_location, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run import lock
 from flexroad.pipeline.run.lock import Heartbeat, Owner, describe_owner, owner, run_lock, started
+from flexroad.pipeline.run.lock_file import InBucket
 from tests.faulty_files import intercepted
 from tests.power_loss import Recording, states
 
@@ -80,61 +83,58 @@ def test_lock_of_killed_process_is_taken_over_at_once(process, tmp_path):
     ]
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"start": 1}, "its number was given to another"),
-        ({"pid": 2**22 + 1}, "that process is gone"),
-    ],
-)
-def test_owner_on_this_machine_is_checked_by_process_table(change, reason, tmp_path):
-    # The age of the lock is ignored, even if it is in the future, as after a clock set back.
-    write_lock(tmp_path, replace(Owner.me(), **change), age_s=-3600)
-    (message,) = take_lock(tmp_path)
-    assert reason in message
-    write_lock(tmp_path, Owner.me(), age_s=86400)
-    with pytest.raises(ConfigError, match="is in use by pid"):
-        take_lock(tmp_path)
+ME = Owner.me()
+GONE = {"pid": 2**22 + 1}
+UPTIME_S, LONG_AGO_S = lock._uptime_s(), 86400.0
+REFUSED = [
+    # The process table decides, not the age of the lock.
+    (ME, LONG_AGO_S, QUICK, UPTIME_S, "is in use by pid"),
+    # Another machine made of the same image; this one was started long ago, or just now.
+    (replace(ME, boot="other", **GONE), 20, Heartbeat(), LONG_AGO_S, "last sign of life 20 s ago; if it is"),
+    (
+        replace(ME, boot="other", **GONE),
+        20,
+        Heartbeat(),
+        5.0,
+        "last sign of life 20 s ago; if it is dead, the",
+    ),
+    # Another container on this machine.
+    (replace(ME, machine="m pid:[2]", **GONE), 0, QUICK, UPTIME_S, "last sign of life 0 s ago"),
+    (ELSEWHERE, 0.1, QUICK, UPTIME_S, "pid 4711 on node7 since 2026-11-20.* the same command takes over"),
+]
+TAKEN_OVER = [
+    # The time of the lock is in the future, as after a clock set back.
+    (replace(ME, start=1), -3600, QUICK, UPTIME_S, "its number was given to another"),
+    (replace(ME, **GONE), -3600, QUICK, UPTIME_S, "that process is gone"),
+    (ELSEWHERE, -LONG_AGO_S, QUICK, UPTIME_S, "no sign of life for"),
+    (replace(ME, boot="before"), UPTIME_S + 100, Heartbeat(30, 1e9), UPTIME_S, "was restarted since"),
+    (replace(ME, boot="other"), 400, QUICK, LONG_AGO_S, "no sign of life for 400 s"),
+    (ELSEWHERE, 400, QUICK, UPTIME_S, "pid 4711 on node7: no sign of life for 400 s"),
+]
 
 
-def test_owner_before_the_last_start_of_this_machine_is_dead_at_once(tmp_path):
-    heartbeat = Heartbeat(interval_s=30, stale_s=1e9)
-    write_lock(tmp_path, replace(Owner.me(), boot="before"), age_s=lock._uptime_s() + 100)
-    (message,) = take_lock(tmp_path, heartbeat)
-    assert "was restarted since" in message
-
-
-@pytest.mark.parametrize("uptime_s", [86400.0, 5.0], ids=["long ago", "just now"])
-def test_owner_with_other_boot_that_renewed_its_lock_is_other_machine(uptime_s, tmp_path, monkeypatch):
-    """As of another machine made of the same image; this one was started long ago, or just now."""
+@pytest.mark.parametrize(("holder", "age_s", "heartbeat", "uptime_s", "message"), REFUSED)
+def test_lock_of_an_owner_that_may_be_alive_is_refused(
+    holder, age_s, heartbeat, uptime_s, message, tmp_path, monkeypatch
+):
     monkeypatch.setattr(lock, "_uptime_s", lambda: uptime_s)
-    write_lock(tmp_path, replace(Owner.me(), boot="other", pid=2**22 + 1), age_s=20)
-    with pytest.raises(ConfigError, match="last sign of life 20 s ago; if it is dead, the same command"):
-        take_lock(tmp_path, Heartbeat())
+    write_lock(tmp_path, holder, age_s)
+    with pytest.raises(ConfigError, match=message):
+        take_lock(tmp_path, heartbeat)
 
 
-def test_owner_with_other_boot_is_taken_over_when_stale(tmp_path, monkeypatch):
-    monkeypatch.setattr(lock, "_uptime_s", lambda: 86400.0)
-    write_lock(tmp_path, replace(Owner.me(), boot="other"), age_s=400)
-    watching, taken_over = take_lock(tmp_path)
-    assert watching.startswith("watching the lock of")
-    assert "no sign of life for 400 s" in taken_over
-
-
-def test_owner_in_other_pid_namespace_is_other_machine(tmp_path):
-    write_lock(tmp_path, replace(Owner.me(), machine="m pid:[2]", pid=2**22 + 1))
-    with pytest.raises(ConfigError, match="last sign of life 0 s ago"):
-        take_lock(tmp_path)
-
-
-def test_owner_on_other_machine_is_checked_by_lock_age(tmp_path):
-    write_lock(tmp_path, ELSEWHERE, age_s=0.1)
-    with pytest.raises(ConfigError, match="pid 4711 on node7 since 2026-11-20.* the same command takes over"):
-        take_lock(tmp_path)
-    write_lock(tmp_path, ELSEWHERE, age_s=400)
-    watching, taken_over = take_lock(tmp_path)
-    assert watching.startswith("watching the lock of pid 4711 on node7")
-    assert taken_over == "took over the lock of pid 4711 on node7: no sign of life for 400 s"
+@pytest.mark.parametrize(("holder", "age_s", "heartbeat", "uptime_s", "reason"), TAKEN_OVER)
+def test_lock_of_a_dead_owner_is_taken_over(
+    holder, age_s, heartbeat, uptime_s, reason, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(lock, "_uptime_s", lambda: uptime_s)
+    write_lock(tmp_path, holder, age_s)
+    *watching, taken_over = take_lock(tmp_path, heartbeat)
+    assert taken_over.startswith("took over the lock of")
+    assert reason in taken_over
+    # Only an owner that the process table does not know is watched for a while.
+    assert bool(watching) == ("no sign of life" in reason)
+    assert all(line.startswith("watching the lock of") for line in watching)
 
 
 @pytest.mark.parametrize("age_s", [3600, -3600], ids=["set forward", "set back"])
@@ -156,46 +156,12 @@ def test_clock_jump_keeps_lock_of_living_owner(age_s, tmp_path):
         renewal.join()
 
 
-def test_clock_set_back_lock_of_dead_owner_is_taken_over(tmp_path):
-    write_lock(tmp_path, ELSEWHERE, age_s=-86400)
-    assert "took over" in take_lock(tmp_path)[-1]
-
-
 def test_damaged_lock_is_taken_over_when_stale(tmp_path):
     (tmp_path / "lock.json").write_text('{"host": "no')
     with pytest.raises(ConfigError, match="an unknown process"):
         take_lock(tmp_path)
     os.utime(tmp_path / "lock.json", (1, 1))
     assert "took over" in take_lock(tmp_path)[-1]
-
-
-@pytest.mark.parametrize("stale", [False, True])
-def test_lock_requested_by_many_is_taken_by_one(stale, tmp_path):
-    code = (
-        "import sys, time\nfrom pathlib import Path\nfrom flexroad.pipeline.run.lock import run_lock\n"
-        "print('ready', flush=True); sys.stdin.readline()\n"
-        "with run_lock(Path(sys.argv[1])):\n    print('won', flush=True); sys.stdin.readline()"
-    )
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", code, tmp_path],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )
-        for _ in range(3)
-    ]  # fmt: skip
-    assert [process.stdout.readline() for process in processes] == ["ready\n"] * 3
-    if stale:
-        write_lock(tmp_path, replace(Owner.me(), pid=2**22 + 1))
-    for process in processes:
-        process.stdin.write("go\n")
-        process.stdin.flush()
-    winners = [process for process in processes if process.stdout.readline() == "won\n"]
-    assert len(winners) == 1
-    assert owner(tmp_path).pid == winners[0].pid
-    for process in processes:
-        _, error = process.communicate("end\n")
-        assert process in winners or f"is in use by pid {winners[0].pid} on" in error
-    assert not (tmp_path / "lock.json").exists()
 
 
 def test_held_lock_is_renewed_and_restored_after_deletion(tmp_path):
@@ -234,8 +200,109 @@ def test_lock_in_unusable_folder_raises(tmp_path):
         take_lock(tmp_path / "file")
 
 
+def test_lock_on_full_disk_is_released(monkeypatch, tmp_path):
+    def full(**_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with run_lock(tmp_path):
+        monkeypatch.setattr("tempfile.TemporaryFile", full)
+    assert not list(tmp_path.iterdir())
+
+
 def _until(condition, seconds: float = 30) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+# --- object storage -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run(bucket):
+    return bucket / "run"
+
+
+IN_BUCKET = (pytest.mark.slow, pytest.mark.soak("runs"))
+
+
+def in_bucket(test):
+    return IN_BUCKET[0](IN_BUCKET[1](test))
+
+
+@in_bucket
+def test_lock_in_bucket_is_exclusive_renewed_and_released(run):
+    with run_lock(run, heartbeat=QUICK):
+        assert owner(run).token != ELSEWHERE.token
+        with pytest.raises(ConfigError, match="is in use by pid"), run_lock(run):
+            pass
+        modified = lambda: run.fs.info((run / "lock.json").path)["LastModified"]  # noqa: E731
+        first = modified()
+        _until(lambda: modified() != first)
+    assert owner(run) is None
+    with run_lock(run):
+        pass
+
+
+@in_bucket
+def test_lock_in_bucket_of_dead_owner_is_taken_over(run):
+    messages: list[str] = []
+    write(run / "lock.json", replace(ME, **GONE).data)
+    with run_lock(run, messages.append):
+        assert owner(run).pid == ME.pid
+    assert "that process is gone" in messages[0]
+    write(run / "lock.json", ELSEWHERE.data)
+    with pytest.raises(ConfigError, match="the same command takes over"):
+        run_lock(run, heartbeat=Heartbeat(stale_s=60)).__enter__()
+    # Times of a bucket's objects are whole seconds.
+    time.sleep(1.1)
+    with run_lock(run, messages.append, QUICK):
+        assert owner(run).token != "t7"
+    assert messages[-1].startswith("took over the lock of pid 4711 on node7: no sign of life")
+
+
+@pytest.mark.parametrize("place", ["tmp_path", pytest.param("run", marks=IN_BUCKET)])
+@pytest.mark.parametrize("stale", [False, True])
+def test_lock_requested_by_many_is_taken_by_one(stale, place, request):
+    run = request.getfixturevalue(place)
+    if stale:
+        write(run / "lock.json", replace(ME, **GONE).data)
+    start, tried, outcomes = threading.Barrier(4), threading.Semaphore(0), []
+
+    def race() -> None:
+        start.wait()
+        try:
+            with run_lock(run):
+                outcomes.append("won")
+                # Hold the lock until the other three have been refused.
+                for _ in range(3):
+                    tried.acquire()
+        except ConfigError as error:
+            outcomes.append(str(error))
+            tried.release()
+
+    racers = [threading.Thread(target=race, daemon=True) for _ in range(4)]
+    for racer in racers:
+        racer.start()
+    for racer in racers:
+        racer.join(60)
+    assert len(outcomes) == 4
+    assert outcomes.count("won") == 1
+    assert sum("is in use by pid" in outcome for outcome in outcomes) == 3
+
+
+@in_bucket
+def test_create_in_bucket_with_lost_response_takes_lock(run, monkeypatch):
+    """The lock was created but the response was lost; the repeated request is rejected."""
+    create = InBucket.create
+    monkeypatch.setattr(InBucket, "create", lambda self, data: create(self, data) and create(self, data))
+    with run_lock(run):
+        assert owner(run).pid == ME.pid
+
+
+@in_bucket
+def test_lock_in_missing_bucket_names_run_and_reason(run):
+    nowhere = parse_location("s3://nowhere/run")
+    with pytest.raises(ConfigError, match=r"cannot write the run to s3://nowhere/run: .*no such bucket"):
+        run_lock(nowhere).__enter__()

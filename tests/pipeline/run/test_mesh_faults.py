@@ -40,22 +40,8 @@ def checks(run):
     return gather(run).meshes.set_index("method")
 
 
-@pytest.mark.slow
-def test_meshes_of_all_variants_have_no_fault(survey, tmp_path):
-    catalog = Catalog.read(survey)
-    pair = catalog.select([tile.id for tile in catalog.tiles[:2]])
-    run = Run.create(tmp_path / "run", compose(EVERY, "every"), pair)
-    assert run_tiles(run, SerialExecutor()).done == 2
-    table = checks(run)
-    assert list(table.index) == list(VARIANTS)
-    assert set(table.meshes) == {2}
-    assert set(table.result) == {"no fault"}
-    assert table.faces["rgt"] == 2 * 2 * 59**2
-
-
-@pytest.mark.real
-@pytest.mark.slow
-def test_meshes_of_real_tiles_have_no_fault(real_data, tmp_path):
+@pytest.fixture
+def real_tiles(real_data, tmp_path) -> Catalog:
     """Four tiles of two cities; the surveys end within three of them."""
     tiles = []
     for archive, names in (
@@ -65,13 +51,24 @@ def test_meshes_of_real_tiles_have_no_fault(real_data, tmp_path):
         zipfile.ZipFile(real_data / "umep" / f"{archive}.zip").extractall(tmp_path)
         layers = dict(zip(("dsm", "dtm", "road_mask"), names, strict=True))
         tiles += rasters.index(tmp_path / archive, layers, road_values=(1,)).tiles
-    catalog = Catalog(tuple(tiles[number] for number in (2, 4, 5, 9)))
-    catalog.write(tmp_path / "real.parquet")
-    run = Run.create(tmp_path / "run", compose(EVERY, "every"), Catalog.read(tmp_path / "real.parquet"))
-    assert run_tiles(run, SerialExecutor()).done == 4
+    Catalog(tuple(tiles[number] for number in (2, 4, 5, 9))).write(tmp_path / "real.parquet")
+    return Catalog.read(tmp_path / "real.parquet")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["made_survey", pytest.param("real_tiles", marks=pytest.mark.real)])
+def test_meshes_of_all_variants_have_no_fault(source, request, tmp_path):
+    found = request.getfixturevalue(source)
+    made = source == "made_survey"
+    catalog = Catalog(Catalog.read(found / "catalog.parquet").tiles[:2]) if made else found
+    run = Run.create(tmp_path / "run", compose(EVERY, "every"), catalog)
+    assert run_tiles(run, SerialExecutor()).done == len(catalog.tiles)
     table = checks(run)
-    assert set(table.meshes) == {4}
+    assert list(table.index) == list(VARIANTS)
+    assert set(table.meshes) == {len(catalog.tiles)}
     assert set(table.result) == {"no fault"}
+    if made:
+        assert table.faces["rgt"] == 2 * 2 * 59**2
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """Catalog, sources, store and run in object storage: results as on disk, also with faulty storage."""
 
 import io
-import sys
 
 import numpy as np
 import pandas as pd
@@ -13,7 +12,6 @@ from shapely import LineString
 from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import parse_location
-from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
@@ -30,26 +28,22 @@ from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.types import Source
 from flexroad.tools.report import write_report
 from flexroad.tools.results.run import open_run
+from tests import command_line
+from tests.builders import finish_run
 from tests.conftest import QUICK
 from tests.make_roads import write as write_roads
 from tests.s3_server import Fault
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
-LIGHT = {"extends": "defaults", "variants": {"plane": {"fit": "plane", "sample": "corners"}}}
-CONFIG = compose(LIGHT, "light")
+PLANE = {"extends": "defaults", "variants": {"plane": {"fit": "plane", "sample": "corners"}}}
+CONFIG = compose(PLANE, "light")
 
 
 @pytest.fixture(scope="module")
 def local(made_survey, tmp_path_factory):
     """The same run on disk, without faults."""
-    return on_disk(made_survey, tmp_path_factory.mktemp("local"), CONFIG)
-
-
-def on_disk(survey, folder, config):
-    run = Run.create(folder, config, Catalog.read(survey / "catalog.parquet"))
-    run_tiles(run, SerialExecutor())
-    return run
+    return finish_run(tmp_path_factory.mktemp("local"), made_survey, CONFIG)
 
 
 @pytest.fixture
@@ -67,23 +61,18 @@ def run(survey, bucket):
     return Run.create(bucket / "run", CONFIG, Catalog.read(survey))
 
 
-@pytest.fixture
-def flexroad(monkeypatch, capsys):
-    def call(*words) -> str:
-        monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        assert not end.value.code
-        return capsys.readouterr().out
-
-    return call
-
-
 def bring_up_to_date(run):
-    """Run all tiles; return the summary and the results by tile id."""
-    results = []
-    state = run_tiles(run, SerialExecutor(), watch=results.append)
-    return state, {result.tile_id: result for result in results}
+    """Run all tiles; return the summary and the ids of computed tiles by their status."""
+    ids = {"done": set(), "failed": set(), "cached": set()}
+    state = run_tiles(run, SerialExecutor(), watch=lambda result: ids[result.status].add(result.tile_id))
+    return state, ids
+
+
+def assert_recovered(run, local, failed):
+    """The next run computes the failed tiles alone, and then equals the one on disk."""
+    state, ids = bring_up_to_date(Run.open(run.path))
+    assert (state.exit_code, ids["done"]) == (0, failed)
+    assert_same(run, local)
 
 
 def assert_same(run, local):
@@ -109,27 +98,23 @@ def assert_files_complete(run):
         assert folder.verified() == paths.exists(folder.path / "item.json")
 
 
-def test_clean_removes_files_that_only_try_a_folder(run, flexroad):
-    """A client that is killed leaves such a file in the run and in the store."""
+def test_run_in_bucket_equals_run_on_disk_and_is_cached(survey, made_survey, bucket, tmp_path):
+    config = compose(QUICK, "quick")
+    local = finish_run(tmp_path, made_survey, config)
+    run = Run.create(bucket / "run", config, Catalog.read(survey))
+    state, ids = bring_up_to_date(run)
+    assert (state.exit_code, len(ids["done"])) == (0, 4)
+    assert_same(run, local)
+    state, ids = bring_up_to_date(Run.open(parse_location(str(run.path))))
+    assert (state.exit_code, state.done, len(ids["cached"])) == (0, 4, 4)
+    # A client that is killed leaves such a file in the run and in the store; `clean` removes it.
     killed = [folder / f".probe-{'0a' * 16}" for folder in (run.path, run.store)]
     others = [run.path / ".probe-others", run.path / "mine" / killed[0].name]
     for file in (*killed, *others):
         paths.write(file, b"")
-    flexroad("clean", run.path)
+    command_line.call("clean", run.path).expected(0)
     assert not any(map(paths.exists, killed))
     assert all(map(paths.exists, others))
-
-
-def test_run_in_bucket_equals_run_on_disk(survey, made_survey, bucket, tmp_path):
-    config = compose(QUICK, "quick")
-    local = on_disk(made_survey, tmp_path, config)
-    run = Run.create(bucket / "run", config, Catalog.read(survey))
-    state, results = bring_up_to_date(run)
-    assert (state.exit_code, {result.status for result in results.values()}) == (0, {"done"})
-    assert_same(run, local)
-    state, results = bring_up_to_date(Run.open(parse_location(str(run.path))))
-    assert (state.exit_code, {result.status for result in results.values()}) == (0, {"cached"})
-    assert (state.done, state.cached, state.failed) == (4, 4, 0)
 
 
 def test_report_tile_and_ground_of_run_in_bucket(run, local):
@@ -149,13 +134,9 @@ def test_run_source_changed_recomputes_tile(run):
     run_tiles(run, SerialExecutor())
     tile = run.catalog.tiles[1]
     file = tile.paths(tile.layer("dsm"))[0]
-    before = paths.stat(file)
-    paths.write(file, paths.read(file) + b"\0")
-    paths.write(file, paths.read(file)[:-1] + b"\1")
-    assert paths.stat(file).size == before.size + 1
-    state, results = bring_up_to_date(Run.open(run.path))
-    assert {name for name, result in results.items() if result.status == "done"} == {tile.id}
-    assert state.exit_code == 0
+    paths.write(file, paths.read(file) + b"\1")
+    state, ids = bring_up_to_date(Run.open(run.path))
+    assert (state.exit_code, ids["done"]) == (0, {tile.id})
 
 
 @pytest.mark.parametrize(
@@ -185,21 +166,16 @@ def test_run_with_temporary_storage_faults_completes(survey, bucket, storage, lo
 @pytest.mark.parametrize(("answer", "skip"), [("denied", 0), ("error", 20)])
 def test_run_with_permanent_write_faults_fails_tiles(run, storage, local, answer, skip):
     storage.fail(Fault(answer, "PUT", "/run/(tiles|store)", skip=skip))
-    state, results = bring_up_to_date(run)
+    state, ids = bring_up_to_date(run)
     storage.fail()
-    failed = {name for name, result in results.items() if result.status == "failed"}
-    assert (state.exit_code, state.failed) == (1, len(failed))
-    assert failed
+    assert (state.exit_code, state.failed) == (1, len(ids["failed"]))
+    assert ids["failed"]
     rows = read_metrics(run.path)
-    assert set(rows[rows.status == "failed"].tile_id) == failed
+    assert set(rows[rows.status == "failed"].tile_id) == ids["failed"]
     assert rows[rows.status == "failed"].error.str.contains(f"{run.path}/").all()
     assert read_summary(run.path)["exit_code"] == 1
     assert_files_complete(run)
-
-    state, results = bring_up_to_date(Run.open(run.path))
-    assert state.exit_code == 0
-    assert {name for name, result in results.items() if result.status == "done"} == failed
-    assert_same(run, local)
+    assert_recovered(run, local, ids["failed"])
 
 
 def test_run_storage_unreachable_keeps_done_tiles(run, storage, local):
@@ -213,21 +189,24 @@ def test_run_storage_unreachable_keeps_done_tiles(run, storage, local):
     assert_same(run, local)
 
 
-@pytest.mark.parametrize("answer", ["slow", "denied", "half"])
+@pytest.mark.parametrize("answer", ["slow", "denied", "half", "missing"])
 def test_run_source_unreadable_fails_only_its_tile(run, storage, local, answer):
     tile = run.catalog.tiles[2]
     file = tile.paths(tile.layer("dsm"))[0]
-    storage.fail(Fault(answer, "GET", f"/{file.path}"))
-    state, results = bring_up_to_date(run)
+    whole = paths.read(file)
+    if answer == "missing":
+        paths.remove(file)
+    else:
+        storage.fail(Fault(answer, "GET", f"/{file.path}"))
+    state, ids = bring_up_to_date(run)
     storage.fail()
-    assert (state.exit_code, state.done, state.failed) == (1, 3, 1)
-    (failure,) = results[tile.id].failures
+    assert (state.exit_code, state.done, ids["failed"]) == (1, 3, {tile.id})
+    (failure,) = state.failures
     assert (failure.stage, failure.file) == ("load", str(file))
-
-    state, results = bring_up_to_date(Run.open(run.path))
-    assert state.exit_code == 0
-    assert {name for name, result in results.items() if result.status == "done"} == {tile.id}
-    assert_same(run, local)
+    assert ("is missing" in failure.message) == (answer == "missing")
+    if answer == "missing":
+        paths.write(file, whole)
+    assert_recovered(run, local, {tile.id})
 
 
 def test_open_run_without_access_is_not_reported_as_missing(run, storage):
@@ -237,17 +216,6 @@ def test_open_run_without_access_is_not_reported_as_missing(run, storage):
     storage.fail()
     with pytest.raises(ConfigError, match="is no run"):
         Run.open(run.path / "none")
-
-
-def test_run_source_missing_names_its_address(run):
-    tile = run.catalog.tiles[0]
-    file = tile.paths(tile.layer("dtm"))[0]
-    paths.remove(file)
-    state, results = bring_up_to_date(run)
-    (failure,) = results[tile.id].failures
-    assert failure.file == str(file)
-    assert "is missing" in failure.message
-    assert (state.done, state.failed) == (3, 1)
 
 
 def test_read_photo_with_world_file_equals_disk(bucket, tmp_path):
@@ -293,12 +261,12 @@ def test_read_near_roads_in_bucket_equal_disk(made_survey, survey, storage, tmp_
 def test_run_artefact_damaged_is_recomputed(run, local):
     run_tiles(run, SerialExecutor())
     name = next(name for name in paths.listing(run.store) if name.startswith("evaluate/"))
-    whole = paths.read(run.store / name)
-    paths.write(run.store / name, whole[:-1])
+    paths.write(run.store / name, paths.read(run.store / name)[:-1])
     for tile in run.catalog.tiles:
         paths.remove(run.folder(tile.id).path / "item.json")
-    _, results = bring_up_to_date(Run.open(run.path))
-    assert sum(result.computed.get("evaluate", 0) for result in results.values()) == 1
+    results = []
+    run_tiles(Run.open(run.path), SerialExecutor(), watch=results.append)
+    assert sum(result.computed.get("evaluate", 0) for result in results) == 1
     assert_same(run, local)
 
 
@@ -317,18 +285,17 @@ def test_run_cached_makes_few_requests(run, storage):
 
 
 def test_commands_accept_s3_addresses(survey, bucket, tmp_path, local, flexroad):
-    config = tmp_path / "light.yaml"
-    config.write_text(yaml.safe_dump(LIGHT, sort_keys=False))
-    home = str(bucket / "run")
-    words = ["run", "--config", str(config), "--catalog", str(survey), "--out", home, "--executor", "dask"]
-    flexroad(*words)
+    config, home = tmp_path / "light.yaml", str(bucket / "run")
+    config.write_text(yaml.safe_dump(PLANE, sort_keys=False))
+    words = ("--config", config, "--catalog", survey, "--out", home, "--executor", "dask")
+    flexroad("run", *words).expected(0)
     assert_same(Run.open(bucket / "run"), local)
-    assert "4 done" in flexroad("status", home)
-    flexroad("report", home)
+    assert "4 done" in flexroad("status", home).out
+    flexroad("report", home).expected(0)
     assert paths.read(bucket / "run" / "report.md")
     tile = local.catalog.tiles[0]
     points = tmp_path / "points.csv"
     points.write_text(f"easting,northing\n{tile.grid.west + 10},{tile.grid.north - 10}\n")
-    answer = pd.read_csv(io.StringIO(flexroad("query", home, "--points", points)))
+    answer = pd.read_csv(io.StringIO(flexroad("query", home, "--points", points).out))
     assert list(answer.tile) == [tile.id]
     assert np.isfinite(answer.height_m).all()

@@ -1,4 +1,4 @@
-"""Tiles that are processed alone, each in its own process and store, have one surface and one mesh."""
+"""Surface and mesh across tiles that are processed alone, and where a survey or a road ends in them."""
 
 import concurrent.futures
 import os
@@ -7,6 +7,8 @@ import sys
 
 import numpy as np
 import pytest
+import rasterio
+import shapely
 import trimesh
 
 import flexroad
@@ -19,6 +21,7 @@ from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.products import npz
 from flexroad.tools.report.steps import edge_steps
 from flexroad.tools.synthetic.scenes import write_scenes
+from tests.make_roads import write
 from tests.mesh_union import Union
 from tests.read_exports import true_heights
 
@@ -180,9 +183,7 @@ def test_tiles_processed_together_have_the_same_bytes(alone, tmp_path):
 
 
 def test_surface_of_part_of_unfinished_run(survey, tmp_path):
-    catalog = Catalog.read(survey / "catalog.parquet").select(
-        [tile.id for tile in Catalog.read(survey / "catalog.parquet").tiles[:2]]
-    )
+    catalog = Catalog(Catalog.read(survey / "catalog.parquet").tiles[:2])
     run = Run.create(tmp_path / "run", load_config("production"), catalog)
     run_tiles(run, SerialExecutor(), only=lambda tile: tile == catalog.tiles[0])
     view = flexroad.open_run(tmp_path / "run")
@@ -191,20 +192,95 @@ def test_surface_of_part_of_unfinished_run(survey, tmp_path):
     surface = view.surface(inside)
     assert surface.bounds == inside
     assert np.isnan(surface.height(grid.west + 50, grid.south + 20))
-    assert surface.height(grid.west + 20, grid.south + 20) == pytest.approx(
-        float(view.height(grid.west + 20, grid.south + 20)), abs=1e-9
-    )
+    at = grid.west + 20, grid.south + 20
+    assert surface.height(*at) == pytest.approx(float(view.height(*at)), abs=1e-9)
     with pytest.raises(flexroad.ConfigError, match="has no finished tile in"):
         view.surface(catalog.tiles[1].grid.bounds)
 
 
-def test_surface_of_independent_tiles_raises(finished_paper_run):
+def test_surface_of_independent_tiles_raises(light_run):
     with pytest.raises(flexroad.ConfigError, match=r"fit\.method smoothing_spline makes one"):
-        flexroad.open_run(finished_paper_run).surface()
+        flexroad.open_run(light_run.path).surface()
 
 
-@pytest.fixture
-def finished_paper_run(survey, tmp_path):
-    catalog = Catalog.read(survey / "catalog.parquet")
-    Run.create(tmp_path / "paper", load_config("paper"), catalog)
-    return tmp_path / "paper"
+# --- roads that are polygons, and a survey that ends within tiles --------------------------------------
+
+LIMIT_M, SLOPE = 190.3, 0.31
+"""Northing of the end of the survey in the west (m), and its descent to the east."""
+
+
+def covered(x, y):
+    """Whether the survey has data, by metres from the south-west corner of the four tiles."""
+    return y < LIMIT_M - SLOPE * x
+
+
+def near_limit(x, y):
+    away = (LIMIT_M - SLOPE * x - y) / np.hypot(1, SLOPE)
+    return np.abs(away) < 1
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("survey")
+    scenes = Catalog.read(write_scenes(folder, 4, seed=5, size_m=SIZE_M))
+    west, south = np.min([tile.grid.bounds[:2] for tile in scenes.tiles], axis=0)
+    for name in ("dsm", "dtm"):
+        for path in folder.glob(f"{name}/*.tif"):
+            with rasterio.open(path, "r+") as raster:
+                row, col = np.indices(raster.shape)
+                x, y = raster.transform * (col + 0.5, row + 0.5)
+                heights = raster.read(1)
+                heights[~covered(x - west, y - south)] = raster.nodata
+                raster.write(heights, 1)
+    street = shapely.buffer(shapely.linestrings([(-30, 20.4), (96, 61.7), (240, 50)]), 4.2, cap_style="flat")
+    ring = shapely.Point(100, 108).buffer(15).difference(shapely.Point(100, 108).buffer(8))
+    roads = [
+        shapely.transform(road, lambda points: points + np.array([west, south])) for road in (street, ring)
+    ]
+    write(folder / "roads.gpkg", roads, scenes.tiles[0].grid.crs)
+    patterns = {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif", "roads": "roads.gpkg"}
+    catalog = Catalog(rasters.index(folder, patterns, tile_size_m=SIZE_M).tiles)
+    made = Run.create(folder / "run", load_config("production_vector"), catalog)
+    summary = run_tiles(made, SerialExecutor())
+    assert (summary.done, summary.failed) == (4, 0)
+    return made, catalog, roads, (west, south)
+
+
+def products_of(run, end):
+    made, catalog, *_ = run
+    return [made.folder(tile.id).path / f"{tile.id}_flexroad{end}" for tile in catalog.tiles]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("end", "read"), [(".glb", glb_part), (".ply", ply_part)])
+def test_meshes_join_and_end_with_the_survey(ended, end, read):
+    origin = ended[-1]
+    whole = Union.of(part for path in products_of(ended, end) for part in read(path))
+    assert whole.uses.max() == 2
+    at_limit = near_limit(*(whole.middles - origin).T)
+    assert (whole.uses[whole.inside & ~at_limit] == 2).all()
+    assert (whole.uses[whole.inside] == 1).sum() > 50
+    x, y = np.meshgrid(*[np.arange(0.5, 2 * SIZE_M)] * 2)
+    assert whole.area == pytest.approx(np.count_nonzero(covered(x, y)), abs=60)
+
+
+@pytest.mark.slow
+def test_road_of_glb_is_that_of_polygons(ended):
+    *_, roads, (west, south) = ended
+    triangles = []
+    for path in products_of(ended, ".glb"):
+        scene = trimesh.load(path, process=False)
+        x0, y0, _ = scene.metadata["run_origin"]
+        for node in scene.graph.nodes_geometry:
+            matrix, name = scene.graph[node]
+            if name == "road":
+                x, _, z = (scene.geometry[name].vertices + matrix[:3, 3]).T
+                plan = np.stack([x + x0 - west, y0 - z - south], axis=1)
+                triangles.append(plan[scene.geometry[name].faces])
+    drawn = shapely.union_all(shapely.polygons(np.concatenate(triangles)), grid_size=1e-4)
+    truth = shapely.transform(shapely.union_all(roads), lambda points: points - np.array([west, south]))
+    # Away from the limit of the survey.
+    ground = shapely.Polygon([(0, 0), (200, 0), (200, LIMIT_M - 200 * SLOPE - 1), (0, LIMIT_M - 1)])
+    drawn, truth = (shapely.intersection(area, ground) for area in (drawn, truth))
+    assert drawn.area == pytest.approx(truth.area, rel=1e-3)
+    assert shapely.area(drawn ^ truth) < 0.01 * shapely.length(truth)

@@ -1,74 +1,54 @@
 """Runs on both executors: which nodes are computed, which are reused, and how failures are recorded."""
 
+import hashlib
 import json
 import os
-import shutil
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pystac
 import pytest
 import rasterio
+import trimesh
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.run.api import rerun_filter
+from flexroad.pipeline.run.events import EventLog
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import summary
-from flexroad.pipeline.run.summary import Summary
-from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.store.tables import read_metrics
-from flexroad.pipeline.worker.tile import TileResult
+from flexroad.pipeline.store.tables import METRICS, PREVIOUS, read_metrics
+from flexroad.tools.report import write_report
 from flexroad.tools.report.browser.relief import relief
 from flexroad.tools.report.content import gather
 from flexroad.tools.report.steps import edge_steps, find_results
+from tests.builders import LIGHT
 from tests.conftest import QUICK
+from tests.whole_run import rows
 
 FIXED = (
     "tile_id variant method stratum status l2_road_m l2_terrain_m rmse_road_m rmse_terrain_m nmad_road_m "
     "p95_road_m mad_road_deg mad_terrain_deg triangles road_fraction completeness seconds error"
 ).split()
-EACH = {"load": 1, "segment": 1, "ecsrc": 1, "fit": 3, "sample": 3, "evaluate": 3, "assess": 3, "export": 1}
+PAPER = {"load": 1, "segment": 1, "ecsrc": 1, "fit": 3, "sample": 3, "evaluate": 3, "assess": 3, "export": 1}
 """Nodes of one tile with the paper's three variants; shared nodes are computed once."""
+EACH = PAPER | {"fit": 2, "sample": 2, "evaluate": 2, "assess": 2}
+"""Nodes of one tile with the two variants of ``LIGHT``."""
 
 
-@pytest.fixture
-def run(survey, quick_config, tmp_path):
-    return Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
-
-
-@pytest.fixture(scope="module")
-def made(made_survey, tmp_path_factory) -> Path:
-    """The folder of a finished run, for copying."""
-    folder = tmp_path_factory.mktemp("made") / "run"
-    run = Run.create(folder, compose(QUICK, "quick"), Catalog.read(made_survey / "catalog.parquet"))
-    run_tiles(run, SerialExecutor())
-    return folder
-
-
-@pytest.fixture
-def finished(made, run):
-    """A finished run with its own survey, which the test may change."""
-    shutil.copytree(made, run.path, dirs_exist_ok=True)
-    return Run.create(run.path, run.config, run.catalog)
+def results_of(run, executor=None, *arguments) -> list:
+    results = []
+    run_tiles(run, executor or SerialExecutor(), *arguments, watch=results.append)
+    return results
 
 
 def computed(results) -> Counter:
-    total = Counter()
-    for result in results:
-        total.update(result.computed)
-    return total
-
-
-def results_of(run, executor, *arguments) -> list[TileResult]:
-    results = []
-    run_tiles(run, executor, *arguments, watch=results.append)
-    return results
+    return sum((Counter(result.computed) for result in results), Counter())
 
 
 def times(n: int, counts=EACH) -> Counter:
@@ -76,109 +56,192 @@ def times(n: int, counts=EACH) -> Counter:
 
 
 def changed(run: Run, **stages) -> Run:
-    raw = {**run.config.raw, **stages}
-    return Run.create(run.path, compose(raw, "changed"), run.catalog)
+    return Run.create(run.path, compose({**LIGHT, **stages}, "changed"), run.catalog)
 
 
-def truncate(run: Run, index: int, layer: str = "dsm") -> tuple[str, bytes]:
-    """Cut a source file of a tile in half; return the tile's id and the original bytes."""
-    tile = run.catalog.tiles[index]
-    path = tile.paths(tile.layer(layer))[0]
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    return tile.id, whole
+def own_file(run, number):
+    tile = run.catalog.tiles[number]
+    return tile.paths(tile.layer("dsm"))[0]
 
 
-def test_run_writes_all_rows_and_computes_shared_nodes_once(run, executor):
-    results = results_of(run, executor)
-    assert computed(results) == times(4)
-    rows = read_metrics(run.path)
-    assert list(rows.columns[: len(FIXED)]) == FIXED
-    assert list(zip(rows.tile_id, rows.variant, rows.method, strict=True)) == [
+# --- one run, on each executor ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def of_executor(made_survey, tmp_path_factory):
+    """Return a run with the paper's variants, and its results, by an executor."""
+
+    def made(executor):
+        folder = tmp_path_factory.mktemp("made") / "run"
+        run = Run.create(folder, compose(QUICK, "quick"), Catalog.read(made_survey / "catalog.parquet"))
+        return run, results_of(run, executor)
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def serial(of_executor):
+    return of_executor(SerialExecutor())
+
+
+@pytest.fixture(scope="module")
+def dask(of_executor, cluster):
+    return of_executor(DaskExecutor(scheduler=cluster.scheduler_address))
+
+
+@pytest.fixture(params=["serial", "dask"])
+def made(request):
+    return request.getfixturevalue(request.param)
+
+
+def test_run_writes_all_rows_and_computes_shared_nodes_once(made):
+    run, results = made
+    assert computed(results) == times(4, PAPER)
+    table = read_metrics(run.path)
+    assert list(table.columns[: len(FIXED)]) == FIXED
+    assert list(zip(table.tile_id, table.variant, table.method, strict=True)) == [
         (tile.id, variant, method)
         for tile in run.catalog.tiles
         for variant, method in (("plane", "plane"), ("rgt", "raster"), ("flexroad", "nurbs"))
     ]
-    assert set(rows.status) == {"done"}
-    assert (rows.seconds > 0).all()
-    assert list(rows[rows.variant == "rgt"].triangles) == [2 * 59**2] * 4
-    assert list(rows[rows.variant == "plane"].triangles) == [2] * 4
-    assert rows.completeness.min() > 0.99
+    assert set(table.status) == {"done"}
+    assert (table.seconds > 0).all()
+    assert list(table[table.variant == "rgt"].triangles) == [2 * 59**2] * 4
+    assert list(table[table.variant == "plane"].triangles) == [2] * 4
+    assert table.completeness.min() > 0.99
 
 
-def test_executors_give_equal_tables(survey, quick_config, tmp_path, cluster):
-    tables = []
-    for name, executor in (("a", SerialExecutor()), ("b", DaskExecutor(scheduler=cluster.scheduler_address))):
-        run = Run.create(tmp_path / name, load_config(quick_config), Catalog.read(survey))
-        run_tiles(run, executor)
-        tables.append(read_metrics(run.path).drop(columns="seconds"))
-    pd.testing.assert_frame_equal(*tables, check_exact=True)
+def test_executors_give_equal_tables(serial, dask):
+    pd.testing.assert_frame_equal(rows(serial[0].path), rows(dask[0].path), check_exact=True)
 
 
-def test_repeated_run_computes_nothing(finished, executor):
-    before = read_metrics(finished.path)
-    results = results_of(Run.open(finished.path), executor)
+def test_log_has_one_event_per_tile_and_stage(made):
+    run, _ = made
+    events = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
+    kinds = Counter(event["event"] for event in events)
+    assert kinds == {"run": 1, "stage": 4 * len(PAPER), "tile": 4, "end": 1}
+    stages = [event for event in events if event["event"] == "stage"]
+    for tile in run.catalog.tiles:
+        by_stage = {event["stage"]: event for event in stages if event["tile"] == tile.id}
+        assert {stage: event["computed"] for stage, event in by_stage.items()} == PAPER
+        assert by_stage["fit"]["bytes"] > 1000
+        assert by_stage["load"]["bytes"] == 0
+    assert all(event["peak_mb"] > 10 and event["pid"] and event["host"] for event in stages)
+
+
+def test_products_have_checksums_and_open_in_standard_readers(made):
+    run, _ = made
+    tile = run.catalog.tiles[0]
+    folder = run.folder(tile.id).path
+    item = pystac.Item.from_file(str(folder / "item.json"))
+    assert item.id == tile.id
+    assert set(item.assets) == {"mesh", "ply", "height", "road", "height_source", "surface"}
+    names = {asset.href for asset in item.assets.values()}
+    assert {path.name for path in folder.iterdir()} == names | {"item.json"}
+    for asset in item.assets.values():
+        data = (folder / asset.href).read_bytes()
+        assert asset.extra_fields["file:checksum"] == "1220" + hashlib.sha256(data).hexdigest()
+    assert set(trimesh.load(folder / f"{tile.id}_flexroad.glb").geometry) == {"road", "terrain"}
+    cloud = trimesh.load(folder / f"{tile.id}_flexroad.ply", process=False)
+    west, south, east, north = tile.grid.hull
+    assert np.allclose(cloud.bounds[:, :2], [[west, south], [east, north]], atol=1e-6)
+    with rasterio.open(folder / f"{tile.id}_flexroad_height.tif") as raster:
+        assert tuple(raster.bounds) == tile.grid.bounds
+        assert raster.crs.to_epsg() == 25832
+
+
+# --- another run of the same folder -------------------------------------------------------------------
+
+
+def test_repeated_run_computes_nothing(own_run, executor):
+    before = read_metrics(own_run.path)
+    results = results_of(Run.open(own_run.path), executor)
     assert {result.status for result in results} == {"cached"}
     assert computed(results) == Counter()
-    pd.testing.assert_frame_equal(before, read_metrics(finished.path), check_exact=True)
-    counts = summary(finished)
+    pd.testing.assert_frame_equal(before, read_metrics(own_run.path), check_exact=True)
+    counts = summary(own_run)
     assert (counts.tiles, counts.done, counts.cached, counts.failed, counts.pending) == (4, 4, 4, 0, 0)
 
 
-def test_changed_option_computes_its_stage_and_dependents(finished, executor):
-    again = results_of(changed(finished, evaluate={"nearest": True}), executor)
-    # Results of load and meshes that are not exported are not stored, so they are computed again.
-    assert computed(again) == times(4, {"load": 1, "sample": 2, "fit": 1, "evaluate": 3, "export": 1})
-    assert read_metrics(finished.path).nearest_road_m.notna().all()
-    back = results_of(changed(finished), executor)
-    assert computed(back) == times(4, {"export": 1})
+@pytest.mark.parametrize(
+    ("stages", "expected"),
+    [
+        # Results of load and meshes that are not exported are not stored, so they are computed again.
+        (
+            {"evaluate": {"nearest": True}},
+            {"load": 1, "sample": 1, "fit": 1, "evaluate": 2, "export": 1},
+        ),
+        ({"ecsrc": {"theta_z_m": 0.1}}, {stage: EACH[stage] for stage in EACH if stage != "segment"}),
+        ({"variants": {"smooth": {}}}, {"export": 1}),
+    ],
+)
+def test_changed_option_computes_its_stage_and_dependents(stages, expected, own_run):
+    assert computed(results_of(changed(own_run, **stages))) == times(4, expected)
+    table = read_metrics(own_run.path)
+    assert table.nearest_road_m.notna().all() == ("evaluate" in stages)
+    assert set(table.variant) == set(stages.get("variants", LIGHT["variants"]))
+    assert computed(results_of(changed(own_run))) == times(4, {"export": 1})
+    assert set(read_metrics(own_run.path).variant) == set(LIGHT["variants"])
 
 
-def test_changed_filter_reuses_segmentation(finished, executor):
-    again = results_of(changed(finished, ecsrc={"theta_z_m": 0.1}), executor)
-    assert computed(again) == times(4, EACH) - times(4, {"segment": 1})
-
-
-def test_changed_source_computes_only_its_tile(finished, executor):
-    tile = finished.catalog.tiles[1]
-    path = tile.paths(tile.layer("dsm"))[0]
-    with rasterio.open(path, "r+") as raster:
-        heights = raster.read(1)
-        raster.write(heights + 0.5, 1)
-    results = results_of(Run.open(finished.path), executor)
-    assert {r.tile_id: r.status for r in results if r.status != "cached"} == {tile.id: "done"}
+def test_changed_source_computes_only_its_tile(own_run):
+    with rasterio.open(own_file(own_run, 1), "r+") as raster:
+        raster.write(raster.read(1) + 0.5, 1)
+    results = results_of(Run.open(own_run.path))
+    found = {result.tile_id: result.status for result in results if result.status != "cached"}
+    assert found == {own_run.catalog.tiles[1].id: "done"}
     assert computed(results) == times(1)
 
 
-def test_shared_store_is_reused_by_another_run(finished, executor, tmp_path):
-    other = Run.create(tmp_path / "other", finished.config, finished.catalog, finished.store)
+def test_shared_store_is_reused_by_another_run(own_run, executor, tmp_path):
+    other = Run.create(tmp_path / "other", own_run.config, own_run.catalog, own_run.store)
     assert computed(results_of(other, executor)) == times(4, {"export": 1})
     assert not (tmp_path / "other" / "store").exists()
-    left, right = (read_metrics(r.path) for r in (finished, other))
+    left, right = (read_metrics(run.path) for run in (own_run, other))
     pd.testing.assert_frame_equal(left, right, check_exact=True)
-    assert Run.open(other.path).store == finished.store.resolve()
+    assert Run.open(other.path).store == own_run.store.resolve()
 
 
-def test_broken_source_fails_only_its_tile(run, executor):
-    broken, whole = truncate(run, 2)
+def test_forced_stages_are_computed_again(own_run, executor):
+    one = rerun_filter(own_run, (own_run.catalog.tiles[3].id,), failed=False)
+    results = results_of(own_run, executor, one, frozenset({"fit", "sample", "evaluate"}))
+    assert computed(results) == times(1, {"load": 1, "fit": 2, "sample": 2, "evaluate": 2, "export": 1})
+
+
+def test_tiles_of_an_older_version_are_exported_again_from_the_store(own_run, monkeypatch):
+    for name in ("tasks.products.cog.VERSION", "pipeline.graph.graph.ITEM_VERSION"):
+        monkeypatch.setattr(f"flexroad.{name}", 10**6)
+        assert computed(results_of(Run.open(own_run.path))) == times(4, {"export": 1})
+
+
+def test_broken_source_fails_only_its_tile(survey, tmp_path, executor):
+    run = Run.create(tmp_path / "run", compose(LIGHT, "light"), Catalog.read(survey))
+    path, broken = own_file(run, 2), run.catalog.tiles[2].id
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
     results = results_of(run, executor)
-    assert {r.tile_id for r in results if r.status == "failed"} == {broken}
-    rows = read_metrics(run.path)
-    assert len(rows) == 12
-    bad = rows[rows.tile_id == broken]
+    assert {result.tile_id for result in results if result.status == "failed"} == {broken}
+    table = read_metrics(run.path)
+    assert len(table) == 8
+    bad = table[table.tile_id == broken]
     assert set(bad.status) == {"failed"}
     assert bad.error.str.startswith("load: TaskError: ").all()
     assert bad.l2_road_m.isna().all()
-    assert set(rows[rows.tile_id != broken].status) == {"done"}
+    assert set(table[table.tile_id != broken].status) == {"done"}
     counts = summary(run)
     assert (counts.done, counts.failed) == (3, 1)
     (failure,) = counts.failures
-    assert failure.tile_id == broken
-    assert failure.file.endswith(f"{broken}.tif")
+    assert (failure.tile_id, failure.file) == (broken, str(path))
     assert pd.read_csv(run.path / "failures.csv").tile_id.astype(str).tolist() == [broken]
+    # The failed tile is chosen, or a given one.
+    failed = rerun_filter(run, (), failed=True)
+    assert [result.tile_id for result in results_of(run, executor, failed)] == [broken]
+    one = run.catalog.tiles[3].id
+    results = results_of(run, executor, rerun_filter(run, (one,), failed=False))
+    assert [(result.tile_id, result.status) for result in results] == [(one, "cached")]
+    assert len(read_metrics(run.path)) == 8
 
-    tile = run.catalog.tiles[2]
-    tile.paths(tile.layer("dsm"))[0].write_bytes(whole)
+    path.write_bytes(whole)
     fixed = results_of(run, executor, rerun_filter(run, (), failed=True))
     # The restored file has another time, so the recorded failure is of another graph: the tile is pending.
     fixed = fixed or results_of(run, executor)
@@ -186,70 +249,33 @@ def test_broken_source_fails_only_its_tile(run, executor):
     assert summary(run).failed == 0
 
 
-def test_rerun_filter_selects_given_or_failed_tiles(run, executor):
-    broken, _ = truncate(run, 0)
-    run_tiles(run, executor)
-    assert [r.tile_id for r in results_of(run, executor, rerun_filter(run, (), failed=True))] == [broken]
-    one = run.catalog.tiles[3].id
-    results = results_of(run, executor, rerun_filter(run, (one,), failed=False))
-    assert [(r.tile_id, r.status) for r in results] == [(one, "cached")]
-    assert len(read_metrics(run.path)) == 12
+def test_missing_source_keeps_result_until_tile_is_processed(own_run):
+    own_file(own_run, 1).unlink()
+    assert (summary(own_run).done, summary(own_run).pending) == (4, 0)
+    other = rerun_filter(own_run, (own_run.catalog.tiles[0].id,), failed=False)
+    for only, expected in ((other, (4, 1, 0)), (lambda tile: True, (3, 3, 1))):
+        counts = run_tiles(own_run, SerialExecutor(), only)
+        assert (counts.done, counts.cached, counts.failed) == expected
+    assert counts.failures[0].tile_id == own_run.catalog.tiles[1].id
 
 
-def test_forced_stages_are_computed_again(finished, executor):
-    one = finished.catalog.tiles[3].id
-    force = frozenset({"fit", "sample", "evaluate"})
-    results = results_of(finished, executor, rerun_filter(finished, (one,), failed=False), force)
-    assert computed(results) == times(1, {"load": 1, "fit": 3, "sample": 3, "evaluate": 3, "export": 1})
-
-
-def test_damaged_artefact_is_computed_again(finished, executor):
-    before = read_metrics(finished.path)
-    tile = finished.catalog.tiles[0].id
-    for path in (finished.path / "store" / "evaluate").rglob("*.npz"):
-        path.write_bytes(path.read_bytes()[:-40])
-    for folder in (finished.path / "tiles").iterdir():
-        (folder / "item.json").unlink()
-    results = results_of(finished, executor)
-    assert computed(results)["evaluate"] == 12
-    assert computed(results)["ecsrc"] == 0
-    after = read_metrics(finished.path)
-    pd.testing.assert_frame_equal(before.drop(columns="seconds"), after.drop(columns="seconds"))
-    assert finished.folder(tile).path.exists()
-
-
-def test_tiles_of_an_older_version_are_exported_again_from_the_store(finished, executor, monkeypatch):
-    monkeypatch.setattr("flexroad.tasks.products.cog.VERSION", 10**6)
-    assert computed(results_of(finished, executor)) == times(4, {"export": 1})
-    monkeypatch.setattr("flexroad.pipeline.graph.graph.ITEM_VERSION", 10**6)
-    assert computed(results_of(Run.open(finished.path), executor)) == times(4, {"export": 1})
-
-
-def test_missing_product_is_written_again(finished, executor):
-    folder = finished.folder(finished.catalog.tiles[0].id).path
-    (mesh,) = folder.glob("*.glb")
-    whole = mesh.read_bytes()
-    mesh.unlink()
-    assert computed(results_of(finished, executor)) == times(1, {"export": 1})
-    assert mesh.read_bytes() == whole
-
-
-def test_full_disk_fails_tile_and_leaves_no_temporary_file(run, monkeypatch):
-    put = ArtefactStore.put
-
-    def full(self, node, value, *rest):
-        if node.stage == "fit" and len(list(self.root.rglob("*.npz"))) > 12:
-            raise OSError(28, "No space left on device", str(self.root))
-        return put(self, node, value, *rest)
-
-    monkeypatch.setattr(ArtefactStore, "put", full)
-    results = results_of(run, SerialExecutor())
-    failed = [r for r in results if r.status == "failed"]
-    assert 0 < len(failed) < 4
-    assert "No space left on device" in failed[0].failures[0].line
-    monkeypatch.undo()
-    assert {r.status for r in results_of(run, SerialExecutor())} == {"done", "cached"}
-    assert not list(run.path.rglob("*.tmp"))
+def test_summary_counts_new_changed_and_vanished_tiles(survey, tmp_path):
+    catalog, config = Catalog.read(survey), compose(LIGHT, "light")
+    first = Run.create(tmp_path / "run", config, Catalog(catalog.tiles[:3]))
+    counts = run_tiles(first, SerialExecutor())
+    assert (counts.new, counts.changed, counts.vanished, counts.exit_code) == (3, 0, 0, 0)
+    tile = catalog.tiles[1]
+    os.utime(tile.paths(tile.layer("dtm"))[0], (1, 1))
+    second = Run.create(first.path, config, Catalog(catalog.tiles[1:]))
+    assert [summary(second).pending, summary(second).done] == [2, 1]
+    counts = run_tiles(second, SerialExecutor())
+    expected = {"new": 1, "changed": 1, "vanished": 1, "tiles": 3, "done": 3, "cached": 1, "exit_code": 0}
+    told = json.loads((first.path / "summary.json").read_text())
+    for name, value in expected.items():
+        assert getattr(counts, name) == told[name] == value
+    assert told["start"] < told["end"]
+    assert list(read_metrics(first.path).tile_id.unique()) == [tile.id for tile in second.catalog.tiles]
+    assert run_tiles(second, SerialExecutor()).vanished == 0
 
 
 class CallBeforeTile(SerialExecutor):
@@ -265,201 +291,114 @@ class CallBeforeTile(SerialExecutor):
             yield function(job)
 
 
-@pytest.mark.parametrize("change", ["replaced", "truncated"])
-def test_source_changed_during_processing_fails_its_tile(change, run, survey, quick_config, tmp_path):
-    tile = run.catalog.tiles[2]
-    path = tile.paths(tile.layer("dsm"))[0]
+def interrupt():
+    raise KeyboardInterrupt
 
-    def change_source():
-        if change == "truncated":
-            path.write_bytes(path.read_bytes()[:700])
-            return
-        with rasterio.open(path, "r+") as raster:
-            raster.write(raster.read(1) + 0.5, 1)
 
-    whole = path.read_bytes()
-    results = results_of(run, CallBeforeTile(2, change_source))
-    assert [result.status for result in results] == ["done", "done", "failed", "done"]
-    (failure,) = results[2].failures
-    assert (failure.stage, failure.kind, failure.file) == ("load", "SourceChanged", str(path))
-    assert "run the same command again" in failure.message
-    assert not failure.trace
-    stored = {path.stem for path in (run.path / "store").rglob("*.npz")}
-    assert not stored & set(run.graph(tile).nodes)
-    if change == "truncated":
-        path.write_bytes(whole)
+def test_interrupted_run_writes_tables_and_summary(survey, tmp_path):
+    run = Run.create(tmp_path / "run", compose(LIGHT, "light"), Catalog.read(survey))
+    with pytest.raises(KeyboardInterrupt):
+        run_tiles(run, CallBeforeTile(2, interrupt))
+    told = json.loads((run.path / "summary.json").read_text())
+    assert [told[name] for name in ("interrupted", "exit_code", "done", "pending")] == [True, 130, 2, 2]
+    assert read_metrics(run.path).tile_id.nunique() == 2
     counts = run_tiles(run, SerialExecutor())
-    assert (counts.done, counts.cached, counts.changed) == (4, 3, 1)
-    undisturbed = Run.create(tmp_path / "undisturbed", run.config, run.catalog)
-    run_tiles(undisturbed, SerialExecutor())
-    left, right = (read_metrics(r.path).drop(columns="seconds") for r in (run, undisturbed))
-    pd.testing.assert_frame_equal(left, right, check_exact=True)
+    assert (counts.done, counts.cached, counts.interrupted, counts.exit_code) == (4, 2, False, 0)
 
 
-def assert_nothing_to_do(run) -> Summary:
+def test_interrupted_run_drops_rows_of_earlier_configuration(own_run):
+    with pytest.raises(KeyboardInterrupt):
+        run_tiles(changed(own_run, evaluate={"nearest": True}), CallBeforeTile(1, interrupt))
+    table = read_metrics(own_run.path)
+    assert list(table.tile_id.unique()) == [own_run.catalog.tiles[0].id]
+    assert table.nearest_road_m.notna().all()
+
+
+def assert_nothing_to_do(run) -> None:
     """Execute a finished run; fail if a tile is processed."""
     before = read_metrics(run.path)
     counts = run_tiles(run, CallBeforeTile(0, lambda: pytest.fail("a tile was processed")))
     assert (counts.done, counts.cached) == (4, 4)
     pd.testing.assert_frame_equal(before, read_metrics(run.path), check_exact=True)
-    return counts
 
 
-def test_resume_makes_each_graph_once_and_reads_no_marker(finished, monkeypatch):
-    made = Counter()
-    graph = Pattern.graph
+def counted_graphs(monkeypatch) -> Counter:
+    """Count the graphs that are made of each tile from now on."""
+    graph, made = Pattern.graph, Counter()
 
     def counted(self, tile, *arguments):
         made[tile.id] += 1
         return graph(self, tile, *arguments)
 
     monkeypatch.setattr(Pattern, "graph", counted)
+    return made
+
+
+def test_resume_makes_each_graph_once_and_reads_no_marker(own_run, monkeypatch):
+    made = counted_graphs(monkeypatch)
     monkeypatch.setattr(
         "flexroad.pipeline.run.status._from_marker", lambda *_: pytest.fail("a marker was read")
     )
-    assert_nothing_to_do(Run.open(finished.path))
-    assert made == {tile.id: 1 for tile in finished.catalog.tiles}
+    assert_nothing_to_do(Run.open(own_run.path))
+    assert made == {tile.id: 1 for tile in own_run.catalog.tiles}
 
 
-@pytest.mark.parametrize("state", ["lost", "damaged", "outdated"])
-def test_outdated_database_is_restored_from_markers(state, finished):
-    database = finished.path / "database.txt"
+def test_outdated_database_is_restored_from_markers(own_run):
+    """As if the client had been killed before it wrote any record."""
+    database = own_run.path / "database.txt"
     before = database.read_bytes()
-    run = changed(finished, evaluate={"nearest": True})
+    run = changed(own_run, evaluate={"nearest": True})
     run_tiles(run, SerialExecutor())
-    if state == "lost":
-        database.unlink()
-    else:
-        # As if the client had been killed before it wrote any record.
-        database.write_bytes(before if state == "outdated" else before[:5000])
+    database.write_bytes(before)
     assert summary(run).done == 4
     assert_nothing_to_do(run)
     assert read_metrics(run.path).nearest_road_m.notna().all()
 
 
-def test_summary_counts_new_changed_and_vanished_tiles(run):
-    first = Run.create(run.path, run.config, Catalog(run.catalog.tiles[:3]))
-    counts = run_tiles(first, SerialExecutor())
-    assert (counts.new, counts.changed, counts.vanished, counts.exit_code) == (3, 0, 0, 0)
-    tile = run.catalog.tiles[1]
-    os.utime(tile.paths(tile.layer("dtm"))[0], (1, 1))
-    second = Run.create(run.path, run.config, Catalog(run.catalog.tiles[1:]))
-    assert [summary(second).pending, summary(second).done] == [2, 1]
-    counts = run_tiles(second, SerialExecutor())
-    assert (counts.new, counts.changed, counts.vanished) == (1, 1, 1)
-    assert (counts.tiles, counts.done, counts.cached) == (3, 3, 1)
-    written = json.loads((run.path / "summary.json").read_text())
-    assert {name: written[name] for name in ("new", "changed", "vanished", "done", "exit_code")} == {
-        "new": 1, "changed": 1, "vanished": 1, "done": 3, "exit_code": 0,
-    }  # fmt: skip
-    assert written["start"] < written["end"]
-    assert list(read_metrics(run.path).tile_id.unique()) == [tile.id for tile in second.catalog.tiles]
-    assert run_tiles(second, SerialExecutor()).vanished == 0
+def test_metrics_before_the_last_execution_that_computed_tiles_are_kept(own_run):
+    def again(watch=lambda result: None):
+        """Change the time of a tile's DSM, and run."""
+        path = own_file(own_run, 0)
+        path.write_bytes(path.read_bytes())
+        run_tiles(own_run, SerialExecutor(), watch=watch)
 
+    def interrupted(result):
+        if result.status != "cached":
+            raise KeyboardInterrupt
 
-def test_interrupted_run_writes_tables_and_summary(run):
-    def interrupt():
-        raise KeyboardInterrupt
-
+    metrics, previous = own_run.path / METRICS, own_run.path / PREVIOUS
+    assert not previous.exists()
+    first = metrics.read_bytes()
+    again()
+    second = metrics.read_bytes()
+    run_tiles(own_run, SerialExecutor())
+    assert previous.read_bytes() == first != second
+    # An interrupted run does not count.
+    before = metrics.read_bytes()
     with pytest.raises(KeyboardInterrupt):
-        run_tiles(run, CallBeforeTile(2, interrupt))
-    written = json.loads((run.path / "summary.json").read_text())
-    assert {name: written[name] for name in ("interrupted", "exit_code", "done", "pending")} == {
-        "interrupted": True, "exit_code": 130, "done": 2, "pending": 2,
-    }  # fmt: skip
-    assert read_metrics(run.path).tile_id.nunique() == 2
-    counts = run_tiles(run, SerialExecutor())
-    assert (counts.done, counts.cached, counts.interrupted, counts.exit_code) == (4, 2, False, 0)
+        again(interrupted)
+    run_tiles(own_run, SerialExecutor())
+    assert previous.read_bytes() == before
+    page = write_report(own_run, "html").read_text()
+    assert "Compared with the state before the last run: 4 tiles done in both runs." in page
+    previous.write_bytes(b"PAR1")
+    with pytest.raises(ConfigError, match=r"metrics.previous.parquet is damaged: .*; remove it"):
+        write_report(own_run, "html")
 
 
-def test_interrupted_run_drops_rows_of_earlier_configuration(finished):
-    def interrupt():
-        raise KeyboardInterrupt
-
-    other = changed(finished, evaluate={"nearest": True})
-    with pytest.raises(KeyboardInterrupt):
-        run_tiles(other, CallBeforeTile(1, interrupt))
-    rows = read_metrics(finished.path)
-    assert list(rows.tile_id.unique()) == [finished.catalog.tiles[0].id]
-    assert rows.nearest_road_m.notna().all()
+def test_configuration_of_a_run_without_extends_keeps_its_options(own_run):
+    file = own_run.path / "config.yaml"
+    text = file.read_text()
+    assert text.startswith("extends: defaults\n")
+    file.write_text(text.removeprefix("extends: defaults\n"))
+    assert Run.open(own_run.path).config.chains == own_run.config.chains
 
 
-def test_verify_writes_changed_product_again(finished):
-    folder = finished.folder(finished.catalog.tiles[0].id).path
-    (mesh,) = folder.glob("*.glb")
-    whole = mesh.read_bytes()
-    mesh.write_bytes(bytes(len(whole)))
-    assert_nothing_to_do(finished)
-    results = []
-    run_tiles(finished, SerialExecutor(), watch=results.append, verify=True)
-    assert computed(results) == times(1, {"export": 1})
-    assert mesh.read_bytes() == whole
+# --- steps and relief of the report -------------------------------------------------------------------
 
 
-def test_missing_source_keeps_result_until_tile_is_processed(finished):
-    tile = finished.catalog.tiles[1]
-    tile.paths(tile.layer("dsm"))[0].unlink()
-    assert (summary(finished).done, summary(finished).pending) == (4, 0)
-    other = finished.catalog.tiles[0].id
-    counts = run_tiles(finished, SerialExecutor(), rerun_filter(finished, (other,), failed=False))
-    assert (counts.done, counts.cached, counts.failed) == (4, 1, 0)
-    counts = run_tiles(finished, SerialExecutor())
-    assert (counts.done, counts.cached, counts.failed) == (3, 3, 1)
-    assert counts.failures[0].tile_id == tile.id
-
-
-def test_log_has_one_event_per_tile_and_stage(run, executor):
-    run_tiles(run, executor)
-    events = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
-    kinds = Counter(event["event"] for event in events)
-    assert kinds == {"run": 1, "stage": 4 * len(EACH), "tile": 4, "end": 1}
-    stages = [event for event in events if event["event"] == "stage"]
-    for tile in run.catalog.tiles:
-        by_stage = {event["stage"]: event for event in stages if event["tile"] == tile.id}
-        assert {stage: event["computed"] for stage, event in by_stage.items()} == EACH
-        assert by_stage["fit"]["bytes"] > 1000
-        assert by_stage["load"]["bytes"] == 0
-    assert all(event["peak_mb"] > 10 and event["pid"] and event["host"] for event in stages)
-
-
-def test_item_is_valid_stac_with_checksums(run, executor):
-    import hashlib
-
-    import pystac
-
-    run_tiles(run, executor)
-    tile = run.catalog.tiles[0]
-    folder = run.folder(tile.id).path
-    item = pystac.Item.from_file(str(folder / "item.json"))
-    assert item.id == tile.id
-    assert set(item.assets) == {"mesh", "ply", "height", "road", "height_source", "surface"}
-    assert {path.name for path in folder.iterdir()} == {
-        *(asset.href for asset in item.assets.values()),
-        "item.json",
-    }
-    for asset in item.assets.values():
-        data = (folder / asset.href).read_bytes()
-        assert asset.extra_fields["file:checksum"] == "1220" + hashlib.sha256(data).hexdigest()
-
-
-def test_products_open_in_standard_readers(run, executor):
-    import trimesh
-
-    run_tiles(run, executor)
-    tile = run.catalog.tiles[0]
-    folder = run.folder(tile.id).path
-    scene = trimesh.load(folder / f"{tile.id}_flexroad.glb")
-    assert set(scene.geometry) == {"road", "terrain"}
-    cloud = trimesh.load(folder / f"{tile.id}_flexroad.ply", process=False)
-    west, south, east, north = tile.grid.hull
-    assert np.allclose(cloud.bounds[:, :2], [[west, south], [east, north]], atol=1e-6)
-    with rasterio.open(folder / f"{tile.id}_flexroad_height.tif") as raster:
-        assert tuple(raster.bounds) == tile.grid.bounds
-        assert raster.crs.to_epsg() == 25832
-
-
-def test_edge_steps_of_large_run_are_a_sample(finished):
-    whole, part = edge_steps(finished), edge_steps(finished, most=2)
+def test_edge_steps_of_large_run_are_a_sample(light_run):
+    whole, part = edge_steps(light_run), edge_steps(light_run, most=2)
     pairs = ["tile", "neighbour"]
     assert (len(whole.edges), whole.note) == (4, "")
     assert 0 < len(part.edges) < len(whole.edges)
@@ -469,38 +408,48 @@ def test_edge_steps_of_large_run_are_a_sample(finished):
     assert list(whole.check.result) == ["tiles are fitted independently"]
 
 
-def test_report_checks_every_tile_once(finished, monkeypatch):
-    graph, checked = Pattern.graph, Counter()
-
-    def counted(pattern, tile, *arguments):
-        checked[tile.id] += 1
-        return graph(pattern, tile, *arguments)
-
-    monkeypatch.setattr(Pattern, "graph", counted)
-    content = gather(finished)
+def test_report_checks_every_tile_once(light_run, monkeypatch):
+    checked = counted_graphs(monkeypatch)
+    content = gather(light_run)
     assert len(content.steps.edges) == 4
-    picture = relief(finished, finished.catalog.tiles, content.results)
-    assert list(picture.places) == [tile.id for tile in finished.catalog.tiles]
+    picture = relief(light_run, light_run.catalog.tiles, content.results)
+    assert list(picture.places) == [tile.id for tile in light_run.catalog.tiles]
     assert checked == dict.fromkeys(picture.places, 1)
 
 
-def test_relief_has_tiles_with_results_in_the_store(finished):
-    first, second, *others = finished.catalog.tiles
-    results = find_results(finished, [first, second])
+def test_relief_has_tiles_with_results_in_the_store(own_run):
+    first, second, *others = own_run.catalog.tiles
+    results = find_results(own_run, [first, second])
     assert set(results["flexroad"]) == {first.id, second.id}
-    (surface,) = finished.store.glob(f"fit/*/{results['flexroad'][first.id][0]}.npz")
+    (surface,) = own_run.store.glob(f"fit/*/{results['flexroad'][first.id][0]}.npz")
     surface.unlink()
-    assert list(relief(finished, finished.catalog.tiles, results).places) == [second.id]
-    assert relief(finished, others, results) is None
+    assert list(relief(own_run, own_run.catalog.tiles, results).places) == [second.id]
+    assert relief(own_run, others, results) is None
 
 
-def test_run_with_pipe_as_log_does_not_wait_for_a_reader(run):
-    (run.path / "log.jsonl").unlink(missing_ok=True)
-    os.mkfifo(run.path / "log.jsonl")
-    assert run_tiles(run, SerialExecutor()).done == len(run.catalog.tiles)
-    assert (run.path / "log.jsonl").is_fifo()
+# --- the log ------------------------------------------------------------------------------------------
 
 
-def test_open_folder_without_run_raises(tmp_path):
-    with pytest.raises(ConfigError, match="is no run"):
-        Run.open(tmp_path)
+def test_run_with_pipe_as_log_does_not_wait_for_a_reader(own_run):
+    log = own_run.path / "log.jsonl"
+    log.unlink()
+    os.mkfifo(log)
+    assert run_tiles(own_run, SerialExecutor(), force=frozenset({"export"})).done == 4
+    assert log.is_fifo()
+
+
+@pytest.mark.parametrize("before", ["", '{"event": "end"}\n', '{"event": "e', "\0\0"])
+def test_log_with_cut_off_line_gets_whole_lines(before, tmp_path):
+    (tmp_path / "log.jsonl").write_text(before)
+    with EventLog(tmp_path) as log:
+        log.note("run")
+    *_, last = (tmp_path / "log.jsonl").read_text().splitlines()
+    assert json.loads(last)["event"] == "run"
+    assert (tmp_path / "log.jsonl").read_text().startswith(before)
+
+
+def test_log_on_full_disk_raises_nothing(tmp_path):
+    # /dev/full rejects every write, as a full disk does.
+    (tmp_path / "log.jsonl").symlink_to("/dev/full")
+    with EventLog(tmp_path) as log:
+        log.note("run")

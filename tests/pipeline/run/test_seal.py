@@ -2,11 +2,13 @@
 
 import json
 import shlex
+from dataclasses import replace
 
 import pytest
 import yaml
 
 from flexroad.catalog import Catalog, CatalogError
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.seal import seal, sealed
@@ -14,12 +16,20 @@ from flexroad.pipeline.store.records import dump_checked, load_checked
 from tests.faulty_files import intercepted
 from tests.power_loss import Recording, states
 
+SERIAL = ("--executor", "serial")
+
 
 @pytest.fixture(autouse=True)
 def home(tmp_path, monkeypatch):
     folder = tmp_path / "state"
     monkeypatch.setenv("XDG_STATE_HOME", str(folder))
     return folder
+
+
+@pytest.fixture
+def made(survey, light_config, tmp_path):
+    """A run, of which nothing is computed."""
+    return Run.create(tmp_path / "run", load_config(light_config), Catalog.read(survey))
 
 
 def test_seal_holds_for_its_list_and_its_user(home, monkeypatch):
@@ -57,30 +67,26 @@ PROGRAMS = {
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_programs_of_a_changed_configuration_need_to_be_given_again(
-    name, flexroad, survey, quick_config, tmp_path
-):
-    run = tmp_path / "run"
-    Run.create(run, *_settings(survey, quick_config))
+def test_programs_of_a_changed_configuration_need_to_be_given_again(name, flexroad, made, tmp_path):
+    run = made.path
     value = json.loads(json.dumps(PROGRAMS[name]).replace("{mark}", str(tmp_path / "mark")))
     config = yaml.safe_load((run / "config.yaml").read_text()) | {"cluster": {name: value}}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
-    said = flexroad("rerun", run, "--executor", "serial").expected(2)
-    (line,) = said.errors
+    (line,) = flexroad("rerun", run, *SERIAL).expected(2).errors
     assert f"{run}/config.yaml: cluster.{name} can start programs, and this user has not given it" in line
     assert not list(run.glob("tiles/*"))
-    assert flexroad("status", run).code == 0
+    flexroad("status", run).expected(0)
     # The words of the message, as a shell reads them.
     again = shlex.split(line.partition("add ")[2])
-    assert flexroad("rerun", run, "--executor", "serial", *again).expected(0)
+    flexroad("rerun", run, *SERIAL, *again).expected(0)
     assert not (tmp_path / "mark").exists()
 
 
-def test_programs_given_to_run_hold_for_its_user(flexroad, survey, quick_config, tmp_path, monkeypatch):
+def test_programs_given_to_run_hold_for_its_user(flexroad, survey, light_config, tmp_path, monkeypatch):
     run, one = tmp_path / "run", Catalog.read(survey).tiles[0].id
-    words = ("--executor", "serial", "--tile", one)
+    words = (*SERIAL, "--tile", one)
     given = ("--set", "cluster.prologue=[module load gdal]")
-    flexroad("run", "--catalog", survey, "--config", quick_config, "--out", run, *given, *words).expected(0)
+    flexroad("run", "--catalog", survey, "--config", light_config, "--out", run, *given, *words).expected(0)
     flexroad("rerun", run, *words).expected(0)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another"))
     option = ("--allow", survey.parent)
@@ -91,30 +97,32 @@ def test_programs_given_to_run_hold_for_its_user(flexroad, survey, quick_config,
 @pytest.mark.parametrize(
     "setting", ["fit.spacing_m=5", "clusters.workers=3", "cluster.no=3", "cluster.workers=0"]
 )
-def test_rerun_takes_options_of_workers_only(setting, flexroad, survey, quick_config, tmp_path):
-    Run.create(tmp_path / "run", *_settings(survey, quick_config))
-    said = flexroad("rerun", tmp_path / "run", "--set", setting).expected(2)
+def test_rerun_takes_options_of_workers_only(setting, flexroad, made):
+    said = flexroad("rerun", made.path, "--set", setting).expected(2)
     assert len(said.errors) == 1
 
 
-def test_store_outside_of_a_foreign_run_needs_allow(flexroad, survey, quick_config, tmp_path, monkeypatch):
-    run, store = tmp_path / "run", tmp_path / "store"
-    config, catalog = _settings(survey, quick_config)
-    Run.create(run, config, catalog, store)
-    assert Run.open(run).store == store
+def change_record(run, name, value) -> None:
     record = load_checked((run / "run.json").read_bytes())
-    other = tmp_path / "other"
-    (run / "run.json").write_bytes(dump_checked(record | {"store": str(other)}))
+    assert name in record
+    (run / "run.json").write_bytes(dump_checked(record | {name: value}))
+
+
+def test_store_outside_of_a_foreign_run_needs_allow(flexroad, made, tmp_path):
+    run, store, other = tmp_path / "stored", tmp_path / "store", tmp_path / "other"
+    Run.create(run, made.config, made.catalog, store)
+    assert Run.open(run).store == store
+    change_record(run, "store", str(other))
     line = f"{run} has its store in {other}, which this user has not given .* add --allow {other}$"
     with pytest.raises(ConfigError, match=line):
         Run.open(run)
     with pytest.raises(ConfigError, match=f"add --store {other}$"):
-        Run.create(run, config, catalog)
+        Run.create(run, made.config, made.catalog)
     for command in ("rerun", "status", "clean"):
         assert f"--allow {other}" in flexroad(command, run).expected(2).err
     assert not other.exists()
     assert Run.open(run, [other]).store == other
-    assert Run.create(run, config, catalog, store).store == Run.open(run).store
+    assert Run.create(run, made.config, made.catalog, store).store == Run.open(run).store
 
 
 def test_key_after_power_failure_is_whole_or_missing(home, tmp_path):
@@ -133,42 +141,24 @@ def test_user_without_writable_home_seals_nothing(home):
 
 
 @pytest.mark.parametrize("allowed", [[], ["/"], None])
-def test_changed_list_of_a_run_allows_nothing(flexroad, survey, quick_config, tmp_path, allowed):
-    run = tmp_path / "run"
-    Run.create(run, *_settings(survey, quick_config))
+def test_changed_list_of_a_run_allows_nothing(flexroad, made, survey, allowed):
+    run, option = made.path, f"--allow {survey.parent}"
     tile = Run.open(run).catalog.tiles[0]
     assert all(path.exists() for path in tile.paths(tile.layers[0]))
-    record = load_checked((run / "run.json").read_bytes())
-    assert str(survey.parent) in record["allowed"]
-    record["allowed"] = allowed
-    (run / "run.json").write_bytes(dump_checked(record))
+    assert str(survey.parent) in load_checked((run / "run.json").read_bytes())["allowed"]
+    change_record(run, "allowed", allowed)
     tile = Run.open(run).catalog.tiles[0]
-    with pytest.raises(CatalogError, match=f"--allow {survey.parent}"):
+    with pytest.raises(CatalogError, match=option):
         tile.paths(tile.layers[0])
     for command in ("rerun", "status", "clean"):
-        said = flexroad(command, run)
-        assert said.code == 2, command
-        assert f"--allow {survey.parent}" in said.err
-    assert flexroad("status", run, "--allow", survey.parent).code == 0
+        assert option in flexroad(command, run).expected(2).err
+    flexroad("status", run, *option.split()).expected(0)
     tile = Run.open(run, [str(survey.parent)]).catalog.tiles[0]
     assert tile.paths(tile.layers[0])
 
 
-def test_run_of_a_catalog_just_made_may_read_its_files(survey, quick_config, tmp_path):
-    config, catalog = _settings(survey, quick_config)
-    made = Catalog(tuple(_unread(tile) for tile in catalog.tiles))
-    Run.create(tmp_path / "run", config, made)
-    for tile in Run.open(tmp_path / "run").catalog.tiles:
+def test_run_of_a_catalog_just_made_may_read_its_files(made, tmp_path):
+    unread = Catalog(tuple(replace(tile, allowed=None) for tile in made.catalog.tiles))
+    Run.create(tmp_path / "new", made.config, unread)
+    for tile in Run.open(tmp_path / "new").catalog.tiles:
         assert all(path.is_file() for layer in tile.layers for path in tile.paths(layer))
-
-
-def _settings(survey, quick_config):
-    from flexroad.pipeline.config.loading import load_config
-
-    return load_config(quick_config), Catalog.read(survey)
-
-
-def _unread(tile):
-    from dataclasses import replace
-
-    return replace(tile, allowed=None)

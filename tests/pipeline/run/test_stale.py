@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import flexroad as library
-from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.cleanup import find_garbage
@@ -23,26 +22,23 @@ from flexroad.tools.export.source import select
 from flexroad.tools.report.content import gather
 from flexroad.tools.synthetic.scenes import write_scenes
 from flexroad.tools.view.driver import write_viewer
+from tests.builders import copy_run, finish_run
 
 ALL = frozenset({"load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export"})
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
-    """A folder with a survey of two tiles and a finished run."""
+def made(tmp_path_factory) -> Run:
+    """A finished run of two tiles, beside its survey."""
     folder = tmp_path_factory.mktemp("made")
-    catalog = Catalog.read(write_scenes(folder / "survey", 2, seed=3, size_m=60))
-    run_tiles(Run.create(folder / "run", load_config("production"), catalog), SerialExecutor())
-    return folder
+    write_scenes(folder / "survey", 2, seed=3, size_m=60)
+    return finish_run(folder / "run", folder / "survey", load_config("production"))
 
 
 @pytest.fixture
 def run(made, tmp_path) -> Run:
-    """A finished run of two tiles with its own survey, which the test may change."""
-    for name in ("survey", "run"):
-        shutil.copytree(made / name, tmp_path / name)
-    catalog = Catalog.read(tmp_path / "survey" / "catalog.parquet")
-    run = Run.create(tmp_path / "run", load_config("production"), catalog)
+    """A copy with its own survey, which the test may change."""
+    run = copy_run(made, made.path.parent / "survey", tmp_path)
     run_tiles(run, SerialExecutor())
     return run
 

@@ -1,7 +1,8 @@
-"""Meshes with the orthophoto: its place on them, the cost of a changed photo, tiles without one."""
+"""Notes of a tile, and meshes with the orthophoto."""
 
 import io
 import json
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import NO_PHOTO
 from tests.builders import LIGHT
 
@@ -61,15 +63,35 @@ def told_place(visual):
     return np.stack([map_coordinates(texels[..., k], place, order=1) for k in (0, 1)], axis=1) * 0.3 - 5
 
 
+def texture_of(run, tile, part="terrain"):
+    return mesh_of(run, tile).geometry[part].visual.material.baseColorTexture
+
+
 def photo_of(catalog, number):
     tile = catalog.tiles[number]
     return tile.paths(tile.layer("dop"))[0]
 
 
+def finished(folder, config, catalog, done=None):
+    """Run a catalog; return the run and its results."""
+    run, results = Run.create(folder, config, catalog), []
+    counts = run_tiles(run, SerialExecutor(), watch=results.append)
+    assert counts.done == (len(catalog.tiles) if done is None else done)
+    return run, results
+
+
+def off_place(part):
+    """Return the error of the photo's place at each vertex (m); x is to the east and z to the south."""
+    return told_place(part.visual) - part.vertices[:, [0, 2]] * (1, -1)
+
+
+def events(run):
+    return [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
+
+
 def test_run_photo_lies_where_the_mesh_does_and_changes_nothing_else(photographed, tmp_path):
-    textured = Run.create(tmp_path / "textured", TEXTURED, photographed)
-    plain = Run.create(tmp_path / "plain", PLAIN, photographed)
-    assert [run_tiles(run, SerialExecutor()).done for run in (textured, plain)] == [4, 4]
+    textured, _ = finished(tmp_path / "textured", TEXTURED, photographed)
+    plain, _ = finished(tmp_path / "plain", PLAIN, photographed)
     for number, tile in enumerate(photographed.tiles):
         one, other = mesh_of(textured, tile), mesh_of(plain, tile)
         for name, part in one.geometry.items():
@@ -78,8 +100,7 @@ def test_run_photo_lies_where_the_mesh_does_and_changes_nothing_else(photographe
             if number == WITHOUT:
                 assert part.visual.uv is None
                 continue
-            # x is east of the tile's corner and z south of it.
-            errors = told_place(part.visual) - part.vertices[:, [0, 2]] * (1, -1)
+            errors = off_place(part)
             # JPEG changes colours by up to 4, which are 1.2 m; half a pixel would show in the mean.
             assert np.abs(errors).max() < 1.5
             assert np.abs(errors.mean(axis=0)).max() < 0.2 * CELL
@@ -104,67 +125,53 @@ def test_run_photo_in_another_crs_is_warped_if_its_layer_allows_it(photographed,
         file.write(values)
     photo = replace(tile.layer("dop"), reproject=True)
     tile = replace(tile, layers=(*tile.layers[:-1], photo))
-    run = Run.create(tmp_path / "run", TEXTURED, Catalog((tile,)))
-    assert run_tiles(run, SerialExecutor()).done == 1
+    run, _ = finished(tmp_path / "run", TEXTURED, Catalog((tile,)))
     for part in mesh_of(run, tile).geometry.values():
-        errors = told_place(part.visual) - part.vertices[:, [0, 2]] * (1, -1)
-        assert np.abs(errors.mean(axis=0)).max() < 0.3 * CELL
-
-
-def events(run):
-    return [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
+        assert np.abs(off_place(part).mean(axis=0)).max() < 0.3 * CELL
 
 
 def test_run_changed_photo_exports_its_tile_again_from_the_store(photographed, tmp_path):
-    textured = Run.create(tmp_path / "textured", TEXTURED, photographed)
-    plain = Run.create(tmp_path / "plain", PLAIN, photographed)
-    for run in (textured, plain):
-        assert run_tiles(run, SerialExecutor()).done == 4
-        assert run_tiles(run, SerialExecutor()).cached == 4
-    before = mesh_of(textured, photographed.tiles[0]).geometry["road"].visual.material.baseColorTexture
+    tile = photographed.tiles[0]
+    textured, _ = finished(tmp_path / "textured", TEXTURED, photographed)
+    plain, _ = finished(tmp_path / "plain", PLAIN, photographed)
+    assert run_tiles(textured, SerialExecutor()).cached == 4
+    before = texture_of(textured, tile, "road")
     with rasterio.open(photo_of(photographed, 0), "r+") as file:
         file.write(255 - file.read())
     results = []
     assert run_tiles(textured, SerialExecutor(), watch=results.append).cached == 3
     (again,) = [result for result in results if result.status == "done"]
-    assert again.tile_id == photographed.tiles[0].id
+    assert again.tile_id == tile.id
     assert again.computed == {"export": 1}
-    after = mesh_of(textured, photographed.tiles[0]).geometry["road"].visual.material.baseColorTexture
+    after = texture_of(textured, tile, "road")
     np.testing.assert_allclose(255 - np.asarray(after, float), np.asarray(before, float), atol=4)
     assert run_tiles(plain, SerialExecutor()).cached == 4
 
 
 def test_run_photo_above_limit_is_averaged(photographed, tmp_path):
     small = compose({**LIGHT, "export": {"texture": True, "texture_px": 64}}, "light")
-    run = Run.create(tmp_path / "run", small, Catalog(photographed.tiles[:1]))
-    assert run_tiles(run, SerialExecutor()).done == 1
-    image = mesh_of(run, photographed.tiles[0]).geometry["terrain"].visual.material.baseColorTexture
-    assert max(image.size) == 64
+    run, _ = finished(tmp_path / "run", small, Catalog(photographed.tiles[:1]))
+    assert max(texture_of(run, photographed.tiles[0]).size) == 64
 
 
 def test_run_unreadable_photo_fails_only_its_tile_and_names_the_file(photographed, tmp_path):
     path = photo_of(photographed, 1)
     path.write_bytes(path.read_bytes()[:300])
-    run = Run.create(tmp_path / "run", TEXTURED, photographed)
-    results = []
-    assert run_tiles(run, SerialExecutor(), watch=results.append).done == 3
+    _, results = finished(tmp_path / "run", TEXTURED, photographed, done=3)
     (failure,) = [failure for result in results for failure in result.failures]
     assert (failure.tile_id, failure.stage, failure.file) == (photographed.tiles[1].id, "export", str(path))
 
 
 def test_run_photo_on_part_of_a_tile_is_noted(photographed, tmp_path):
-    tile = photographed.tiles[0]
     with rasterio.open(photo_of(photographed, 0), "r+") as file:
         file.nodata = 0
         values = file.read()
         values[:, :, : file.width // 2] = 0
         file.write(values)
-    run = Run.create(tmp_path / "run", TEXTURED, Catalog((tile,)))
-    assert run_tiles(run, SerialExecutor()).done == 1
+    run, _ = finished(tmp_path / "run", TEXTURED, Catalog(photographed.tiles[:1]))
     (note,) = [event["notes"] for event in events(run) if "notes" in event]
     assert note == ["dop: 50.0% of the texture has no orthophoto and takes its mean colour"]
-    image = mesh_of(run, tile).geometry["terrain"].visual.material.baseColorTexture
-    assert np.asarray(image).min() > 5
+    assert np.asarray(texture_of(run, photographed.tiles[0])).min() > 5
 
 
 def test_dry_run_names_the_tiles_without_a_texture(photographed, survey, flexroad, tmp_path, quick_config):
@@ -174,3 +181,93 @@ def test_dry_run_names_the_tiles_without_a_texture(photographed, survey, flexroa
     bare = photographed.tiles[WITHOUT].id
     assert f"warning: 1 of 4 tiles would have no texture: no dop, which export.texture needs: {bare}" in lines
     assert not [line for line in flexroad(*command).expected(0).out.splitlines() if "texture" in line]
+
+
+# --- notes: those of the sources, whichever results are computed and whichever are stored --------------
+
+CLEANED = "dsm: 2 cells outside -500..9000 m taken as nodata"
+"""The note of `load` on the survey."""
+ROADLESS = "segment: the road mask has no road cell on this tile"
+"""The begin of the note of `segment`."""
+
+
+@pytest.fixture
+def run(survey, tmp_path):
+    """A finished run of one tile, with a note of each of two stages."""
+    catalog = Catalog(Catalog.read(survey).tiles[:1])
+    (tile,) = catalog.tiles
+    for name, values in (("dsm", [[1e6, 1e6]]), ("road_mask", np.zeros(tile.grid.shape))):
+        (path,) = tile.paths(tile.layer(name).reaching(tile.grid.bounds))
+        with rasterio.open(path, "r+") as raster:
+            array = raster.read(1)
+            rows, columns = np.shape(values)
+            array[:rows, :columns] = values
+            raster.write(array, 1)
+    made, _ = finished(tmp_path / "run", PLAIN, catalog)
+    load, segment = notes(made)
+    assert load == CLEANED
+    assert segment.startswith(ROADLESS)
+    return made
+
+
+def notes(run) -> list[str]:
+    item = run.folder(run.catalog.tiles[0].id).path / "item.json"
+    return json.loads(item.read_text())["properties"]["flexroad:notes"]
+
+
+def computed(run, force=()) -> Counter:
+    results = []
+    run_tiles(run, SerialExecutor(), force=frozenset(force), watch=results.append)
+    (result,) = results
+    assert list(result.notes) == notes(run)
+    return Counter(result.computed)
+
+
+@pytest.mark.parametrize(
+    ("changes", "force", "stage"),
+    [
+        ({}, "export", "export"),
+        ({"export": {"formats": ["ply"]}}, None, "export"),
+        ({"ecsrc": {"theta_z_m": 0.1}}, None, "ecsrc"),
+        ({"evaluate": {"nearest": True}}, None, "evaluate"),
+    ],
+    ids=["exported again", "another format", "another filter", "another evaluation"],
+)
+def test_notes_of_stored_results_are_kept(changes, force, stage, run):
+    before = notes(run)
+    again = Run.create(run.path, compose({**LIGHT, **changes}, "changed"), run.catalog)
+    parts = computed(again, filter(None, [force]))
+    assert stage in parts
+    assert "segment" not in parts
+    assert notes(again) == before
+
+
+def test_notes_of_tile_that_failed_in_between_are_kept(run, monkeypatch):
+    before = notes(run)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TileProducts, "finish", full)
+        assert run_tiles(run, SerialExecutor(), force=frozenset({"export"})).failed == 1
+    assert computed(run) == {"export": 1}
+    assert notes(run) == before
+
+
+def test_notes_of_shared_store_are_those_of_the_other_run(run, tmp_path):
+    other = Run.create(tmp_path / "other", run.config, run.catalog, run.store)
+    assert computed(other) == {"export": 1}
+    assert notes(other) == notes(run)
+
+
+def test_notes_of_corrected_source_are_gone(run):
+    (tile,) = run.catalog.tiles
+    (path,) = tile.paths(tile.layer("dsm").reaching(tile.grid.bounds))
+    with rasterio.open(path, "r+") as raster:
+        heights = raster.read(1)
+        heights[0, :2] = heights[0, 2]
+        raster.write(heights, 1)
+    assert computed(run)["load"] == 1
+    assert len(notes(run)) == 1
+    assert notes(run)[0].startswith(ROADLESS)

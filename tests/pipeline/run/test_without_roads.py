@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from flexroad.tasks.products import npz
 from flexroad.tasks.quality.assess import NO_ROAD
 from flexroad.tools.report.content import WITH_ROADS, gather
 from flexroad.tools.report.steps import edge_steps
-from tests.builders import LIGHT
+from tests.builders import LIGHT, finish_run
 from tests.conftest import QUICK
 
 BARE = (0, 3)
@@ -49,10 +50,10 @@ def half(survey) -> Catalog:
     return catalog
 
 
-def test_run_tiles_without_roads_are_done_flagged_and_cached(half, tmp_path, executor):
+def test_run_tiles_without_roads_are_done_flagged_and_cached(half, tmp_path):
     run = Run.create(tmp_path / "run", compose(QUICK, "quick"), half)
     for cached in (0, 4):
-        result = run_tiles(run, executor)
+        result = run_tiles(run, SerialExecutor())
         assert (result.done, result.cached, result.without_roads, result.exit_code) == (4, cached, 2, 0)
     assert summary(run).without_roads == 2
     with open_database(run) as database:
@@ -77,8 +78,7 @@ def test_run_tiles_without_roads_are_done_flagged_and_cached(half, tmp_path, exe
 
 
 def test_products_of_tile_without_roads_open_and_follow_dtm(half, tmp_path):
-    run = Run.create(tmp_path / "run", load_config("production"), half)
-    assert run_tiles(run, SerialExecutor()).exit_code == 0
+    run = finish_run(tmp_path / "run", Path(half.tiles[0].root), load_config("production"))
     tile = half.tiles[BARE[0]]
     product = {end: run.folder(tile.id).path / f"{tile.id}_flexroad{end}" for end in ENDS}
     assert set(trimesh.load(product[".glb"]).geometry) == {"terrain"}
@@ -97,11 +97,9 @@ def test_products_of_tile_without_roads_open_and_follow_dtm(half, tmp_path):
     assert list(steps.check.edges) == [4]
 
 
-def test_command_counts_tiles_without_roads_apart(half, flexroad, tmp_path):
-    config, out = tmp_path / "light.yaml", tmp_path / "run"
-    config.write_text(json.dumps(LIGHT))
-    where = half.tiles[0].root + "/catalog.parquet"
-    words = ["run", "--config", config, "--catalog", where, "--out", out, "--executor", "serial"]
+def test_command_counts_tiles_without_roads_apart(half, light_config, flexroad, tmp_path):
+    out, where = tmp_path / "run", half.tiles[0].root + "/catalog.parquet"
+    words = ["run", "--config", light_config, "--catalog", where, "--out", out, "--executor", "serial"]
     alone = flexroad(*words, "--tile", half.tiles[BARE[0]].id).expected(0)
     assert "warning: no tile of this run has a road that the filter keeps; if there are roads" in alone.err
     said = flexroad(*words).expected(0)
@@ -113,9 +111,8 @@ def test_command_counts_tiles_without_roads_apart(half, flexroad, tmp_path):
     written = json.loads((out / "summary.json").read_text())
     assert (written["without_roads"], written["exit_code"]) == (2, 0)
     states = json.loads((out / "tiles.geojson").read_text())["features"]
-    assert [state["properties"]["flags"] == NO_ROAD for state in states] == [
-        number in BARE for number in range(4)
-    ]
+    flagged = [state["properties"]["flags"] == NO_ROAD for state in states]
+    assert flagged == [number in BARE for number in range(4)]
     flexroad("report", out, "--format", "md").expected(0)
     assert "| method | tiles | with roads |" in (out / "report.md").read_text()
 
@@ -124,10 +121,8 @@ def test_command_counts_tiles_without_roads_apart(half, flexroad, tmp_path):
 def test_tile_whose_road_the_filter_drops_is_done_and_flagged(method, survey, tmp_path):
     filtered = {**LIGHT, "ecsrc": {"method": method, "min_area_m2": 1e6}}
     filtered["variants"] = {"flexroad": {}, "wo_dtm": {"fit": {"terrain": False}}, "plane": {"fit": "plane"}}
-    catalog = Catalog.read(survey)
-    run = Run.create(tmp_path / "run", compose(filtered, "light"), replace(catalog, tiles=catalog.tiles[:1]))
-    result = run_tiles(run, SerialExecutor())
-    assert (result.done, result.without_roads, result.exit_code) == (1, 1, 0)
+    run = finish_run(tmp_path / "run", survey.parent, compose(filtered, "light"), tiles=1)
+    assert (summary(run).done, summary(run).without_roads) == (1, 1)
     rows = read_metrics(run.path)
     assert rows["flags"].str.startswith(f"{NO_ROAD}, ").all()
     assert rows["flags"].str.contains("dropped").all()
