@@ -1,5 +1,11 @@
 """Functions that numba compiles at their first call."""
 
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -49,3 +55,22 @@ def test_function_called_by_compiled_ones_alone_has_no_cache(tmp_path, monkeypat
     assert {path.name.split("-")[0] for path in tmp_path.rglob("*.nbi")} == {
         "test_compiled.test_function_called_by_compiled_ones_alone_has_no_cache.locals.quadruple"
     }
+
+
+def test_import_read_only_installation_without_home(tmp_path):
+    """Numba raises on import if it has no writable cache folder; FlexRoad sets one."""
+    root = Path(__file__).parents[2]
+    for name in ("catalog", "tasks", "pipeline", "flexroad"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(root / name, tmp_path / name, symlinks=True, ignore=ignored)
+    for folder in (tmp_path / "tasks", tmp_path / "tasks" / "fit"):
+        # A file in place of the folder: root cannot write there, either.
+        (folder / "__pycache__").touch()
+    code = "import os, flexroad.pipeline, flexroad.tasks.fit.nurbs; print(os.environ['NUMBA_CACHE_DIR'])"
+    elsewhere = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
+    environment = {name: value for name, value in os.environ.items() if name not in elsewhere}
+    environment |= {"HOME": "/dev/null"}
+    call = [sys.executable, "-c", code]
+    done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert not Path(done.stdout.strip()).exists()

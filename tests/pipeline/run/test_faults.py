@@ -9,7 +9,6 @@ import os
 import random
 import shutil
 import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -18,7 +17,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 import pytest
 import rasterio
 
@@ -26,7 +24,6 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.storage import paths
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.events import EventLog
 from flexroad.pipeline.run.lock import Owner, run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -34,8 +31,7 @@ from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.tables import read_metrics
 from tests.builders import LIGHT
-from tests.command_line import PROCESS, error_lines
-from tests.dask_processes import wait_for
+from tests.command_line import PROCESS
 from tests.permissions import permissions_enforced
 from tests.whole_run import assert_whole, item_times, rows, times
 
@@ -84,8 +80,7 @@ def events(out: Path) -> int:
     return len((out / "log.jsonl").read_text().splitlines())
 
 
-def own_file(catalog: Path, number: int) -> Path:
-    """The DSM of a tile."""
+def dsm_of(catalog: Path, number: int) -> Path:
     tile = Catalog.read(catalog).tiles[number]
     return tile.paths(tile.layer("dsm"))[0]
 
@@ -93,15 +88,18 @@ def own_file(catalog: Path, number: int) -> Path:
 # --- damaged files of a finished run ------------------------------------------------------------------
 
 
+NOTHING: dict[str, int] = {}
+
+
 class Damage(NamedTuple):
     act: Callable[[Path], object]
+    status: str = "4 done"
+    """What `status` says before the next run."""
     cached: int = 4
     """Tiles that the next run does not process."""
-    computed: dict[str, int] | None = None
+    computed: dict[str, int] | None = NOTHING
     """The nodes that it computes; None if they are not compared."""
     options: tuple[str, ...] = ()
-    status: str = "4 done"
-    """What `status` says before."""
 
 
 def written(pattern: str, content: str) -> Callable[[Path], object]:
@@ -150,52 +148,41 @@ def log_is_folder(out: Path) -> None:
     (out / "log.jsonl").mkdir()
 
 
-EXPORT = {"export": 4}
-NO_RUN = "is no run: run.json is missing or damaged"
+ONE, ALL = {"export": 1}, {"export": 4}
+PENDING, NO_RUN = "4 pending", "is no run: run.json is missing or damaged"
+VERIFY = ("--verify",)
+MARKERS = "tiles/*/item.json"
+PRODUCTS = ("tiles/*/*height.tif", "tiles/*/*.glb", "tiles/*/*surface.npz")
 DAMAGES = {
-    "tile folder deleted": Damage(
-        lambda out: shutil.rmtree(min((out / "tiles").iterdir())), 3, {"export": 1}, status="3 done"
-    ),
-    "mesh deleted": Damage(removed("tiles/*/*.glb", 1), 3, {"export": 1}, status="3 done"),
-    "meshes empty": Damage(written("tiles/*/*.glb", ""), 0, EXPORT, status="4 pending"),
-    "mesh of the same size": Damage(
-        lambda out: zero(min(out.glob("tiles/*/*.glb"))), 3, {"export": 1}, ("--verify",)
-    ),
-    "products of other tiles": Damage(
-        rotated("tiles/*/*height.tif", "tiles/*/*.glb", "tiles/*/*surface.npz"), 0, EXPORT, status="4 pending"
-    ),
-    "markers of other tiles": Damage(rotated("tiles/*/item.json"), 0, EXPORT, status="4 pending"),
-    "markers of other tiles, verified": Damage(
-        rotated("tiles/*/item.json"), 0, EXPORT, ("--verify",), status="4 pending"
-    ),
-    "markers without content": Damage(written("tiles/*/item.json", "{}"), 0, EXPORT, status="4 pending"),
-    "markers no JSON": Damage(written("tiles/*/item.json", "["), 0, EXPORT, status="4 pending"),
-    "store deleted": Damage(lambda out: shutil.rmtree(out / "store"), 4, {}),
+    "tile folder deleted": Damage(lambda out: shutil.rmtree(min(out.glob("tiles/*"))), "3 done", 3, ONE),
+    "mesh deleted": Damage(removed("tiles/*/*.glb", 1), "3 done", 3, ONE),
+    "mesh of zeros": Damage(lambda out: zero(min(out.glob("tiles/*/*.glb"))), "4 done", 3, ONE, VERIFY),
+    "meshes empty": Damage(written("tiles/*/*.glb", ""), PENDING, 0, ALL),
+    "products of other tiles": Damage(rotated(*PRODUCTS), PENDING, 0, ALL),
+    "markers of other tiles": Damage(rotated(MARKERS), PENDING, 0, ALL),
+    "markers of other tiles, verified": Damage(rotated(MARKERS), PENDING, 0, ALL, VERIFY),
+    "markers without content": Damage(written(MARKERS, "{}"), PENDING, 0, ALL),
+    "store deleted": Damage(lambda out: shutil.rmtree(out / "store")),
     "metrics cut off": Damage(
         without_tiles(cut_off("store/evaluate/*/*.npz")),
+        PENDING,
         0,
-        EXPORT | {"load": 4, "fit": 4, "sample": 4, "evaluate": 8},
-        status="4 pending",
+        ALL | {"load": 4, "fit": 4, "sample": 4, "evaluate": 8},
     ),
     **{
-        f"{stage} of other tiles": Damage(
-            without_tiles(rotated(f"store/{stage}/*/*.npz")), 0, status="4 pending"
-        )
+        f"{stage} of other tiles": Damage(without_tiles(rotated(f"store/{stage}/*/*.npz")), PENDING, 0, None)
         for stage in ("segment", "ecsrc", "fit", "sample", "evaluate", "assess", "*")
     },
-    "database lost": Damage(removed("database.txt"), 4, {}),
-    "database cut off": Damage(lambda out: os.truncate(out / "database.txt", 5000), 4, {}),
-    "log a folder": Damage(log_is_folder),
-    "log no JSON": Damage(written("log.jsonl", 'null\n{"event": 3}\n{"ev')),
-    "metrics empty": Damage(written("metrics.parquet", ""), 4, {}),
-    "record without content": Damage(written("run.json", "{}"), 4, {}, status=NO_RUN),
-    "record a list": Damage(written("run.json", "[]"), 4, {}, status=NO_RUN),
-    "configuration wrong": Damage(
-        written("config.yaml", "fit: {degre: 3}"), 4, {}, status="fit.degre: unknown key"
-    ),
-    "configuration lost": Damage(removed("config.yaml"), 4, {}, status="no configuration"),
-    "configuration empty": Damage(written("config.yaml", ""), 4, {}, status="config.yaml is empty"),
-    "catalog empty": Damage(written("catalog.parquet", ""), 4, {}, status="is not a FlexRoad catalog"),
+    "database lost": Damage(removed("database.txt")),
+    "database cut off": Damage(lambda out: os.truncate(out / "database.txt", 5000)),
+    "log a folder": Damage(log_is_folder, computed=None),
+    "log no JSON": Damage(written("log.jsonl", 'null\n{"event": 3}\n{"ev'), computed=None),
+    "metrics empty": Damage(written("metrics.parquet", "")),
+    "record without content": Damage(written("run.json", "{}"), NO_RUN),
+    "configuration wrong": Damage(written("config.yaml", "fit: {degre: 3}"), "fit.degre: unknown key"),
+    "configuration lost": Damage(removed("config.yaml"), "no configuration"),
+    "configuration empty": Damage(written("config.yaml", ""), "config.yaml is empty"),
+    "catalog empty": Damage(written("catalog.parquet", ""), "is not a FlexRoad catalog"),
 }
 
 
@@ -401,7 +388,7 @@ def test_storage_that_does_not_answer_fails_the_tile_with_its_reason(run, monkey
 @pytest.mark.parametrize("change", ["replaced", "truncated"])
 def test_source_changed_during_processing_fails_its_tile(change, survey, out, undisturbed):
     run = Run.create(out, compose(LIGHT, "light"), Catalog.read(survey))
-    tile, path = run.catalog.tiles[2], own_file(survey, 2)
+    tile, path = run.catalog.tiles[2], dsm_of(survey, 2)
     whole, results = path.read_bytes(), []
 
     def change_source(job):
@@ -433,13 +420,12 @@ def test_source_changed_during_processing_fails_its_tile(change, survey, out, un
 def test_run_survey_not_mounted_changes_nothing(survey, night, undisturbed, out):
     """The run exits at once instead of failing tile by tile; the next run has nothing to do."""
     night(catalog=survey).expected(0)
-    for name in ("dsm", "dtm"):
-        (survey.parent / name).rename(survey.parent / f"{name} elsewhere")
+    home, away = survey.parent / "dsm", survey.parent / "elsewhere"
+    home.rename(away)
     said = night(catalog=survey).expected(2)
     assert json.loads((out / "summary.json").read_text())["exit_code"] == 2
     assert "each of the 4 tiles lacks a file" in said.err
-    for name in ("dsm", "dtm"):
-        (survey.parent / f"{name} elsewhere").rename(survey.parent / name)
+    away.rename(home)
     since = events(out)
     night(catalog=survey).expected(0)
     assert stages(out, since) == {}
@@ -534,7 +520,7 @@ def test_read_only_disk_allows_only_reading(own_run, flexroad, light_config, tmp
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
 def test_run_output_not_writable_completes(stream, survey, light_config, night, out, undisturbed):
     """The disk of cron's log is full, and one tile fails, which is printed at once."""
-    file = own_file(survey, 0)
+    file = dsm_of(survey, 0)
     whole = shutil.copy2(file, file.with_suffix(".whole"))
     file.write_bytes(b"")
     words = ["run", "--config", light_config, "--catalog", survey, "--out", out, *SERIAL]
@@ -548,25 +534,6 @@ def test_run_output_not_writable_completes(stream, survey, light_config, night, 
     whole.rename(file)
     night(catalog=survey).expected(0)
     assert_whole(out, undisturbed)
-
-
-def test_import_read_only_installation_without_home(tmp_path):
-    """Numba raises on import if it has no writable cache folder; FlexRoad sets one."""
-    root = Path(__file__).parents[3]
-    for name in ("catalog", "tasks", "pipeline", "flexroad"):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(root / name, tmp_path / name, symlinks=True, ignore=ignored)
-    for folder in (tmp_path / "tasks", tmp_path / "tasks" / "fit"):
-        # A file in place of the folder: root cannot write there, either.
-        (folder / "__pycache__").touch()
-    code = "import os, flexroad.pipeline, flexroad.tasks.fit.nurbs; print(os.environ['NUMBA_CACHE_DIR'])"
-    elsewhere = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
-    environment = {name: value for name, value in os.environ.items() if name not in elsewhere}
-    environment |= {"HOME": "/dev/null"}
-    call = [sys.executable, "-c", code]
-    done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert not Path(done.stdout.strip()).exists()
 
 
 # --- clocks -------------------------------------------------------------------------------------------
@@ -602,7 +569,7 @@ def test_run_clock_set_back_between_runs_detects_change(survey, night, undisturb
         for path in folder.rglob("*"):
             os.utime(path, (time.time() + 10 * DAY_S,) * 2)
     assert "4 done (4 cached)" in night(catalog=survey).out
-    file = own_file(survey, 1)
+    file = dsm_of(survey, 1)
     whole = file.read_bytes()
     with rasterio.open(file, "r+") as raster:
         raster.write(raster.read(1) + np.float32(0.5), 1)
@@ -614,77 +581,7 @@ def test_run_clock_set_back_between_runs_detects_change(survey, night, undisturb
     assert_whole(out, undisturbed)
 
 
-# --- processes ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.soak("runs")
-def test_run_scheduler_killed_keeps_done_tiles(
-    processes, light_config, made_survey, flexroad, night, monkeypatch, undisturbed, out
-):
-    """The run ends with one error line; the next one, without a cluster, computes the other tiles."""
-    scheduler = processes.scheduler()
-    processes.worker()
-    wait_for(processes.address, 1)
-    log_tile = EventLog.tile
-
-    def kill(self, result) -> None:
-        log_tile(self, result)
-        scheduler.kill()
-
-    monkeypatch.setattr(EventLog, "tile", kill)
-    words = ["--config", light_config, "--catalog", made_survey / "catalog.parquet", "--out", out]
-    said = flexroad("run", *words, "--scheduler", processes.address).expected(1)
-    name = f"the Dask scheduler at {processes.address}"
-    assert said.errors == [f"error: {name} is gone; the same command goes on from here"]
-    told = json.loads((out / "summary.json").read_text())
-    assert told["exit_code"] == 1
-    assert 1 <= told["done"] < 4
-    assert rows(out).tile_id.nunique() == told["done"]
-    before = item_times(out)
-    processes.end()
-    night().expected(0)
-    assert_whole(out, undisturbed)
-    assert before.items() <= item_times(out).items()
-
-
-@pytest.mark.slow
-@pytest.mark.soak("runs")
-def test_run_workers_cannot_start_exits_with_one_line(light_config, made_survey, night, undisturbed, out):
-    # Without the check at the start, as if the files were too few for the number of workers.
-    code = "from flexroad.pipeline.cli import limits, main; limits.OPEN_FILES = 0; main.main()"
-    call = [sys.executable, "-c", code, "run", "--executor", "dask", "--workers", "2"]
-    call += ["--config", light_config, "--catalog", made_survey / "catalog.parquet", "--out", out]
-    few = ["sh", "-c", 'ulimit -n 40; exec "$@"', "sh"]
-    done = subprocess.run([*few, *call], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    # A slow machine also says what takes more than a second.
-    first, last = (
-        line for line in done.stderr.splitlines() if not line.startswith(("preparing ", "reading "))
-    )
-    assert first == "starting: 4 tiles"
-    assert last.startswith("error: cannot start 2 worker processes here: ")
-    night().expected(0)
-    assert_whole(out, undisturbed)
-
-
-@pytest.mark.slow
-@pytest.mark.soak("runs")
-def test_simultaneous_runs_share_a_store(made_survey, light_config, tmp_path):
-    words = [*SERIAL, "--config", light_config, "--catalog", made_survey / "catalog.parquet"]
-    call = [*PROCESS, "run", *words, "--store", tmp_path / "store", "--out"]
-    both = [
-        subprocess.Popen(
-            [*call, tmp_path / name], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
-        )
-        for name in "ab"
-    ]
-    stderr = [process.communicate()[1] for process in both]
-    assert [process.returncode for process in both] == [0, 0], stderr
-    # The standard error of a slow run also has progress lines.
-    assert [error_lines(text) for text in stderr] == [[], []]
-    pd.testing.assert_frame_equal(rows(tmp_path / "a"), rows(tmp_path / "b"), check_exact=True)
-    assert not list(tmp_path.rglob("*.tmp"))
+# --- a second run -------------------------------------------------------------------------------------
 
 
 def test_run_in_locked_folder_exits_and_changes_nothing(finished, night, flexroad, undisturbed):
