@@ -1,4 +1,5 @@
 import json
+import math
 import os
 
 import pytest
@@ -132,6 +133,10 @@ def test_override_with_other_filter_uses_its_defaults(tmp_path):
             "x: fit.engine: unknown key; it is an option of method nurbs, not of smoothing_spline",
         ),
         ({"fit": [1]}, "x: fit: expected a mapping of options, not [1]"),
+        ({"load": 3}, "x: load: expected a mapping of options, not 3"),
+        ({"fit": {"learning_rate": math.inf}}, "x: fit.learning_rate: input should be a finite number"),
+        ({"variants": {"a/b": {}}}, "x: variants.a/b: the name is part of file names; use letters,"),
+        ({"export": {"variants": []}}, "x: export.variants: tuple should have at least 1 item"),
         ({"variants": {"a": {"fitt": {}}}}, "x: variants.a.fitt: unknown key; did you mean fit?"),
         ({"variants": {"a": {"sample": {"road": 1}}}}, "x: variants.a.sample.road: unknown key"),
         ({"variants": ["a"]}, "x: variants: expected a mapping"),

@@ -96,8 +96,8 @@ def test_tiles_processed_alone_have_equal_control_points_and_meet(alone):
     assert pairs >= 12
 
 
-def glb_part(path):
-    """Return vertices (easting, northing, height, relative to the run) and faces of a GLB."""
+def glb_parts(path):
+    """Yield name, vertices (easting, northing, height) and geometry of the parts of a GLB."""
     scene = trimesh.load(path, process=False)
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
@@ -105,7 +105,11 @@ def glb_part(path):
         x, y, z = (part.vertices.astype(np.float32).astype(np.float64) + matrix[:3, 3]).T
         # Every run has its own origin, which is a whole number of metres.
         origin = scene.metadata["run_origin"]
-        yield np.stack([x + origin[0], -z + origin[1], y + origin[2]], axis=1), part.faces
+        yield name, np.stack([x + origin[0], -z + origin[1], y + origin[2]], axis=1), part
+
+
+def glb_part(path):
+    return ((places, part.faces) for _, places, part in glb_parts(path))
 
 
 def ply_part(path):
@@ -131,20 +135,12 @@ def test_meshes_have_equal_normals_where_tiles_meet(alone):
     path, folder = alone
     seen: dict[tuple[float, ...], dict[str, tuple[float, ...]]] = {}
     for tile in Catalog.read(path).tiles:
-        scene = trimesh.load(product(folder, tile.id, ".glb"), process=False)
         west, south, east, north = tile.grid.bounds
-        for node in scene.graph.nodes_geometry:
-            matrix, name = scene.graph[node]
-            part = scene.geometry[name]
-            origin = scene.metadata["run_origin"]
-            x, y, z = (part.vertices + matrix[:3, 3]).T
-            for place, normal in zip(
-                zip(x + origin[0], origin[1] - z, y.astype(np.float32), strict=True),
-                part.vertex_normals.astype(np.float32),
-                strict=True,
-            ):
+        for _, places, part in glb_parts(product(folder, tile.id, ".glb")):
+            for place, normal in zip(places, part.vertex_normals.astype(np.float32), strict=True):
                 if place[0] in (west, east) or place[1] in (south, north):
-                    seen.setdefault(place, {})[tile.id] = tuple(normal)
+                    key = (*place[:2], np.float32(place[2]))
+                    seen.setdefault(key, {})[tile.id] = tuple(normal)
     met = [normals for normals in seen.values() if len(normals) > 1]
     assert len(met) > 200
     assert all(len(set(normals.values())) == 1 for normals in met)
@@ -267,16 +263,12 @@ def test_meshes_join_and_end_with_the_survey(ended, end, read):
 @pytest.mark.slow
 def test_road_of_glb_is_that_of_polygons(ended):
     *_, roads, (west, south) = ended
-    triangles = []
-    for path in products_of(ended, ".glb"):
-        scene = trimesh.load(path, process=False)
-        x0, y0, _ = scene.metadata["run_origin"]
-        for node in scene.graph.nodes_geometry:
-            matrix, name = scene.graph[node]
-            if name == "road":
-                x, _, z = (scene.geometry[name].vertices + matrix[:3, 3]).T
-                plan = np.stack([x + x0 - west, y0 - z - south], axis=1)
-                triangles.append(plan[scene.geometry[name].faces])
+    triangles = [
+        (places[:, :2] - (west, south))[part.faces]
+        for path in products_of(ended, ".glb")
+        for name, places, part in glb_parts(path)
+        if name == "road"
+    ]
     drawn = shapely.union_all(shapely.polygons(np.concatenate(triangles)), grid_size=1e-4)
     truth = shapely.transform(shapely.union_all(roads), lambda points: points - np.array([west, south]))
     # Away from the limit of the survey.
