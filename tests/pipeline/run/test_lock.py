@@ -86,47 +86,59 @@ def test_lock_of_killed_process_is_taken_over_at_once(process, tmp_path):
 ME = Owner.me()
 GONE = {"pid": 2**22 + 1}
 UPTIME_S, LONG_AGO_S = lock._uptime_s(), 86400.0
-REFUSED = [
-    # The process table decides, not the age of the lock.
-    (ME, LONG_AGO_S, QUICK, UPTIME_S, "is in use by pid"),
-    # Another machine made of the same image; this one was started long ago, or just now.
-    (replace(ME, boot="other", **GONE), 20, Heartbeat(), LONG_AGO_S, "last sign of life 20 s ago; if it is"),
-    (
-        replace(ME, boot="other", **GONE),
+OTHER_BOOT = replace(ME, boot="other", **GONE)
+REFUSED = {
+    "the process lives": (ME, LONG_AGO_S, QUICK, UPTIME_S, "is in use by pid"),
+    "same image, this one started long ago": (
+        OTHER_BOOT,
+        20,
+        Heartbeat(),
+        LONG_AGO_S,
+        "life 20 s ago; if it is",
+    ),
+    "same image, this one started just now": (
+        OTHER_BOOT,
         20,
         Heartbeat(),
         5.0,
-        "last sign of life 20 s ago; if it is dead, the",
+        "life 20 s ago; if it is dead",
     ),
-    # Another container on this machine.
-    (replace(ME, machine="m pid:[2]", **GONE), 0, QUICK, UPTIME_S, "last sign of life 0 s ago"),
-    (ELSEWHERE, 0.1, QUICK, UPTIME_S, "pid 4711 on node7 since 2026-11-20.* the same command takes over"),
-]
-TAKEN_OVER = [
+    "another container": (
+        replace(ME, machine="m pid:[2]", **GONE),
+        0,
+        QUICK,
+        UPTIME_S,
+        "last sign of life 0 s",
+    ),
+    "another machine": (ELSEWHERE, 0.1, QUICK, UPTIME_S, "pid 4711 on node7 .* the same command takes over"),
+}
+TAKEN_OVER = {
     # The time of the lock is in the future, as after a clock set back.
-    (replace(ME, start=1), -3600, QUICK, UPTIME_S, "its number was given to another"),
-    (replace(ME, **GONE), -3600, QUICK, UPTIME_S, "that process is gone"),
-    (ELSEWHERE, -LONG_AGO_S, QUICK, UPTIME_S, "no sign of life for"),
-    (replace(ME, boot="before"), UPTIME_S + 100, Heartbeat(30, 1e9), UPTIME_S, "was restarted since"),
-    (replace(ME, boot="other"), 400, QUICK, LONG_AGO_S, "no sign of life for 400 s"),
-    (ELSEWHERE, 400, QUICK, UPTIME_S, "pid 4711 on node7: no sign of life for 400 s"),
-]
+    "number of another": (replace(ME, start=1), -3600, QUICK, UPTIME_S, "its number was given to another"),
+    "process gone": (replace(ME, **GONE), -3600, QUICK, UPTIME_S, "that process is gone"),
+    "clock set back": (ELSEWHERE, -LONG_AGO_S, QUICK, UPTIME_S, "no sign of life for"),
+    "restarted": (replace(ME, boot="before"), UPTIME_S + 100, Heartbeat(30, 1e9), UPTIME_S, "was restarted"),
+    "same image": (replace(ME, boot="other"), 400, QUICK, LONG_AGO_S, "no sign of life for 400 s"),
+    "another machine": (ELSEWHERE, 400, QUICK, UPTIME_S, "pid 4711 on node7: no sign of life for 400 s"),
+}
+"""Owner, age of the lock (s), heartbeat, time since this machine was started (s), and part of the message.
+
+A machine of the same image has the name of this one. The process table decides if it can, not the age.
+"""
 
 
-@pytest.mark.parametrize(("holder", "age_s", "heartbeat", "uptime_s", "message"), REFUSED)
-def test_lock_of_an_owner_that_may_be_alive_is_refused(
-    holder, age_s, heartbeat, uptime_s, message, tmp_path, monkeypatch
-):
+@pytest.mark.parametrize("name", REFUSED)
+def test_lock_of_an_owner_that_may_be_alive_is_refused(name, tmp_path, monkeypatch):
+    holder, age_s, heartbeat, uptime_s, message = REFUSED[name]
     monkeypatch.setattr(lock, "_uptime_s", lambda: uptime_s)
     write_lock(tmp_path, holder, age_s)
     with pytest.raises(ConfigError, match=message):
         take_lock(tmp_path, heartbeat)
 
 
-@pytest.mark.parametrize(("holder", "age_s", "heartbeat", "uptime_s", "reason"), TAKEN_OVER)
-def test_lock_of_a_dead_owner_is_taken_over(
-    holder, age_s, heartbeat, uptime_s, reason, tmp_path, monkeypatch
-):
+@pytest.mark.parametrize("name", TAKEN_OVER)
+def test_lock_of_a_dead_owner_is_taken_over(name, tmp_path, monkeypatch):
+    holder, age_s, heartbeat, uptime_s, reason = TAKEN_OVER[name]
     monkeypatch.setattr(lock, "_uptime_s", lambda: uptime_s)
     write_lock(tmp_path, holder, age_s)
     *watching, taken_over = take_lock(tmp_path, heartbeat)

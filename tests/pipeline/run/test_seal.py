@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from flexroad.catalog import Catalog, CatalogError
+from flexroad.catalog import Catalog, CatalogError, Layer
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run
@@ -155,6 +155,16 @@ def test_changed_list_of_a_run_allows_nothing(flexroad, made, survey, allowed):
     flexroad("status", run, *option.split()).expected(0)
     tile = Run.open(run, [str(survey.parent)]).catalog.tiles[0]
     assert tile.paths(tile.layers[0])
+
+
+def test_changed_catalog_of_a_run_allows_no_other_file(flexroad, made):
+    tile, *others = made.catalog.tiles
+    layers = (Layer("dsm", ("/etc/passwd",)), *(layer for layer in tile.layers if layer.name != "dsm"))
+    changed = Catalog((replace(tile, layers=layers), *others))
+    changed.write(made.path / "catalog.parquet", movable=False)
+    (line,) = flexroad("rerun", made.path, *SERIAL).expected(2).errors
+    assert "dsm names /etc/passwd" in line
+    assert not list(made.path.glob("tiles/*"))
 
 
 def test_run_of_a_catalog_just_made_may_read_its_files(made, tmp_path):
