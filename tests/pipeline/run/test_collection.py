@@ -183,6 +183,8 @@ def test_mosaic_in_a_moved_run_has_the_cells_of_all_tiles(name, done):
                 assert mosaic.units == raster.units
                 assert str(mosaic.nodata) == str(raster.nodata)
                 assert mosaic.colorinterp == raster.colorinterp
+                if name != "height":
+                    assert mosaic.colormap(1)[1] == raster.colormap(1)[1]
     assert np.ptp(whole) > 0
 
 
