@@ -82,6 +82,16 @@ def undisturbed(command, tmp_path_factory) -> tuple[Path, list[Operation]]:
     return out, counting.met
 
 
+def run_with(fault: Faulty, words: list, out: Path) -> command_line.Said:
+    with intercepted(out, fault):
+        return command_line.call(*words, out)
+
+
+def killed_with(fault: Faulty, words: list, out: Path) -> int:
+    """Run in a copy of this process, which ends itself; return its exit code."""
+    return command_line.forked(lambda: run_with(fault, words, out).code)
+
+
 def check_after_error(said: command_line.Said, out: Path, fault: Faulty) -> None:
     """One line tells the error; no temporary file is left, except one whose removal failed."""
     if said.code == 0:
@@ -110,18 +120,12 @@ def test_run_fault_at_any_write_next_run_is_whole(kind, command, undisturbed, tm
     sample = {round(i * last / (SAMPLE - 1)) for i in range(SAMPLE)}
     for at in range(last + 1) if EVERY else sorted(sample):
         out, fault = tmp_path / str(at) / "run", FAULTS[kind](at)
-
-        def run(out=out, fault=fault) -> command_line.Said:
-            with intercepted(out, fault):
-                return command_line.call(*words, out)
-
         try:
             if kind == "killed":
-                # In a copy of this process, which ends itself.
-                assert command_line.forked(lambda run=run: run().code) == -signal.SIGKILL
+                assert killed_with(fault, words, out) == -signal.SIGKILL
                 assert len(temporary_files(out)) <= 1
             else:
-                said = run()
+                said = run_with(fault, words, out)
                 codes[said.code] += 1
                 check_after_error(said, out, fault)
             if (out / "lock.json").exists():

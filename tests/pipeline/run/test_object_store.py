@@ -117,7 +117,7 @@ def test_run_in_bucket_equals_run_on_disk_and_is_cached(survey, made_survey, buc
     assert all(map(paths.exists, others))
 
 
-def test_report_tile_and_ground_of_run_in_bucket(run, local):
+def test_run_in_bucket_is_read_repaired_and_brought_up_to_date(run, local):
     run_tiles(run, SerialExecutor())
     opened = Run.open(run.path)
     assert (summary(opened).done, summary(opened).exit_code) == (4, 0)
@@ -128,11 +128,16 @@ def test_report_tile_and_ground_of_run_in_bucket(run, local):
     actual, expected = (RunSampler.open(each.path).at(east, north) for each in (run, local))
     assert actual.height == expected.height
     assert list(actual.tile) == [tile.id]
-
-
-def test_run_source_changed_recomputes_tile(run):
-    run_tiles(run, SerialExecutor())
-    tile = run.catalog.tiles[1]
+    # A damaged artefact is computed again.
+    name = next(name for name in paths.listing(run.store) if name.startswith("evaluate/"))
+    paths.write(run.store / name, paths.read(run.store / name)[:-1])
+    for each in run.catalog.tiles:
+        paths.remove(run.folder(each.id).path / "item.json")
+    results = []
+    run_tiles(Run.open(run.path), SerialExecutor(), watch=results.append)
+    assert sum(result.computed.get("evaluate", 0) for result in results) == 1
+    assert_same(run, local)
+    # A changed source computes its tile again.
     file = tile.paths(tile.layer("dsm"))[0]
     paths.write(file, paths.read(file) + b"\1")
     state, ids = bring_up_to_date(Run.open(run.path))
@@ -256,18 +261,6 @@ def test_read_near_roads_in_bucket_equal_disk(made_survey, survey, storage, tmp_
     paths.remove(queries[1].path)
     with pytest.raises(TaskError, match=r"s3://.*/roads.gpkg cannot be opened .no such file.; put it back"):
         read_near(queries[1], bounds)
-
-
-def test_run_artefact_damaged_is_recomputed(run, local):
-    run_tiles(run, SerialExecutor())
-    name = next(name for name in paths.listing(run.store) if name.startswith("evaluate/"))
-    paths.write(run.store / name, paths.read(run.store / name)[:-1])
-    for tile in run.catalog.tiles:
-        paths.remove(run.folder(tile.id).path / "item.json")
-    results = []
-    run_tiles(Run.open(run.path), SerialExecutor(), watch=results.append)
-    assert sum(result.computed.get("evaluate", 0) for result in results) == 1
-    assert_same(run, local)
 
 
 def test_run_cached_makes_few_requests(run, storage):
