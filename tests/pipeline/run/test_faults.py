@@ -277,8 +277,8 @@ def test_readers_of_a_damaged_run_say_the_same(lost, own_run, flexroad, tmp_path
     else:
         rotated("store/*/*/*.npz")(out)
     assert [flexroad(*words) for words in questions] == before
-    flexroad("report", out, "--format", "html").expected(0)
     if lost == "sources":
+        flexroad("report", out, "--format", "html").expected(0)
         (error,) = flexroad(*questions[0], "--variant", "rgt").expected(2).errors
         assert f"tile {tile.id}: load: TaskError: dsm dsm/{tile.id}.tif is missing" in error
         return

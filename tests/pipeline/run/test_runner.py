@@ -379,11 +379,16 @@ def test_metrics_before_the_last_execution_that_computed_tiles_are_kept(own_run)
         again(interrupted)
     run_tiles(own_run, SerialExecutor())
     assert previous.read_bytes() == before
-    page = write_report(own_run, "html").read_text()
-    assert "Compared with the state before the last run: 4 tiles done in both runs." in page
     previous.write_bytes(b"PAR1")
     with pytest.raises(ConfigError, match=r"metrics.previous.parquet is damaged: .*; remove it"):
         write_report(own_run, "html")
+
+
+@pytest.mark.slow
+def test_report_compares_with_the_state_before(own_run):
+    run_tiles(own_run, SerialExecutor(), force=frozenset({"export"}))
+    page = write_report(own_run, "html").read_text()
+    assert "Compared with the state before the last run: 4 tiles done in both runs." in page
 
 
 def test_configuration_of_a_run_without_extends_keeps_its_options(own_run):
