@@ -16,8 +16,7 @@ from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.guard.open_raster import ERRORS, kept_raster, open_raster
-from flexroad.catalog.scan.rasters import georeference_fault, heights_fault, quiet
-from flexroad.catalog.scan.valid_cells import read_valid
+from flexroad.catalog.scan.rasters import georeference_fault, heights_fault, quiet, read_valid
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import some
 

@@ -20,8 +20,7 @@ from flexroad.catalog.storage.buckets import StatCache
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.tile import HEIGHTS
-from flexroad.pipeline.check.heights import height_findings
-from flexroad.pipeline.check.trial import Finding, trials
+from flexroad.pipeline.check.trial import Finding, height_findings, trials
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.layers import lacking, without_photo
 from flexroad.tasks import load

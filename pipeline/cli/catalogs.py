@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from flexroad.catalog import Catalog, CatalogError, layouts
-from flexroad.catalog.allowlist import needed
+from flexroad.catalog.index import needed
 from flexroad.catalog.sources import nrw, rasters, templates
 from flexroad.catalog.storage.unpack import unpack
 from flexroad.catalog.text import count

@@ -15,8 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config import document
-from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.models import ROOT, TAG, Config, Export, stage_models
+from flexroad.pipeline.config.models import ROOT, TAG, Cluster, Config, Export, stage_models
 from flexroad.pipeline.config.settings import applied, merge, parsed, texts
 from flexroad.pipeline.config.stages import DEFAULTS
 from flexroad.pipeline.errors import ConfigError

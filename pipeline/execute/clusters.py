@@ -22,7 +22,7 @@ from distributed.utils import silence_logging_cmgr
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import Notify
 from flexroad.pipeline import OF_WORKERS
-from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.models import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.slurm import slurm
 from flexroad.pipeline.execute.start import (

@@ -17,7 +17,7 @@ from distributed.security import Security
 from distributed.system import MEMORY_LIMIT
 
 from flexroad.pipeline import OF_WORKERS
-from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.models import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.memory import MOUNT, OWN, group_limits
 

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from flexroad.catalog import Bounds, Catalog, Tile
-from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.area import Area
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.index import check_allowed
 from flexroad.catalog.skipped import Skipped, lost
 from flexroad.catalog.storage.outputs import made_folder
 from flexroad.catalog.storage.paths import Location, exists

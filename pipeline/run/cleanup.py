@@ -22,9 +22,8 @@ from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.record import RECORD, Run, check_links, check_models
+from flexroad.pipeline.run.record import RECORD, USERS, Run, check_links, check_models, runs_using
 from flexroad.pipeline.run.status import known_record, open_database, peek_statuses
-from flexroad.pipeline.run.store_users import FOLDER, runs_using
 from flexroad.pipeline.store.records import DONE, FAILED
 from flexroad.pipeline.worker.exports import KINDS, LEVEL_KINDS
 
@@ -107,7 +106,7 @@ def _others(run: Run, without: Sequence[Location]) -> list[Location]:
         users = set(runs_using(run.store))
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(
-            f"the list of runs in {run.store / FOLDER} cannot be read: {error!r}; correct or remove that file"
+            f"the list of runs in {run.store / USERS} cannot be read: {error!r}; correct or remove that file"
         ) from error
     others = (path for path in users if not any(_same(path, excluded) for excluded in (run.path, *without)))
     return sorted(others, key=str)

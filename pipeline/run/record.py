@@ -17,10 +17,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
+import json
 import platform
 import shlex
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,20 +31,23 @@ from typing import Any
 import yaml
 
 from flexroad.catalog import Catalog, Tile
-from flexroad.catalog.allowlist import needed
 from flexroad.catalog.guard.source_files import source_stat
+from flexroad.catalog.index import needed
 from flexroad.catalog.storage.buckets import StatCache
-from flexroad.catalog.storage.links import links_out
 from flexroad.catalog.storage.paths import (
     Location,
     absolute,
     check_writable,
+    contained,
     entries,
     exists,
     flush_names,
     is_remote,
+    links_out,
+    listing,
     parse_location,
     read,
+    remove,
     stat,
     visible_entry,
     write,
@@ -59,7 +64,6 @@ from flexroad.pipeline.graph.sources import Recorded, Stat
 from flexroad.pipeline.run.events import LOG
 from flexroad.pipeline.run.lock import NAME as LOCK
 from flexroad.pipeline.run.seal import seal, sealed
-from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import DONE, FAILED, dump_checked, load_checked
@@ -69,6 +73,9 @@ PACKAGES = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "das
 STORE = "store"
 RECORD = "run.json"
 """The first file of a run: a folder that has it is a run, also if it is not complete."""
+
+USERS = "runs"
+"""Folder of a shared store with a small file for each run that uses it, read by `flexroad clean`."""
 
 
 @dataclass(frozen=True)
@@ -377,3 +384,31 @@ def _record(run: Location) -> dict[str, Any] | None:
         raise ConfigError(f"cannot read {run / RECORD}: {error.strerror or error}") from error
     required = {"config", "store", "shared_store", "origin", "checksum", "versions"}
     return record if required <= record.keys() else None
+
+
+def register(store: Location, run: Location) -> None:
+    """Register a run with its store; not needed for a store in the run's own folder."""
+    if absolute(store) != absolute(run / "store"):
+        path = _entry(store, run)
+        if not exists(path):
+            write(path, json.dumps({"run": str(absolute(run))}).encode(), flushed=True)
+
+
+def runs_using(store: Location) -> Iterator[Location]:
+    """Yield the folders of the runs registered with a store."""
+    # A store in a run's folder belongs to that run.
+    if exists(store.parent / "run.json"):
+        yield absolute(store.parent)
+    for name in sorted(listing(contained(store / USERS, store))):
+        if name.endswith(".json") and not name.startswith("."):
+            yield parse_location(json.loads(read(store / USERS / name))["run"])
+
+
+def unregister(store: Location, run: Location) -> None:
+    """Remove a run from the runs of a store."""
+    remove(_entry(store, run))
+
+
+def _entry(store: Location, run: Location) -> Location:
+    name = hashlib.sha256(str(absolute(run)).encode()).hexdigest()[:16]
+    return contained(store / USERS / f"{name}.json", store)

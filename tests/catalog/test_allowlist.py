@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 
 from flexroad.catalog import Catalog, CatalogError, Grid, Layer, Tile
-from flexroad.catalog.allowlist import check_allowed, needed
+from flexroad.catalog.index import check_allowed, needed
 from flexroad.catalog.tile import LAYERS
 from flexroad.catalog.trust import AllowedFolders
 
