@@ -56,6 +56,12 @@ def plan_unit(text: str) -> Unit:
     return axis.unit_name, axis.unit_conversion_factor
 
 
+def plan_units(text: str) -> str:
+    """Return the name of the unit of eastings and northings in the plural, for messages."""
+    unit = plan_unit(text)[0]
+    return unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
+
+
 def height_unit(text: str) -> Unit | None:
     """Return the unit of heights, or None if the CRS has no height axis."""
     plan, height = _parts(text)

@@ -15,17 +15,14 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from itertools import compress
 from pathlib import Path
 from typing import Any
 
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
-
 from flexroad.catalog import geoparquet, ids
 from flexroad.catalog.area import Area
-from flexroad.catalog.crs import short
+from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.entries import TileReader
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.geoparquet import SKIPPED, Item, Unreadable
@@ -230,14 +227,6 @@ def _not_a_catalog(path: Location, reason: str) -> CatalogError:
     return CatalogError(f"{path} is not a FlexRoad catalog: {reason}; make one with `flexroad catalog`")
 
 
-@lru_cache(maxsize=16)
-def _to_wgs84(crs: str) -> Transformer:
-    try:
-        return Transformer.from_crs(CRS.from_user_input(crs), "EPSG:4326", always_xy=True)
-    except CRSError as error:
-        raise CatalogError(f"unknown CRS {crs[:60]!r}: {error}") from error
-
-
 def item(tile: Tile, root: str = "") -> Item:
     """Return the tile as a STAC item.
 
@@ -273,7 +262,7 @@ def datetime_text(time: datetime) -> str:
 def _outline(grid: Grid) -> Item:
     """Return geometry and bbox in degrees; no bbox if the grid lies where they are not defined."""
     west, south, east, north = grid.bounds
-    to_wgs84 = _to_wgs84(grid.crs)
+    to_wgs84 = transformer(grid.crs, "EPSG:4326")
     ring = [(west, south), (east, south), (east, north), (west, north), (west, south)]
     corners = [list(to_wgs84.transform(*corner)) for corner in ring]
     xs, ys = [c[0] for c in corners], [c[1] for c in corners]

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import NotGeoreferencedWarning
 
-from flexroad.catalog.crs import bounds_in, height_unit, in_plan, plan_unit, short, utm_of
+from flexroad.catalog.crs import bounds_in, height_unit, in_plan, plan_unit, plan_units, short, utm_of
 from flexroad.catalog.crs_checks import angle_fault, crs_of, require_scale
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.gdal_options import CHOSEN, DEFAULTS
@@ -335,8 +335,8 @@ def require_metric(file: RasterFile, option: str = "") -> None:
     if unit in ("metre", "meter") and metres == 1.0:
         require_scale(file.name, file.crs, file.bounds, remedy)
         return
-    units = unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
     zone = utm_of(bounds_in("EPSG:4326", file.crs, file.bounds))
+    units = plan_units(file.crs)
     raise CatalogError(
         f"{file.name} is in {short(file.crs)}, whose unit is {units}; {remedy.format(zone=zone)}"
     )

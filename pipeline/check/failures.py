@@ -114,16 +114,17 @@ def _missing(
 
 def _no_access(path: Location, stat: StatCache) -> str | None:
     """Return why a file is not there, or is not given to this user; None if it is."""
-    if isinstance(path, Path):
-        try:
-            head(path)
-        except FileNotFoundError:
-            return MISSING
-        except InputRejected:
-            return NO_FILE
-        except OSError as error:
-            return access_reason(error) or str(error)
-    return MISSING if stat(path) is None else None
+    if not isinstance(path, Path):
+        return MISSING if stat(path) is None else None
+    try:
+        head(path)
+    except FileNotFoundError:
+        return MISSING
+    except InputRejected:
+        return NO_FILE
+    except OSError as error:
+        return access_reason(error) or str(error)
+    return None
 
 
 @dataclass(frozen=True)

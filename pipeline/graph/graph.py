@@ -211,7 +211,12 @@ class Pattern:
                 if key not in steps or step.stored:
                     steps[key] = step
             variants[variant] = by_stage
-        exported = to_json([product_options(config.export), product_versions(config.export)])
+        options = config.export.model_dump(mode="json")
+        if not config.export.texture:
+            # Without a texture, products do not depend on its options.
+            options = {name: value for name, value in options.items() if not name.startswith(PHOTO)}
+        versions = {"item": ITEM_VERSION} | {name: FORMATS[name].VERSION for name in config.export.formats}
+        exported = to_json([options, versions])
         halo_m = max(chain["load"].halo_m for chain in config.chains.values())
         return cls(tuple(steps[key] for key in numbers), variants, config.export, exported, halo_m)
 
@@ -271,19 +276,6 @@ class Pattern:
         ]
         layers = [sources.text(layer) for layer in _product_sources(tile, self.export)]
         return hashed(f"{','.join([to_json(requested)[:-1], *layers, self.exported])}]")
-
-
-def product_versions(export: Export) -> dict[str, int]:
-    """Return the versions of the item and of the exported formats."""
-    return {"item": ITEM_VERSION} | {name: FORMATS[name].VERSION for name in export.formats}
-
-
-def product_options(export: Export) -> dict[str, Any]:
-    """Return the options that the products depend on: without a texture not those of the texture."""
-    options: dict[str, Any] = export.model_dump(mode="json")
-    if export.texture:
-        return options
-    return {name: value for name, value in options.items() if not name.startswith(PHOTO)}
 
 
 def product_layers(export: Export) -> tuple[str, ...]:

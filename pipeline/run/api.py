@@ -37,7 +37,7 @@ from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_folder, check_links
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.run.status import Folders, open_database, recorded
+from flexroad.pipeline.run.status import open_database, recorded, tile_files
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import FAILED
 
@@ -207,7 +207,7 @@ def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile
 
     With the failed ones go the tiles that were made without a file.
     """
-    folders = Folders(run.path)
+    files_of = tile_files(run.path)
     ids = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
     without_file = set[str]()
     if failed:
@@ -219,7 +219,7 @@ def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile
         if tile.id in ids or not (ids or failed):
             return True
         # The marker is enough, even if it is of other sources: a corrected file is a reason to rerun.
-        return tile.id in without_file or (failed and FAILED in folders(tile.id))
+        return tile.id in without_file or (failed and FAILED in files_of(tile.id))
 
     return selected
 

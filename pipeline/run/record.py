@@ -42,7 +42,6 @@ from flexroad.catalog.storage.paths import (
     entries,
     exists,
     flush_names,
-    is_remote,
     links_out,
     listing,
     parse_location,
@@ -54,7 +53,7 @@ from flexroad.catalog.storage.paths import (
 )
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.loading import compose, load_config, read_mapping
-from flexroad.pipeline.config.models import ROOT, Config
+from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.config.stages import STAGE_NAMES, model_files
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import check_tiles
@@ -196,7 +195,7 @@ class Run:
     def stat_cache(self) -> Stat:
         """Return a stat function for many source files; in a bucket it lists each folder once."""
         remote = StatCache()
-        return lambda file: remote(file) if is_remote(file) else source_stat(file)
+        return lambda file: source_stat(file) if isinstance(file, Path) else remote(file)
 
     def job(self, graph: TileGraph, force: frozenset[str] = frozenset()) -> TileJob:
         """Return the job that a worker needs to process one tile."""
@@ -368,8 +367,7 @@ def _config(path: Location) -> Config:
     if file is None and exists(path):
         raise ConfigError(f"{path} is not a regular file; `flexroad run` writes it again")
     if isinstance(path, Path):
-        # Earlier versions wrote it without `extends`.
-        return load_config(path, base=ROOT)
+        return load_config(path)
     return compose(read_mapping(read(path), str(path)), str(path))
 
 
