@@ -25,7 +25,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, MIN_COVER_HELP, OUTPUTS, TILES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.layers import fitting_config
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
 from flexroad.pipeline.run.record import check_inputs
 
 TOOLS = {
@@ -188,7 +188,7 @@ def catalog_gerod(
     """
     dataset = load_config(layout).dataset
     if root.suffix.lower() == ".zip" and not root.is_dir():
-        root = unpack(root, layouts.SHA256, StepProgress(Console(stderr=True)), _note)
+        root = unpack(root, layouts.SHA256, step_progress(Console(stderr=True)), _note)
     if templates.by_name(dataset) and root.is_dir():
         found, _ = layouts.find(root)
         for line in layouts.table(found) if found else ():
