@@ -159,7 +159,6 @@ def utm_of(degrees: Bounds) -> str:
 def metric_twin(text: str, easting: float, northing: float) -> str:
     """Return the same projection in metres: its code in the EPSG register if it has one, else WKT.
 
-    - `text`: a projected CRS in any unit.
     - `easting`, `northing`: any point of the data, in units of ``text``; only CRSs of the register that are
       valid at this point are considered.
     """

@@ -87,8 +87,6 @@ def mask_notes(root: Path, layer: str, names: Sequence[str], road_values: Sequen
     """Return a note if the values of a mask do not fit those that mean road; empty if they may.
 
     Parts of some files are read, so that the time does not depend on the size of the survey.
-
-    - `road_values`: values that mean road; empty: every value but 0 and nodata.
     """
     step = -(-len(names) // MOST_MASKS)
     values, has_nodata, read = set[float](), False, list[str]()

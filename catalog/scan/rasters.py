@@ -399,10 +399,7 @@ def alpha_band(dataset: Any) -> int | None:
 
 
 def read_valid(dataset: Any, **how: Any) -> Any:
-    """Return the first band of an open raster as a masked array; cells without a value are masked.
-
-    - `how`: options of its method `read`, such as ``window``.
-    """
+    """Return the first band of an open raster as a masked array; cells without a value are masked."""
     values = dataset.read(1, masked=True, **how)
     alpha = alpha_band(dataset)
     return values if alpha is None else np.ma.masked_where(transparent(dataset, alpha, **how), values)

@@ -40,8 +40,6 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
     tile, and a DSM that covers less of a tile than `load.min_valid`. Every raster is opened once, and the DSM
     is read. Some tiles, with those of doubtful files first, are read as the run would (`trials`), and their
     DSM and DTM are compared (`height_findings`).
-
-    - `layers`: the layers whose files are looked up.
     """
     unusable = [tile for tile in tiles if tile.fault]
     for tile in unusable[:MAX_SHOWN]:

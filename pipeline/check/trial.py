@@ -76,7 +76,6 @@ def trials(
     """Read some tiles as the stages of a run do, up to the road mask and the splines.
 
     - `tiles`: usable tiles; some of them are read (`MOST_TILES`).
-    - `config`: configuration of the run.
     - `named`: tiles of which something else was found: they are left out.
     - `doubtful`: tiles with a file that may fail: they come first.
     - `absent`: files that are missing or closed, which have been named.
@@ -170,10 +169,7 @@ MOST_ROAD = 0.9
 
 
 def height_findings(trials: Sequence[Trial]) -> Iterator[Finding]:
-    """Yield what DSM and DTM say of each other: a line on units, and one on an offset or a step.
-
-    - `trials`: some tiles of a catalog.
-    """
+    """Yield what DSM and DTM say of each other: a line on units, and one on an offset or a step."""
     converted = sorted({note for tile in trials for note in tile.units})
     yield from (Finding(f"{note}: if they are in metres, correct the unit") for note in converted)
     lines = on_tiles([tile.note for tile in trials if tile.note], len(trials))

@@ -48,11 +48,7 @@ _thread = local()
 
 
 class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
-    """Limits a worker to one thread; before its first job, compares versions and takes the client's probe.
-
-    - `versions`: those of the client, from `versions`.
-    - `probe`: check of what the jobs need.
-    """
+    """Limits a worker to one thread; before its first job, compares versions and takes the client's probe."""
 
     def __init__(self, versions: Mapping[str, str], probe: Probe | None = None) -> None:
         self.versions = dict(versions)

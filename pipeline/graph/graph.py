@@ -231,7 +231,6 @@ class Pattern:
         """Return the graph of one tile.
 
         - `checksum`: hash the bytes of the source files instead of size and time.
-        - `stat_file`: returns size and version of a source file, None if it does not exist.
         - `recorded`: `TileGraph.sources` of an earlier graph, used for files that no longer exist.
         """
         own = tile.within(tile.grid.buffered(self.halo_m).bounds)

@@ -125,8 +125,6 @@ def created(
     """Hold a new or an existing run of a catalog while its tiles are brought up to date.
 
     - `path`: the run's folder: new, empty, or of a run, which is resumed.
-    - `catalog`: the catalog's file.
-    - `selection`: its tiles to process.
     - `store`: folder of stage results that several runs share; by default a folder of the run.
     - `checksum`: whether changed sources are detected by their content, not by size and time.
     - `allow`: folders besides the catalog's that its files may lie below.
@@ -157,9 +155,7 @@ def reopened(
 ) -> Iterator[Prepared]:
     """Hold an existing run while its tiles are brought up to date.
 
-    - `path`: the run's folder.
     - `tiles`: ids of the tiles to process; none given: all, or the failed ones.
-    - `failed`: whether the tiles that failed are processed.
     - `from_stage`: stage that is computed again, with all later ones; ``export``: only the products are
       written again.
     - `settings`: options of the workers: ``cluster.memory=8 GiB``.
@@ -178,8 +174,6 @@ def process(prepared: Prepared, verify: bool = False) -> Summary:
     """Bring the tiles of a run up to date, and write its tables, mosaics, collection and map.
 
     A tile that fails is counted, and does not stop the others.
-
-    - `verify`: see `run_tiles`.
     """
     run, observer = prepared.run, prepared.observer
     observer.start(len(run.catalog.tiles), sum(map(prepared.only, run.catalog.tiles)))
@@ -250,8 +244,6 @@ def with_workers(run: Run, settings: Sequence[str]) -> Run:
 
     Those of RUN/config.yaml that can start programs (`Cluster.programs`) count only if they are sealed: the
     run may come from anyone.
-
-    - `settings`: options of the command line: ``cluster.workers=8``.
     """
     changes = [parsed(text) for text in settings]
     for keys, _ in changes:

@@ -55,8 +55,6 @@ def exclusive(
 
     - `run`: the run; the caller holds its lock.
     - `without`: runs to ignore because they no longer exist.
-    - `notify`: receives one line when the lock of a dead process is taken over.
-    - `allow`: see `Run.open`.
     """
     with contextlib.ExitStack() as stack:
         runs = [run]
@@ -76,10 +74,7 @@ def exclusive(
 
 
 def find_garbage(runs: Sequence[Run]) -> Iterator[Garbage]:
-    """Yield the files that are not needed in the store of these runs and in the folder of the first run.
-
-    - `runs`: all runs of the store.
-    """
+    """Yield the unneeded files of a store and of the first run's folder; ``runs``: all runs of the store."""
     first = runs[0]
     # Before the needed ones are known: other commands may write to the store meanwhile, and that stays.
     unneeded = {name for name, _ in _in_store(first.store)}

@@ -265,7 +265,6 @@ def check_own(
     """Check that a folder has no visible files, or the mark of an earlier command (`is_own`).
 
     - `kind`: what the command writes: ``a run``.
-    - `option`: the option that names the folder.
     """
     try:
         other = visible_entry(folder, ignored)

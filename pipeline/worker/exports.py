@@ -124,10 +124,8 @@ def products(
 ) -> dict[str, Product]:
     """Return the products of the graph's export variants and formats, by file name.
 
-    - `graph`: the tile's graph, with the export options.
     - `evaluate`: returns the result of a node by its fingerprint.
     - `origin`: origin of the run: whole-metre (easting, northing) that mesh translations are relative to.
-    - `texture`: the photo on the mesh.
     """
     vertical = vertical_crs(graph.tile) if "cog" in graph.export.formats else None
     files: dict[str, Product] = {}
@@ -215,10 +213,7 @@ def assets(files: Mapping[str, Product], variants: tuple[str, ...], grid: Grid) 
 
 
 def item_assets(variants: tuple[str, ...], formats: Iterable[str], cells: set[float]) -> dict[str, Any]:
-    """Return what the assets of all items have in common, for a collection.
-
-    - `cells`: the cell sizes of the tiles (m).
-    """
+    """Return what the assets of all items have in common, for a collection."""
     cell = cells.copy().pop() if len(cells) == 1 else None
     return {
         asset_key(kind, variant, variants): {"type": kind.media_type}
@@ -289,7 +284,6 @@ def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
 def tile_photo(tile: Tile, layer: Layer, largest_px: int) -> Orthophoto | None:
     """Return the orthophoto of a tile, None if no pixel of it is known.
 
-    - `layer`: the tile's orthophoto.
     - `largest_px`: largest width and height (pixels); a finer photo is averaged.
     """
     source = layer_source(replace(tile, layers=(layer,)), layer.name)
