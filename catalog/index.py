@@ -352,16 +352,12 @@ def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
     for tile, layer in _chosen(catalog, layers):
         for name in (full_name(tile.root, file) for file in layer.files):
             if tile.allowed and not tile.allowed.permits(name):
-                folders = _needed(catalog, tile.allowed, layers)
+                folders = needed(catalog, tile.allowed, layers)
                 raise tile.allowed.refusal(f"tile {tile.id}: {layer.name}", name, folders)
 
 
-def needed(catalog: Catalog, folder: Location | str, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
-    """Return the folders that must be allowed to read these layers of a catalog stored in ``folder``."""
-    return _needed(catalog, AllowedFolders.of(folder), layers)
-
-
-def _needed(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str]) -> tuple[str, ...]:
+def needed(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
+    """Return the folders that must be allowed besides those of ``allowed`` to read layers of a catalog."""
     names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
     # Addresses cannot be allowed.
     outside = (name for name in names if not ADDRESS.match(name) and not allowed.permits(name))

@@ -18,6 +18,7 @@ from flexroad.catalog.storage.unpack import unpack
 from flexroad.catalog.text import count
 from flexroad.catalog.tile import MIN_COVER
 from flexroad.catalog.tiling import Conversion, TilingResult
+from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, LazyGroup, group
 from flexroad.pipeline.cli.stdio import echo
@@ -268,6 +269,6 @@ def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] 
     words = ["flexroad", "run", "--config", name, *(word for change in changes for word in ("--set", change))]
     words += ["--catalog", str(path), "--out", f"runs/{title}"]
     # Of all layers, so that the same options suit `catalog check` and `train`.
-    for folder in needed(catalog, path.parent):
+    for folder in needed(catalog, AllowedFolders.of(path.parent)):
         words += ["--allow", folder]
     return f"next: {shlex.join(words)}"

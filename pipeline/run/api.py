@@ -2,7 +2,7 @@
 
 ::
 
-    with created(path, catalog, config) as prepared:     # or reopened(path)
+    with created(path, catalog, config, selection, workers=workers) as prepared:     # or reopened(path)
         summary = process(prepared)
 """
 
@@ -59,9 +59,6 @@ class Workers:
     """Whether Dask's dashboard is served."""
 
 
-AUTO = Workers()
-
-
 @dataclass(frozen=True)
 class Selection:
     """The tiles of a catalog that a run takes; all if nothing is given."""
@@ -93,9 +90,6 @@ class Selection:
         return replace(taken, skipped=_with_lost(path, whole)), selected
 
 
-ALL = Selection()
-
-
 @dataclass(frozen=True)
 class Prepared:
     """A run that this process may write, until the block that gave it ends."""
@@ -114,12 +108,12 @@ def created(
     path: Location,
     catalog: Location,
     config: Config,
-    selection: Selection = ALL,
+    selection: Selection,
     *,
     store: Location | None = None,
     checksum: bool = False,
     allow: Sequence[Any] = (),
-    workers: Workers = AUTO,
+    workers: Workers,
     observer: Observer | None = None,
 ) -> Iterator[Prepared]:
     """Hold a new or an existing run of a catalog while its tiles are brought up to date.
@@ -150,7 +144,7 @@ def reopened(
     from_stage: str | None = None,
     settings: Sequence[str] = (),
     allow: Sequence[Any] = (),
-    workers: Workers = AUTO,
+    workers: Workers,
     observer: Observer | None = None,
 ) -> Iterator[Prepared]:
     """Hold an existing run while its tiles are brought up to date.

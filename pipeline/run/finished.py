@@ -274,13 +274,11 @@ class FinishedTile:
         """The options of `quality`."""
         return cast(assess.Options, self.graph.nodes[self.snapshot.nodes["assess"]].options)
 
-    @property
-    def cell_errors(self) -> tuple[Floats, NDArray[np.uint8]]:
-        """Estimated error (m) and height source of each cell of the core; needs the source files."""
-        return self.level_errors(0)
-
     def level_errors(self, number: int) -> tuple[Floats, NDArray[np.uint8]]:
-        """Return `cell_errors` of a level; those of level 0 if the tile does not have it."""
+        """Return estimated error (m) and height source of each cell of the core; needs the source files.
+
+        They are those of a level, or of level 0 if the tile does not have it.
+        """
         inputs = self.data, self.road, self.clusters, self.surface
         return assess.cell_errors(*inputs, self.assessment, number)
 

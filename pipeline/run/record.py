@@ -142,7 +142,9 @@ class Run:
         check_inputs(config, catalog)
         old = _record(path)
         # Existing meshes are relative to the earlier origin, which the last summary contains, too.
-        origin = (old or read_summary(path)).get("origin") or _origin(catalog)
+        origin = (old or read_summary(path)).get("origin")
+        if not origin:
+            origin = [min(axis) for axis in zip(*(tile.grid.origin for tile in catalog.usable), strict=True)]
         store = store or _store(old, path, "--store")
         exported = _exported(old, config)
         origin = (origin[0], origin[1])
@@ -314,7 +316,7 @@ def folders_of(catalog: Catalog) -> tuple[str, ...]:
     roots = [
         folder
         for root in sorted({tile.root for tile in made.tiles})
-        for folder in (root, *needed(made, root))
+        for folder in (root, *needed(made, AllowedFolders.of(root)))
     ]
     return tuple(dict.fromkeys([*(folder for allowed in given for folder in allowed.folders), *roots]))
 
@@ -342,11 +344,6 @@ def _store(record: dict[str, Any] | None, run: Location, option: str, allow: Seq
             f"add {option} {shlex.quote(named)}"
         )
     return parse_location(named)
-
-
-def _origin(catalog: Catalog) -> tuple[float, float]:
-    corners = [tile.grid.origin for tile in catalog.usable]
-    return min(east for east, _ in corners), min(north for _, north in corners)
 
 
 def _exported(record: dict[str, Any] | None, config: Config) -> tuple[str, ...]:

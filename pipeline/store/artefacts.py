@@ -18,8 +18,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any, NamedTuple
@@ -33,6 +31,7 @@ from flexroad.catalog.storage.paths import Location, contained
 from flexroad.pipeline.config.stages import methods
 from flexroad.pipeline.graph.graph import Node
 from flexroad.tasks.io.archive import npz
+from flexroad.tasks.products.npz import DAMAGED
 from flexroad.tasks.spline.frame import Corner, Edge
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.moving import MovingNurbs
@@ -50,7 +49,6 @@ from flexroad.tasks.types import (
     Surface,
 )
 
-DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
 RESULTS: dict[str, tuple[type, ...]] = {
     "segment": (RoadMask,),
     "ecsrc": (RoadClusters,),
