@@ -156,8 +156,7 @@ def _sample(tiles: Sequence[Tile], doubtful: Collection[str]) -> list[Tile]:
 
 def _files(tile: Tile, names: Collection[str]) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Return the files of some layers that lie on a tile, with the name of the layer."""
-    layers = (layer.reaching(tile.grid.bounds) for layer in tile.layers if layer.name in names)
-    return tuple((layer.name, layer.files) for layer in layers if layer)
+    return tuple((layer.name, layer.files) for layer in tile.layers_on(names))
 
 
 STEP_M = 0.3

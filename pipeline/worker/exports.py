@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.scan.rasters import quiet
-from flexroad.pipeline.graph.graph import TileGraph
+from flexroad.pipeline.graph.graph import TileGraph, product_layers
 from flexroad.pipeline.store.products import file_entry
 from flexroad.pipeline.worker.evaluator import check_unchanged
 from flexroad.tasks.errors import LayerMissing
@@ -267,9 +267,10 @@ def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
     export, tile = graph.export, graph.tile
     if not export.texture:
         return None, ""
-    if not graph.product_sources:
+    layers = tile.layers_on(product_layers(export))
+    if not layers:
         return None, NO_PHOTO
-    (layer,) = graph.product_sources
+    (layer,) = layers
     try:
         photo = tile_photo(tile, layer, export.texture_px)
     finally:
