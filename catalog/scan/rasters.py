@@ -378,13 +378,10 @@ def heights_fault(dataset: Any) -> str | None:
 
 def color_kinds(dataset: Any) -> tuple[ColorInterp, ...]:
     """Return the kind of each band of an open raster, such as grey or alpha."""
-    kinds: tuple[ColorInterp, ...]
     # The call raises the last error of GDAL, which may be about a tag that does not matter, and so clears it.
     with contextlib.suppress(Exception):
-        kinds = dataset.colorinterp
-        return kinds
-    kinds = dataset.colorinterp
-    return kinds
+        _ = dataset.colorinterp
+    return tuple(dataset.colorinterp)
 
 
 def alpha_band(dataset: Any) -> int | None:
