@@ -349,7 +349,7 @@ def estimates(folder: Path, place: Place, truth: Truth) -> Floats:
     for tile in select(str(folder), allow=[str(place.catalog.anchor)]).finished():
         west, south, east, north = tile.tile.grid.bounds
         inside = (truth.x >= west) & (truth.x < east) & (truth.y > south) & (truth.y <= north)
-        error, _ = tile.cell_errors
+        error, _ = tile.level_errors(0)
         road = tile.road.mask[tile.road.grid.window(tile.road.core)]
         cells = tile.tile.grid.cells(truth.x[inside], truth.y[inside])
         estimate[inside] = np.where(road, error, np.nan)[cells]

@@ -12,12 +12,13 @@ import typer
 from rich.console import Console
 
 from flexroad.catalog import Catalog, CatalogError, layouts
-from flexroad.catalog.allowlist import needed
+from flexroad.catalog.index import needed
 from flexroad.catalog.sources import nrw, rasters, templates
 from flexroad.catalog.storage.unpack import unpack
 from flexroad.catalog.text import count
 from flexroad.catalog.tile import MIN_COVER
 from flexroad.catalog.tiling import Conversion, TilingResult
+from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, LazyGroup, group
 from flexroad.pipeline.cli.stdio import echo
@@ -25,7 +26,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, MIN_COVER_HELP, OUTPUTS, TILES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.layers import fitting_config
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
 from flexroad.pipeline.run.record import check_inputs
 
 TOOLS = {
@@ -188,7 +189,7 @@ def catalog_gerod(
     """
     dataset = load_config(layout).dataset
     if root.suffix.lower() == ".zip" and not root.is_dir():
-        root = unpack(root, layouts.SHA256, StepProgress(Console(stderr=True)), _note)
+        root = unpack(root, layouts.SHA256, step_progress(Console(stderr=True)), _note)
     if templates.by_name(dataset) and root.is_dir():
         found, _ = layouts.find(root)
         for line in layouts.table(found) if found else ():
@@ -268,6 +269,6 @@ def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] 
     words = ["flexroad", "run", "--config", name, *(word for change in changes for word in ("--set", change))]
     words += ["--catalog", str(path), "--out", f"runs/{title}"]
     # Of all layers, so that the same options suit `catalog check` and `train`.
-    for folder in needed(catalog, path.parent):
+    for folder in needed(catalog, AllowedFolders.of(path.parent)):
         words += ["--allow", folder]
     return f"next: {shlex.join(words)}"

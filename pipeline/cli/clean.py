@@ -16,8 +16,7 @@ from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.cleanup import MEANING, delete, exclusive, find_garbage
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.record import Run, check_links
-from flexroad.pipeline.run.store_users import runs_using, unregister
+from flexroad.pipeline.run.record import Run, check_links, runs_using, unregister
 
 app = group()
 

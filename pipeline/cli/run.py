@@ -17,8 +17,8 @@ from rich.console import Console
 from flexroad.catalog.area import Area
 from flexroad.catalog.storage.paths import parse_location
 from flexroad.catalog.text import count
-from flexroad.pipeline.check.heights import road_is_off, road_step
 from flexroad.pipeline.check.reasons import why_pending
+from flexroad.pipeline.check.trial import road_is_off, road_step
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.dry_run import plan

@@ -16,8 +16,7 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.vrt import WarpedVRT
 
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
-from flexroad.catalog.scan.rasters import quiet
-from flexroad.catalog.scan.valid_cells import color_kinds
+from flexroad.catalog.scan.rasters import color_kinds, quiet
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import LayerMissing, TaskError, Unusable, leave_out

@@ -22,8 +22,7 @@ from flexroad.catalog.crs import short
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.guard.open_raster import ERRORS, has_own_blocks, kept_raster, open_raster
 from flexroad.catalog.guard.source_files import InputRejected, files_of, read_through
-from flexroad.catalog.scan.rasters import heights_fault
-from flexroad.catalog.scan.valid_cells import transparent
+from flexroad.catalog.scan.rasters import heights_fault, transparent
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason
 from flexroad.tasks.errors import TaskError, Unusable

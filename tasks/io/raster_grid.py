@@ -15,8 +15,7 @@ from rasterio.enums import MaskFlags
 from flexroad.catalog.crs import bounds_in, in_plan, same, scales, short, transformer
 from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from flexroad.catalog.scan.rasters import georeference_fault
-from flexroad.catalog.scan.valid_cells import alpha_band
+from flexroad.catalog.scan.rasters import alpha_band, georeference_fault
 from flexroad.catalog.storage.paths import Location
 from flexroad.tasks.errors import Unusable
 from flexroad.tasks.types import Bools, Floats

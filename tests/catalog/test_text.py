@@ -5,7 +5,7 @@ import os
 import pytest
 
 from flexroad.catalog import CatalogError
-from flexroad.catalog.allowlist import AllowedFolders
+from flexroad.catalog.index import AllowedFolders
 from flexroad.catalog.storage.paths import parse_location
 from flexroad.catalog.storage.settings import s3_options
 from flexroad.catalog.text import without_credentials

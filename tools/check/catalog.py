@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 
 from flexroad.catalog import LAYERS, Catalog, Tile
-from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import short, transformer
+from flexroad.catalog.index import check_allowed
 from flexroad.catalog.scan.cell_values import plateau_notes
 from flexroad.catalog.storage.paths import Location, exists, read, remove, write
 from flexroad.catalog.text import count, write_reason

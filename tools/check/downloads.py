@@ -19,8 +19,7 @@ from flexroad.catalog.crs import in_plan, plan_unit, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
 from flexroad.catalog.scan.point_clouds import inspect
-from flexroad.catalog.scan.rasters import quiet
-from flexroad.catalog.scan.valid_cells import read_valid
+from flexroad.catalog.scan.rasters import quiet, read_valid
 from flexroad.catalog.scan.vectors import layers as layers_of
 from flexroad.catalog.scan.vectors import listed
 from flexroad.catalog.sources import nrw

@@ -20,8 +20,7 @@ from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile, GroundTile, passing
-from flexroad.pipeline.run.points import LARGEST_STEP_M, length_text
-from flexroad.pipeline.run.sampler import TileSampler
+from flexroad.pipeline.run.sampler import LARGEST_STEP_M, TileSampler, length_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
 from flexroad.tasks.quality.flagged import flag_names

@@ -19,8 +19,8 @@ from flexroad.pipeline.cli.stdio import echo, end_for_steps
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-from flexroad.pipeline.run.points import STEP_REMEDY
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
+from flexroad.pipeline.run.sampler import STEP_REMEDY
 from flexroad.tools.export.driver import check_formats
 from flexroad.tools.export.driver import export as write
 from flexroad.tools.export.georeference import Datum
@@ -91,7 +91,7 @@ def export(
     folder = parse_location(output)
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)
-    track = StepProgress(Console(stderr=True))
+    track = step_progress(Console(stderr=True))
     runner = SerialExecutor() if workers == 1 else DaskExecutor(workers)
     try:
         source = select(

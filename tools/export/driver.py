@@ -31,8 +31,8 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.points import STEP_REMEDY
 from flexroad.pipeline.run.record import Run, check_own
+from flexroad.pipeline.run.sampler import STEP_REMEDY
 from flexroad.pipeline.run.status import Track, ended, untracked
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.export.formats import FORMATS, Format

@@ -18,10 +18,10 @@ from flexroad.pipeline.config.options import INPUTS, OUTPUTS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import (
     COMPUTED_AGAIN,
-    FileStates,
     FinishedTile,
     RunPlace,
     Snapshot,
+    file_states,
     snapshots,
 )
 from flexroad.pipeline.run.record import Run
@@ -139,9 +139,9 @@ class Source:
 
         Only sizes and times of their files are compared, so that each format can have a pass of its own.
         """
-        files, place = FileStates(self.run), RunPlace.of(self.run)
+        state, place = file_states(self.run), RunPlace.of(self.run)
         for tile, before in zip(self.tiles, self.snapshots, strict=True):
-            current = before if files(tile) == before.files else self._checked(tile, before)
+            current = before if state(tile) == before.files else self._checked(tile, before)
             yield FinishedTile(tile, self.variant, current, place)
 
     def _checked(self, tile: Tile, before: Snapshot) -> Snapshot:

@@ -15,8 +15,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo, end_for_steps
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.points import LARGEST_STEP_M, STEP_REMEDY, length_text
-from flexroad.pipeline.run.sampler import RunSampler
+from flexroad.pipeline.run.sampler import LARGEST_STEP_M, STEP_REMEDY, RunSampler, length_text
 from flexroad.tools.lift.driver import lift as lift_file
 from flexroad.tools.lift.types import Options
 

@@ -24,8 +24,7 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import passing
-from flexroad.pipeline.run.points import length_text
-from flexroad.pipeline.run.sampler import RunSampler, required_crs
+from flexroad.pipeline.run.sampler import RunSampler, length_text, required_crs
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tools.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.lazy import lazy
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.quality.flagged import Bits, passed
 from flexroad.tasks.roads import attributes

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.roads.attributes import OSM_TAGS, level_numbers
 from flexroad.tasks.types import Floats
 from flexroad.tools.lift.lines import stretches

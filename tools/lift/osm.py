@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.text import shown
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats

@@ -15,8 +15,7 @@ from flexroad.catalog import Bounds
 from flexroad.catalog.crs import in_plan, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.pipeline.config.options import METHOD, OUTPUTS, option
-from flexroad.pipeline.run.points import Heights, to_crs
-from flexroad.pipeline.run.sampler import RunSampler
+from flexroad.pipeline.run.sampler import Heights, RunSampler, to_crs
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 

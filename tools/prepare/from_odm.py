@@ -21,8 +21,7 @@ from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import bounds_in
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.scan.rasters import date_of
-from flexroad.catalog.scan.valid_cells import color_kinds
+from flexroad.catalog.scan.rasters import color_kinds, date_of
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor

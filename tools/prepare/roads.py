@@ -21,7 +21,7 @@ from flexroad.catalog.crs_checks import angle_fault
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
 from flexroad.catalog.guard.open_vector import encoding_note, in_its_encoding, vector_name
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.scan.valid_cells import read_valid
+from flexroad.catalog.scan.rasters import read_valid
 from flexroad.catalog.scan.vectors import VectorFile, layers, listed, opened
 from flexroad.catalog.text import count
 from flexroad.catalog.to_metres import MetricTransform

@@ -21,7 +21,7 @@ from flexroad.catalog.guard.source_files import InputRejected
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import reason, shown
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.points import to_crs
+from flexroad.pipeline.run.sampler import to_crs
 from flexroad.tasks import memory
 from flexroad.tasks.io.vectors import WHOLE
 from flexroad.tasks.types import Floats

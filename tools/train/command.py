@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from flexroad.catalog import Catalog
-from flexroad.catalog.allowlist import check_allowed
+from flexroad.catalog.index import check_allowed
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.storage.paths import check_writable
 from flexroad.catalog.text import printable, shown

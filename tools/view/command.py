@@ -18,7 +18,7 @@ from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import OUTPUTS
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
 from flexroad.pipeline.run.record import Run
 from flexroad.tools.view.driver import server, write_viewer
 
@@ -70,7 +70,7 @@ def view(
     if serve and is_remote(folder):
         raise ConfigError(f"--serve needs a folder on disk, not {folder}; give one with -o")
     runner = SerialExecutor() if workers == 1 else DaskExecutor(workers)
-    track = StepProgress(Console(stderr=True))
+    track = step_progress(Console(stderr=True))
     written = write_viewer(run, folder, runner, tile or (), bbox, track)
     for note in written.notes[:MOST_NOTES]:
         echo(f"note: {note}", err=True)

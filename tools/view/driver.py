@@ -20,8 +20,7 @@ from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.crs import in_plan, name, short, transformer
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.storage.links import contained
-from flexroad.catalog.storage.paths import Location, absolute, exists, read, remove, write
+from flexroad.catalog.storage.paths import Location, absolute, contained, exists, read, remove, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots

@@ -9,7 +9,7 @@ from rasterio.enums import ColorInterp, Resampling
 
 from flexroad.catalog import Grid
 from flexroad.catalog.scan.cell_values import height_share, mask_notes
-from flexroad.catalog.scan.valid_cells import alpha_band, read_valid
+from flexroad.catalog.scan.rasters import alpha_band, read_valid
 from flexroad.tasks.io.raster import read_window
 from tests.make_rasters import UTM, write
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks import TaskError
 from flexroad.tools.lift import xml_text
 from flexroad.tools.lift.driver import XML_FORMATS

@@ -10,7 +10,7 @@ import cloudpickle
 import dask
 import pytest
 
-from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.models import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor
 from flexroad.pipeline.execute.clusters import open_cluster

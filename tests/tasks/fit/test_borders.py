@@ -9,7 +9,7 @@ import scipy
 
 from flexroad.catalog.borders import border_of
 from flexroad.catalog.grid import Grid
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import encode
 from flexroad.tasks import load
 from flexroad.tasks.border import ENDS, BorderStages
 from flexroad.tasks.filter import planar
@@ -240,7 +240,7 @@ def test_part_with_dtm_checked_near_border_equals_that_of_complete_filter(monkey
         complete = stages.frame(world, tile)
         for field in fields(Frame):
             parts = (getattr(result, field.name) for result in (frame, complete))
-            assert len({codec.encode(result, {}, (), "") for result in parts}) == 1
+            assert len({encode(result, {}, (), "") for result in parts}) == 1
 
 
 def test_border_without_ground_is_left_free():

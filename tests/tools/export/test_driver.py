@@ -13,7 +13,7 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.errors import TaskError
@@ -134,7 +134,7 @@ def test_error_ends_the_progress_lines(city, tmp_path, monkeypatch):
             ["obj"],
             OPTIONS,
             SerialExecutor(),
-            track=StepProgress(Console(quiet=True)),
+            track=step_progress(Console(quiet=True)),
         )
     assert raised.tb  # It refers to the iterator of the tiles.
     assert threading.active_count() == before

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tools.lift import types
 
 
