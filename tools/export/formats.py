@@ -35,7 +35,7 @@ from flexroad.tools.export import (
 )
 from flexroad.tools.export.georeference import Georeference
 from flexroad.tools.export.network import network
-from flexroad.tools.export.source import Options, Source, TileItem, layer_state, texture_of
+from flexroad.tools.export.source import Options, Source, layer_state, texture_of
 from flexroad.tools.export.tile_outputs import (
     Encode,
     TileOutput,
@@ -78,10 +78,9 @@ def obj_output(
     return TileOutput(files, {"height_error_m": _error_m(tile, 10**-obj.DECIMALS)})
 
 
-def draped_obj_output(item: TileItem, place: Georeference) -> TileOutput:
+def draped_obj_output(tile: FinishedTile, place: Georeference) -> TileOutput:
     """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
-    tile, name = item.tile, safe_name(item.id)
-    image = texture_of(tile)
+    image, name = texture_of(tile), safe_name(tile.id)
     materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
     output = obj_output(tile, place, materials, image.bounds if image else None)
     if image is None:
@@ -203,8 +202,16 @@ def write_obj(
         write(folder / MATERIALS, obj.encode_materials())
         return _write_each(obj.VERSION, obj_output, source, tiles, folder, options, executor)
     remove(folder / MATERIALS)
-    items = (TileItem(tile, f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}") for tile in tiles)
-    return figures(write_outputs(items, folder, obj.VERSION, draped_obj_output, source.place, executor))
+    rows = write_outputs(
+        tiles,
+        folder,
+        obj.VERSION,
+        draped_obj_output,
+        source.place,
+        executor,
+        made_of=lambda tile: f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}",
+    )
+    return figures(rows)
 
 
 def _write_each(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,7 +11,6 @@ import numpy as np
 from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.area import Area
 from flexroad.catalog.guard.source_files import source_stat
-from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS, option
 from flexroad.pipeline.errors import ConfigError
@@ -31,10 +29,7 @@ from flexroad.pipeline.worker.exports import tile_texture
 from flexroad.tasks.io.dsm_and_dtm import vertical_crs
 from flexroad.tasks.metrics.evaluate import FIGURES
 from flexroad.tasks.products.glb import Texture
-from flexroad.tools.export.aerial import Aerial
 from flexroad.tools.export.georeference import Datum, Georeference
-
-Image = lazy("PIL.Image")
 
 
 @dataclass(frozen=True)
@@ -65,25 +60,6 @@ class Options:
     left_hand: bool = option(False, INPUTS, "Traffic keeps left, for xodr.")
     formats: frozenset[str] = frozenset()
     """Names of the formats that are written together: some refer to files of other formats."""
-
-
-@dataclass(frozen=True, eq=False)
-class TileItem:
-    """A finished tile whose files are made of more than its mesh, such as its photo; sent to a worker."""
-
-    tile: FinishedTile
-    fingerprint: str
-    """Name of its files by what they are made of."""
-
-    @property
-    def id(self) -> str:
-        """Id of the tile."""
-        return self.tile.id
-
-    @property
-    def label(self) -> str:
-        """Its name in messages."""
-        return self.tile.label
 
 
 def layer_state(tile: Tile, name: str) -> str:
@@ -198,16 +174,3 @@ def texture_of(tile: FinishedTile) -> Texture | None:
         return tile_texture(with_photo.graph(tile.tile, tile.place.checksum))[0]
     except SourceChanged as error:
         raise ConfigError(f"{error.file} {error}") from error
-
-
-def aerial_of(texture: Texture, pixel_m: float) -> Aerial:
-    """Return a texture as pixels: means of its own, of which at least two fit into ``pixel_m`` (m)."""
-    west, south, east, north = texture.bounds
-    image = Image.open(io.BytesIO(texture.jpeg))
-    dx, dy = (east - west) / image.width, (north - south) / image.height
-    # Large photos would take a gigabyte as numbers.
-    factor = max(1, int(pixel_m / max(dx, dy) / 2))
-    colour = np.asarray(image.reduce(factor), np.float64)
-    rows, columns = colour.shape[:2]
-    bounds = west, north - rows * factor * dy, west + columns * factor * dx, north
-    return Aerial(bounds, colour, np.ones((rows, columns)))

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -67,17 +68,14 @@ class Item(Protocol):
     @property
     def id(self) -> str:
         """Id of the tile, area or road; unique within an export."""
-        ...
 
     @property
     def fingerprint(self) -> str:
         """Name of the content by what it is made of."""
-        ...
 
     @property
     def label(self) -> str:
         """Its name in messages."""
-        ...
 
 
 Encode = Callable[[Any, Any], TileOutput]
@@ -145,12 +143,14 @@ def write_outputs(
     options: Any,
     executor: Executor,
     group: str = "",
+    made_of: Callable[[Any], str] = attrgetter("fingerprint"),
 ) -> Iterator[ManifestRow]:
     """Write the files of each tile that does not have them, and yield the row of each, in any order.
 
     Files of tiles of an earlier export that are not among the given ones are removed at the end.
 
     - `group`: name of what the items have in common, if a format has several kinds of them.
+    - `made_of`: returns the name of an item's content, where it depends on more than its fingerprint.
     """
     unchanged: list[ManifestRow] = []
     kept: set[str] = set()
@@ -160,7 +160,7 @@ def write_outputs(
             marker = _marker(folder, group, tile.id)
             kept.add(marker.name)
             former = _Mark.read(marker)
-            key = sha256(f"{tile.fingerprint} {version} {options}".encode()).hexdigest()
+            key = sha256(f"{made_of(tile)} {version} {options}".encode()).hexdigest()
             if former and former.holds(folder, key):
                 unchanged.append(former.row)
             else:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -36,13 +36,12 @@ from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import glb
 from flexroad.tasks.quality.height_source import top_height_source
 from flexroad.tasks.roads import rasterise
-from flexroad.tasks.roads.rasterise import DEFAULTS
 from flexroad.tasks.roads.rasterise import Options as RoadOptions
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats
 from flexroad.tools.export.network import read_centre_lines
-from flexroad.tools.export.source import TileItem, layer_state
+from flexroad.tools.export.source import layer_state
 from flexroad.tools.export.tile_outputs import TileOutput, write_outputs
 from flexroad.tools.view import encoding
 
@@ -110,10 +109,15 @@ def write_viewer(
     index, done = _index(run, tiles, variant)
     options = run.config.chains[variant]["segment"]
     roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
-    look = Look(run.origin, roads)
-    finished = track(_finished(run, done, variant), "writing tiles", len(done))
-    with ended(finished):
-        rows = list(write_outputs(finished, out, VERSION, script, look, executor))
+    place = RunPlace.of(run)
+    finished = (
+        FinishedTile(tile, variant, snapshot, place)
+        for tile, snapshot in snapshots(run, done, variant)
+        if snapshot
+    )
+    tracked, look = track(finished, "writing tiles", len(done)), (run.origin, roads)
+    with ended(tracked):
+        rows = list(write_outputs(tracked, out, VERSION, script, look, executor, made_of=_made_of))
     for file in built_files():
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())
@@ -173,13 +177,10 @@ def _claim(out: Location, run: Run) -> None:
     remove(out / PAGE)
 
 
-def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[TileItem]:
-    place = RunPlace.of(run)
-    for tile, snapshot in snapshots(run, done, variant):
-        if snapshot:
-            photo_and_lines = (layer_state(tile, name) for name in ("dop", "roads"))
-            made_of = " ".join((snapshot.nodes["assess"], *photo_and_lines))
-            yield TileItem(FinishedTile(tile, variant, snapshot, place), made_of)
+def _made_of(tile: FinishedTile) -> str:
+    """Return the name of a tile's script by what it is made of."""
+    photo_and_lines = (layer_state(tile.tile, name) for name in ("dop", "roads"))
+    return " ".join((tile.snapshot.nodes["assess"], *photo_and_lines))
 
 
 def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any], list[Tile]]:
@@ -275,20 +276,12 @@ def server(folder: Path, port: int) -> ThreadingHTTPServer:
     return ThreadingHTTPServer((LOOPBACK, port), partial(_Files, directory=str(folder)))
 
 
-@dataclass(frozen=True)
-class Look:
-    """Options of the tiles' scripts."""
+def script(tile: FinishedTile, look: tuple[tuple[float, float], RoadOptions]) -> TileOutput:
+    """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks.
 
-    origin: tuple[float, float]
-    """Whole-metre (easting, northing) that meshes of the run are relative to."""
-    roads: RoadOptions = DEFAULTS
-    """Selection of the road lines."""
-
-
-def script(item: TileItem, look: Look) -> TileOutput:
-    """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks."""
-    tile = item.tile
-    source, notes = tile.tile, list[str]()
+    - `look`: the run's origin (easting, northing), and which road lines are shown.
+    """
+    (origin, roads), source, notes = look, tile.tile, list[str]()
     photo = _photo(source, PHOTO_PX, notes)
     quality, surface, core = tile.quality, tile.surface, source.grid
     top = surface.top(*np.meshgrid(core.eastings, core.northings))
@@ -309,7 +302,7 @@ def script(item: TileItem, look: Look) -> TileOutput:
         seen = base64.b64encode(small).decode("ascii")
     encoded = encoding.encode_tile(
         tile.id,
-        glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
+        glb.encode(tile.mesh, (*origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
         corners(source),
         top_height_source(quality, top),
@@ -318,7 +311,7 @@ def script(item: TileItem, look: Look) -> TileOutput:
         estimate,
         surface if isinstance(surface, NurbsSurface) and not surface.levels else None,
         surface.highest.lattice(core.eastings, core.northings) if surface.levels else None,
-        _lines(source, look.roads, notes),
+        _lines(source, roads, notes),
     )
     name = f"tiles/{safe_name(tile.id)}{encoding.NAME_TILE}"
     return TileOutput(
