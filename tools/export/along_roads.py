@@ -292,7 +292,7 @@ def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Pro
     """Return numbers, grids, profiles and rows of a route's roads, and why it has none."""
     height, step = unit.height(work), unit.height(work, steps=True)
     line, problem = reference_line(unit)
-    parts = [] if line is None else lines.usable(line, height(line.x, line.y), lines.Options())
+    parts = [] if line is None else lines.usable(line, height(line.x, line.y))
     roads = []
     for part, own in enumerate(parts):
         grid = height_grid(own, height)
@@ -304,12 +304,11 @@ def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Pro
 
 def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
     """Return the line of a route, or why it has none."""
-    options = lines.Options()
     try:
-        line = lines.reference_line(unit.route, options)
+        line = lines.reference_line(unit.route)
     except TaskError as error:
         return None, str(error)
-    return line, f"shorter than {options.min_length_m:g} m" if line is None else ""
+    return line, f"shorter than {lines.MIN_LENGTH_M:g} m" if line is None else ""
 
 
 def route_row(unit: RouteUnit, roads: list[ManifestRow], problem: str) -> ManifestRow:

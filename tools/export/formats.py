@@ -55,7 +55,7 @@ NO_PHOTO = "no orthophoto, in plain colours"
 
 def landxml_part(tile: FinishedTile, project: landxml.Project) -> TileOutput:
     """Return the part of a LandXML file."""
-    part = landxml.part(tile.mesh, project.joined).encode()
+    part = landxml.part(tile.mesh, project.joined)
     return TileOutput({part_name(tile.id): part}, {"height_error_m": _error_m(tile, 10**-landxml.DECIMALS)})
 
 
@@ -172,8 +172,7 @@ def write_landxml(
 
     def join(local: Path, parts: Iterator[bytes]) -> None:
         with local.open("wb") as file:
-            decoded = (landxml.Part.decode(part) for part in parts)
-            landxml.join(file, decoded, project, local.parent, options.compress)
+            landxml.join(file, parts, project, local.parent, options.compress)
 
     file = folder / f"{source.run.path.name}{name}"
     return write_joined(source, tiles, file, landxml.VERSION, landxml_part, project, executor, join)

@@ -18,6 +18,8 @@ from typing import Any, Literal
 
 import numpy as np
 from pyproj import CRS, Transformer
+from pyproj.crs import ProjectedCRS
+from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 from pyproj.exceptions import ProjError
 
 from flexroad.catalog import crs as crs_of
@@ -116,33 +118,9 @@ class LocalFrame:
 
     @cached_property
     def _transformer(self) -> Transformer:
-        geodetic = _geodetic(self.crs).to_json_dict()
-        metre = {"type": "LinearUnit", "name": "metre", "conversion_factor": 1}
-        values = {
-            "Latitude of natural origin": (self.latitude, "degree"),
-            "Longitude of natural origin": (self.longitude, "degree"),
-            "Scale factor at natural origin": (1, "unity"),
-            "False easting": (0, metre),
-            "False northing": (0, metre),
-        }
-        local = {
-            "type": "ProjectedCRS",
-            "name": "local transverse Mercator",
-            "base_crs": geodetic,
-            "conversion": {
-                "name": "local",
-                "method": {"name": "Transverse Mercator", "id": {"authority": "EPSG", "code": 9807}},
-                "parameters": [{"name": k, "value": v, "unit": u} for k, (v, u) in values.items()],
-            },
-            "coordinate_system": {
-                "subtype": "Cartesian",
-                "axis": [
-                    {"name": "Easting", "abbreviation": "E", "direction": "east", "unit": "metre"},
-                    {"name": "Northing", "abbreviation": "N", "direction": "north", "unit": "metre"},
-                ],
-            },
-        }
-        return Transformer.from_crs(_plan(self.crs), CRS.from_json_dict(local), always_xy=True)
+        conversion = TransverseMercatorConversion(self.latitude, self.longitude, 0, 0, 1)
+        local = ProjectedCRS(conversion, geodetic_crs=_geodetic(self.crs))
+        return Transformer.from_crs(_plan(self.crs), local, always_xy=True)
 
 
 def _plan(crs: str) -> CRS:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.roads.attributes import OSM_TAGS, level_numbers
 from flexroad.tasks.types import Floats
-from flexroad.tools.lift.lines import stretches
+from flexroad.tools.export.reference_line import stretches
 
 ANY = np.int8(-128)
 """A wanted level that is not known."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.export.profiles import cubic_pieces, straight_lines
-from flexroad.tools.lift.lines import stretches
+from flexroad.tools.export.reference_line import stretches
 from flexroad.tools.lift.network import NOWHERE, Ends, filled
 from flexroad.tools.lift.xml_text import Part
 

@@ -350,7 +350,7 @@ def _lines(tile: Tile, options: RoadOptions, notes: list[str]) -> tuple[CentreLi
         return ()
     bounds = tile.grid.bounds
     try:
-        lines = read_centre_lines(source, bounds, tile.grid.crs, options).lines
+        lines = read_centre_lines({source: bounds}, tile.grid.crs, options).lines
     except TaskError as error:
         notes.append(f"no road lines: {error}")
         return ()

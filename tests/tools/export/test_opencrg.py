@@ -8,7 +8,6 @@ from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots
 from flexroad.tools.export import opencrg
 from flexroad.tools.export.georeference import LocalFrame
 from flexroad.tools.export.profiles import HeightGrid, height_grid
-from flexroad.tools.export.reference_line import Options as LineOptions
 from flexroad.tools.export.reference_line import reference_line
 
 SOUTH_WEST = (366_000.0, 5_621_000.0)
@@ -40,7 +39,7 @@ def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def grid(points: np.ndarray = BENDS, **options: float) -> HeightGrid:
     x, y = FRAME.to_local(*(points + SOUTH_WEST).T)
-    line = reference_line(Route((CentreLine(np.stack([x, y], axis=1), 6.0),)), LineOptions())
+    line = reference_line(Route((CentreLine(np.stack([x, y], axis=1), 6.0),)))
     assert line is not None
     return height_grid(line, height, **options)
 

@@ -12,7 +12,6 @@ from flexroad.tasks.levels.along_route import Structure
 from flexroad.tasks.roads.routes import CentreLine, Route
 from flexroad.tools.export import opendrive
 from flexroad.tools.export.profiles import HeightAt, elevation_error, height_grid, profile_error, profiles
-from flexroad.tools.export.reference_line import Options as LineOptions
 from flexroad.tools.export.reference_line import ReferenceLine, reference_line
 from tests.read_opendrive import numbers, plan, polynomial, quality_issues
 
@@ -28,7 +27,7 @@ def hills(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def reference(points: np.ndarray = BENDS, **known: object) -> ReferenceLine:
     parts = (CentreLine(points, 6.0, **known),)
-    line = reference_line(Route(parts), LineOptions())
+    line = reference_line(Route(parts))
     assert line is not None
     return line
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from flexroad.tasks.roads.routes import CentreLine, Route
+from flexroad.tools.export import reference_line as lines
 from flexroad.tools.export.profiles import (
     HeightGrid,
     Profiles,
@@ -12,17 +13,12 @@ from flexroad.tools.export.profiles import (
     profiles,
     value_at,
 )
-from flexroad.tools.export.reference_line import Options as LineOptions
-from flexroad.tools.export.reference_line import ReferenceLine, reference_line
+from flexroad.tools.export.reference_line import ReferenceLine
 
 
 def straight(length: float = 120.0) -> ReferenceLine:
     """Return a straight road to the east, 6 m wide: s is x, and v is y."""
-    line = reference_line(
-        Route((CentreLine(np.array([[0.0, 0.0], [length, 0.0]]), 6.0),)), LineOptions(increment_m=1.0)
-    )
-    assert line is not None
-    return line
+    return road(np.array([[0.0, 0.0], [length, 0.0]]))
 
 
 def grid(heights_at, length: float = 120.0) -> HeightGrid:
@@ -139,7 +135,9 @@ def test_a_cubic_is_one_piece():
 
 
 def road(points: np.ndarray, width_m: float = 6.0) -> ReferenceLine:
-    line = reference_line(Route((CentreLine(points, width_m),)), LineOptions(increment_m=1.0))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(lines, "INCREMENT_M", 1.0)
+        line = lines.reference_line(Route((CentreLine(points, width_m),)))
     assert line is not None
     return line
 
