@@ -18,6 +18,8 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats, HeightAt
 from flexroad.tools.export.reference_line import ReferenceLine
 
+MARGIN_M = 1.0
+"""Width of a grid beside the widest carriageway (m); less in narrow bends, so that the grid does not fold."""
 TOLERANCE_M = 0.0005
 """Largest distance of a profile from the straight lines that fit the cross-sections (m)."""
 
@@ -136,13 +138,9 @@ class HeightGrid:
     """``(n, m)``, m; NaN beyond the surface, and beyond a gap in it: no row has NaN between heights."""
 
 
-def height_grid(line: ReferenceLine, height: HeightAt, margin_m: float = 1.0) -> HeightGrid:
-    """Return the heights of a surface beside a part of a line that `reference_line.usable` returns.
-
-    - `margin_m`: width beside the carriageway at its widest place (m), less in narrow bends, so that the grid
-      does not fold.
-    """
-    v = across(line, 0.25, margin_m)
+def height_grid(line: ReferenceLine, height: HeightAt) -> HeightGrid:
+    """Return the heights of a surface beside a part of a line that `reference_line.usable` returns."""
+    v = across(line, 0.25, MARGIN_M)
     heights, middle = height(*line.beside(v)), int(np.argmin(np.abs(v)))
     # Readers of OpenCRG refuse gaps in a row.
     known = np.isfinite(heights)

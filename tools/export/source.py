@@ -137,7 +137,6 @@ def select(
     location: Location,
     ids: Sequence[str] = (),
     bbox: Bounds | None = None,
-    variant: str | None = None,
     allow: Sequence[str] = (),
     area: Area | None = None,
     track: Track = untracked,
@@ -149,10 +148,7 @@ def select(
     - `track`: shows the progress of that.
     """
     run = Run.open(location, allow)
-    variants = run.config.export.variants
-    variant = variant or variants[0]
-    if variant not in variants:
-        raise ConfigError(f"{location} exports no variant {variant!r}; it has {', '.join(variants)}")
+    variant = run.config.export.variants[0]
     wanted = run.catalog.select(ids, bbox, area).tiles
     checked = track(snapshots(run, wanted, variant), "checking tiles", len(wanted))
     done = {tile.id: snapshot for tile, snapshot in checked if snapshot}

@@ -25,7 +25,7 @@ from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import passing
 from flexroad.pipeline.run.points import length_text
-from flexroad.pipeline.run.sampler import RunSampler, required_crs
+from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tools.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text
@@ -62,8 +62,6 @@ class LiftedFile:
     """What became of a file."""
 
     rows: tuple[Lifted, ...]
-    files: tuple[Path, ...]
-    """The files written."""
     earlier: int
     """Number of tiles whose heights are of earlier sources or options."""
     noun: str
@@ -164,21 +162,18 @@ def lift(
             place = Frame(place.crs, *offset)
         if place.crs is None:
             raise TaskError("carries no CRS; give it with --crs, such as --crs EPSG:25832")
-        in_run = RunSurface(
-            ground, plan_crs(place.crs), place, required_crs(ground), module in VECTORS, crs is not None
-        )
+        in_run = RunSurface(ground, plan_crs(place.crs), place, module in VECTORS, crs is not None)
         with made_folder(out.absolute().parent), ScratchFolder(out.absolute().parent) as scratch:
             with _named(out, Path(scratch)):
                 rows = tuple(module.lift(source, Path(scratch, out.name), in_run, options))
             in_run.require_heights()
-            files = _move(Path(scratch), out)
-            _remove_parts(out, files)
+            _move(Path(scratch), out)
     except (TaskError, InputRejected) as error:
         raise ConfigError(f"{source} {error}") from error
     if report is not None:
-        files += _write_report(rows, report, in_run)
+        _write_report(rows, report, in_run)
     seen = in_run.seen
-    return LiftedFile(rows, files, len(seen.earlier), NOUNS.get(module, "feature"), options, seen.tile_step_m)
+    return LiftedFile(rows, len(seen.earlier), NOUNS.get(module, "feature"), options, seen.tile_step_m)
 
 
 def _format(source: Path) -> ModuleType:
@@ -245,29 +240,25 @@ def _named(out: Path, scratch: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror or str(error), str(out)) from error
 
 
-def _move(scratch: Path, out: Path) -> tuple[Path, ...]:
-    """Move the files that a format has written into their places; the one that was asked for is the last."""
+def _move(scratch: Path, out: Path) -> None:
+    """Move the files that a format has written into their places; the one that was asked for is the last.
+
+    Parts of a Shapefile that has been replaced are removed if the new one has none: old indices.
+    """
     made = sorted(path for path in scratch.iterdir() if path.is_file() and not path.name.startswith("."))
     made.sort(key=lambda path: path.name == out.name)
-    files = list[Path]()
     for path in made:
-        target = out.parent / path.name
-        path.replace(output_file(target))
-        files.append(target)
-    return tuple(files)
-
-
-def _remove_parts(out: Path, files: Sequence[Path]) -> None:
-    """Remove the parts of a Shapefile that has been replaced, of which the new one has none: old indices."""
+        path.replace(output_file(out.parent / path.name))
     if out.suffix.lower() == shapefile.SUFFIXES[0]:
+        names = {path.name for path in made}
         for end in SHAPEFILE_PARTS:
             part = out.with_suffix(end)
-            if part not in files and part.is_file():
+            if part.name not in names and part.is_file():
                 part.unlink()
 
 
-def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> tuple[Path, ...]:
-    """Write the table, and the places above limits if there are any; return the files."""
+def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> None:
+    """Write the table, and the places above limits if there are any."""
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, list(_row(Lifted(""))), lineterminator="\n")
     table.writeheader()
@@ -275,7 +266,7 @@ def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> t
     write(report, text.getvalue().encode())
     steep = [(row.id, place) for row in rows for place in row.steep]
     if not steep:
-        return (report,)
+        return
     east, north = in_run.to_run(
         np.array([place.x for _, place in steep]), np.array([place.y for _, place in steep])
     )
@@ -287,11 +278,9 @@ def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> t
     }
     height = np.nan_to_num(found.ground)
     frame = geopandas.GeoDataFrame(columns, geometry=shapely.points(east, north, height), crs=in_run.run_crs)
-    places = report.with_suffix(PLACES)
     with ScratchFolder() as folder:
         frame.to_file(Path(folder, "places.gpkg"), layer="places", driver="GPKG", engine="pyogrio")
-        write(places, Path(folder, "places.gpkg").read_bytes())
-    return report, places
+        write(report.with_suffix(PLACES), Path(folder, "places.gpkg").read_bytes())
 
 
 def _row(row: Lifted) -> dict[str, str | int | float]:

@@ -85,17 +85,6 @@ def cross_sections(
     return CrossSections(s, t, z, inside, line, grade, joined)
 
 
-def elevation(
-    sections: CrossSections, old: Floats, flat: bool, tolerance: float, ends: Ends = NOWHERE
-) -> Floats | None:
-    """Return the pieces of the elevation, ``(k, 5)``; None if the road has no ground.
-
-    - `old`: the pieces that it had, which stay beyond the ground.
-    - `flat`: whether it goes on level there instead, or to ``ends``: heights of the nodes, NaN if not known.
-    """
-    return _profile(sections, sections.line, sections.grade, old, flat, tolerance, ends)
-
-
 def superelevation(sections: CrossSections, old: Floats, flat: bool, tolerance: float) -> Floats | None:
     """Return the pieces of the superelevation, ``(k, 5)``, radians; None if the road has no ground."""
     inside = sections.inside & np.isfinite(sections.z)
@@ -111,10 +100,10 @@ def superelevation(sections: CrossSections, old: Floats, flat: bool, tolerance: 
     elif known.any():
         angle[known] = 0.0
     reach = float(np.abs(sections.t).max(initial=1.0))
-    return _profile(sections, angle, _slopes(s, angle), old, flat, tolerance / max(reach, 1.0))
+    return profile(sections, angle, _slopes(s, angle), old, flat, tolerance / max(reach, 1.0))
 
 
-def _profile(
+def profile(
     sections: CrossSections,
     values: Floats,
     slopes: Floats,
@@ -123,7 +112,12 @@ def _profile(
     tolerance: float,
     ends: Ends = NOWHERE,
 ) -> Floats | None:
-    """Return pieces along the whole road: of the surface where it is, else level or as they were."""
+    """Return pieces along the whole road, ``(k, 5)``; None if it has no ground.
+
+    - `values`, `slopes` ``(n,)``: of the surface.
+    - `old`: the pieces that it had, which stay beyond the ground.
+    - `flat`: whether it goes on level there instead, or to ``ends``: heights of the nodes, NaN if not known.
+    """
     s, known = sections.s, np.isfinite(values)
     both = known[:-1] & known[1:]
     if not both.any():

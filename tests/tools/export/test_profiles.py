@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from flexroad.tasks.roads.routes import CentreLine, Route
+from flexroad.tools.export import profiles as heights_along
 from flexroad.tools.export import reference_line as lines
 from flexroad.tools.export.profiles import (
     HeightGrid,
@@ -155,10 +156,11 @@ def test_height_grid_left_of_the_line_has_positive_v():
     assert grid_error(grid, tilted)[1] < 1e-9
 
 
-def test_height_grid_narrow_bend_has_no_margin_on_its_inside():
+def test_height_grid_narrow_bend_has_no_margin_on_its_inside(monkeypatch):
+    monkeypatch.setattr(heights_along, "MARGIN_M", 5.0)
     turn = np.radians(np.arange(0.0, 181.0, 5.0))
     bend = 6 * np.stack([np.sin(turn), 1 - np.cos(turn)], axis=1)
-    grid = height_grid(road(bend), tilted, margin_m=5.0)
+    grid = height_grid(road(bend), tilted)
     assert grid.v[0] == -8
     assert 3 < grid.v[-1] < 6
     # Cross-sections do not meet: all cells have an area.
