@@ -20,6 +20,8 @@ from flexroad.tools.export.reference_line import ReferenceLine
 
 MARGIN_M = 1.0
 """Width of a grid beside the widest carriageway (m); less in narrow bends, so that the grid does not fold."""
+NONE = np.zeros((1, 5))
+"""A profile without records: it is 0."""
 TOLERANCE_M = 0.0005
 """Largest distance of a profile from the straight lines that fit the cross-sections (m)."""
 
@@ -191,13 +193,10 @@ def _pieces(s: Floats, values: Floats, tolerance: float) -> Floats:
 
 def profile_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
     """Return how far profiles miss the heights of the carriageway: mean, largest (m); NaN if it has none."""
-    return _missed(grid, profiles.at(grid.line.s[:, None], grid.v))
-
-
-def elevation_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
-    """Return the same as `profile_error` for a reader that takes the elevation alone, across a level road."""
-    level = value_at(profiles.elevation, grid.line.s[:, None])
-    return _missed(grid, np.broadcast_to(level, grid.heights.shape))
+    missed = np.abs(profiles.at(grid.line.s[:, None], grid.v) - grid.heights)[on_carriageway(grid)]
+    if not len(missed):
+        return np.nan, np.nan
+    return float(missed.mean()), float(missed.max())
 
 
 def largest_steps(grid: HeightGrid, step: HeightAt) -> tuple[float, float]:
@@ -209,13 +208,6 @@ def largest_steps(grid: HeightGrid, step: HeightAt) -> tuple[float, float]:
     known, inside = steps[np.isfinite(steps)], steps[on_carriageway(grid)]
     everywhere, carriageway = (float(part.max()) if len(part) else np.nan for part in (known, inside))
     return everywhere, carriageway
-
-
-def _missed(grid: HeightGrid, fitted: Floats) -> tuple[float, float]:
-    missed = np.abs(fitted - grid.heights)[on_carriageway(grid)]
-    if not len(missed):
-        return np.nan, np.nan
-    return float(missed.mean()), float(missed.max())
 
 
 def on_carriageway(grid: HeightGrid) -> Bools:

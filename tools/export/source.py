@@ -39,15 +39,12 @@ class Options:
     datum: Datum | None = None
     """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
     compress: bool = option(False, OUTPUTS, "Compress LandXML.", name="gzip")
-    """Whether text formats of the complete run are compressed with gzip."""
     resolution_m: float | None = option(
         None, OUTPUTS, "Cell size of mosaic; default: that of the run.", "METRES", min=0.01
     )
-    """Cell size of rasters over the run (m)."""
     level: int | None = option(
         None, OUTPUTS, "Level of mosaic: 0 is the ground, also below decks; default: the highest.", "N"
     )
-    """Level of roads above roads."""
     drape: bool = option(False, OUTPUTS, "Put the orthophoto on the meshes of 3dtiles and obj.")
     """Also if the meshes of the run have none."""
     roads: str | None = option(

@@ -46,9 +46,9 @@ ManifestRow = dict[str, Any]
 """What the files of the complete run need of a tile, as JSON values."""
 
 
-def steps_left_out(steps_m: float | None) -> str:
+def steps_left_out(steps_m: float) -> str:
     """Return the end of a line for the user about the largest step (m); empty if it is too small."""
-    if steps_m is None or steps_m < STEPS_SHOWN_M:
+    if steps_m < STEPS_SHOWN_M:
         return ""
     return f"; with kerbs and walls it differs by up to {steps_m:.2f} m, where the run has no road"
 
@@ -185,7 +185,7 @@ def figures(rows: Iterable[ManifestRow]) -> dict[str, Any]:
         for name in (name for name in LARGEST if name in row):
             largest[name] = max(row[name], largest.get(name, row[name]))
         notes.update([row["note"]] if row.get("note") else [])
-    left_out = steps_left_out(largest.get("steps_max_m"))
+    left_out = steps_left_out(largest.get("steps_max_m", 0.0))
     summary = {"summary": f"of {SMOOTH}{left_out}"} if left_out else {}
     said = [f"{count(number, 'tile')}: {note}" for note, number in sorted(notes.items())]
     return largest | summary | {"notes": said}

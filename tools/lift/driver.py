@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -14,18 +12,21 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 import shapely
 
+from flexroad.catalog.guard.open_vector import GEOPACKAGES, SQLITE
 from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, InputRejected, head
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import made_folder, output_file
 from flexroad.catalog.storage.paths import write
 from flexroad.catalog.storage.scratch import ScratchFolder
-from flexroad.catalog.text import count, no_formula
+from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import passing
 from flexroad.pipeline.run.points import length_text
 from flexroad.pipeline.run.sampler import RunSampler
+from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tools.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text
@@ -41,7 +42,7 @@ XML_FORMATS: dict[str, ModuleType] = {"OpenDRIVE": opendrive, "net": sumo, "osm"
 NOUNS: dict[ModuleType, str] = {opendrive: "road", sumo: "edge", osm: "way"}
 """What a row of the report is; of other formats, a feature."""
 VECTORS: tuple[ModuleType, ...] = (geopackage, geojson, flatgeobuf, shapefile)
-"""Formats of features. Their heights have the steps beside roads, ``begins`` tells one by its first bytes."""
+"""Formats of features. Their heights have the steps beside roads."""
 KINDS = (
     "OpenDRIVE (.xodr), a network of SUMO (.net.xml), OSM (.osm), a GeoPackage, GeoJSON, FlatGeobuf or "
     "Shapefile"
@@ -178,7 +179,8 @@ def lift(
 
 def _format(source: Path) -> ModuleType:
     """Return the module of a file's format, told by its first bytes."""
-    first = head(source).removeprefix(b"\xef\xbb\xbf").lstrip()
+    data = head(source)
+    first = data.removeprefix(b"\xef\xbb\xbf").lstrip()
     if first[:1] == b"<" or first[:2] == b"\x1f\x8b":
         name = xml_text.root_name(source)
         if name in XML_FORMATS:
@@ -186,11 +188,16 @@ def _format(source: Path) -> ModuleType:
         if name == "osmChange":
             raise TaskError("is a list of changes (osmChange); give the complete file (.osm)")
         raise TaskError(f"has the root element {name or 'none'}; give {KINDS}")
-    for module in VECTORS:
-        if module.begins(head(source)):
-            return module
+    if data.startswith(SQLITE) and data[68:72] in GEOPACKAGES:
+        return geopackage
+    if first[:1] == b"{":
+        return geojson
+    if data.startswith(b"fgb\x03"):
+        return flatgeobuf
+    if data.startswith(b"\0\0\x27\x0a"):
+        return shapefile
     for begin, said in PACKED.items():
-        if begin in head(source)[:64]:
+        if begin in data[:64]:
             raise TaskError(f"{said.format(file=shlex.quote(str(source)))}")
     raise TaskError(
         f"is of no known format; give {KINDS}; convert others, such as DXF, with ogr2ogr NEW.gpkg FILE"
@@ -259,11 +266,8 @@ def _move(scratch: Path, out: Path) -> None:
 
 def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> None:
     """Write the table, and the places above limits if there are any."""
-    text = io.StringIO(newline="")
-    table = csv.DictWriter(text, list(_row(Lifted(""))), lineterminator="\n")
-    table.writeheader()
-    table.writerows({name: no_formula(value) for name, value in _row(row).items()} for row in rows)
-    write(report, text.getvalue().encode())
+    table = pd.DataFrame(map(_row, rows), columns=list(_row(Lifted(""))), dtype=object)
+    write(report, csv_text(table).encode())
     steep = [(row.id, place) for row in rows for place in row.steep]
     if not steep:
         return

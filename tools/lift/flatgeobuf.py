@@ -38,11 +38,6 @@ KINDS = NAMES[POINT : COLLECTION + 1]
 """Types of layers that GDAL writes with z; those of layers with several types it does not."""
 
 
-def begins(data: bytes) -> bool:
-    """Return whether a file begins like a FlatGeobuf."""
-    return data.startswith(b"fgb\x03")
-
-
 def frame(source: Path) -> Frame:
     """Return the CRS in the header."""
     return Frame(vector_info(source)["crs"])

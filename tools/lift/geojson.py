@@ -47,11 +47,6 @@ DIGITS = 9
 """Decimals of the coordinates of new vertices: 0.1 mm in degrees."""
 
 
-def begins(data: bytes) -> bool:
-    """Return whether a file begins like JSON."""
-    return data.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
-
-
 def frame(source: Path) -> Frame:
     """Return the CRS of a file: longitude and latitude if it names none."""
     vector_name(source)
@@ -186,22 +181,21 @@ def _path(positions: Any) -> Floats:
 
 def _coordinates(item: _Item, shape: Shape) -> list[tuple[int, int, str]]:
     """Return the edits that replace the coordinates of the geometry of an item."""
-    if "geometry" not in item.members:
-        geometry, offset = {name: place[1:] for name, place in item.members.items()}, 0
-    else:
-        _, offset, _ = item.members["geometry"]
-        geometry = {name: place[1:] for name, place in _object(item.text, offset)[0].items()}
-    return _edits(item.text, geometry, shape)
+    members = item.members
+    if "geometry" in members:
+        members, _ = _object(item.text, members["geometry"][1])
+    return _edits(item.text, members, shape)
 
 
-def _edits(text: str, geometry: dict[str, tuple[int, int]], shape: Shape) -> list[tuple[int, int, str]]:
+def _edits(text: str, members: dict[str, tuple[Any, int, int]], shape: Shape) -> list[tuple[int, int, str]]:
     if shape.code != COLLECTION:
-        return [(*geometry["coordinates"], json.dumps(_lists(shape), allow_nan=False))]
-    edits, at = list[tuple[int, int, str]](), geometry["geometries"][0] + 1
+        _, start, end = members["coordinates"]
+        return [(start, end, json.dumps(_lists(shape), allow_nan=False))]
+    edits, at = list[tuple[int, int, str]](), members["geometries"][1] + 1
     for part in shape.parts:
         at = SPACE.match(text, at).end()  # type: ignore[union-attr]
-        members, end = _object(text, at)
-        edits += _edits(text, {name: place[1:] for name, place in members.items()}, part)
+        own, end = _object(text, at)
+        edits += _edits(text, own, part)
         at = SPACE.match(text, end).end() + 1  # type: ignore[union-attr]
     return edits
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.guard.open_vector import GEOPACKAGES, SQLITE, vector_name
+from flexroad.catalog.guard.open_vector import vector_name
 from flexroad.catalog.guard.vector_contents import quoted
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift.features import (
@@ -37,11 +37,6 @@ ENVELOPES = (0, 32, 48, 48, 64)
 """Size of the envelope of a geometry by its number in the flags."""
 UNDEFINED = (0, -1, 99999)
 """Numbers of coordinate systems that say nothing."""
-
-
-def begins(data: bytes) -> bool:
-    """Return whether a file begins like a GeoPackage."""
-    return data.startswith(SQLITE) and data[68:72] in GEOPACKAGES
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from flexroad.pipeline.run.points import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.export.profiles import Profiles, cubic_pieces, value_at
+from flexroad.tools.export.profiles import NONE, Profiles, cubic_pieces, value_at
 from flexroad.tools.lift import plan_view, road_profiles, xml_text
 from flexroad.tools.lift.lines import steepest
 from flexroad.tools.lift.network import (
@@ -33,7 +33,7 @@ from flexroad.tools.lift.network import (
     of_levels,
 )
 from flexroad.tools.lift.plan_view import numbers
-from flexroad.tools.lift.road_profiles import AHEAD_M, NONE, CrossSections
+from flexroad.tools.lift.road_profiles import AHEAD_M, CrossSections
 from flexroad.tools.lift.types import NO_POINTS, Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 

@@ -336,4 +336,4 @@ def _with_ele(part: Part, z: float) -> bytes:
     for tag in part.element.iter("tag"):
         if tag.get("k") == "ele":
             return part.replaced([part.with_attributes(tag, {"v": f"{z:.3f}"})])
-    return part.replaced([part.with_child(f'<tag k="ele" v="{z:.3f}"/>')])
+    return part.replaced([part.with_child(part.element, f'<tag k="ele" v="{z:.3f}"/>')])

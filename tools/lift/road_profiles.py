@@ -21,8 +21,6 @@ from flexroad.tools.lift.xml_text import Part
 
 AHEAD_M = 0.05
 """Distance over which the slope of a surface is taken (m)."""
-NONE = np.zeros((1, 5))
-"""A profile without records: it is 0."""
 STEEPEST = 0.5
 """Largest slope across a road (m/m): where the surface is steeper, a step or the end of a deck is beneath."""
 LEAST_ACROSS_M = 0.25
@@ -208,9 +206,7 @@ def _replaced(road: Part, name: str, old: Sequence[str], body: str, around: str)
     assert element is not None
     place = road.inside(element)
     if place is None:
-        start, end = road.start_tag(element)
-        head = road.text[start:end].removesuffix(b"/>").rstrip()
-        return [(start, end, head + f">{body}{around}</{name}>".encode("ascii"))] if body else []
+        return [road.with_child(element, body + around)] if body else []
     edits = [(place[0], place[0], body.encode("ascii"))]
     for child in element:
         if child.tag in old:

@@ -55,11 +55,6 @@ _Record = tuple[int, bytes]
 """Number and data of a geometry of the file."""
 
 
-def begins(data: bytes) -> bool:
-    """Return whether a file begins like a Shapefile."""
-    return data.startswith(b"\0\0\x27\x0a")
-
-
 def frame(source: Path) -> Frame:
     """Return the CRS in the ``.prj``."""
     return Frame(vector_info(source)["crs"])

@@ -57,14 +57,14 @@ class Part:
             return None
         return first, self.text.rindex(b"</", first, self.spans[element][1])
 
-    def with_child(self, text: str) -> tuple[int, int, bytes]:
-        """Return the edit that adds a text before the end of the element."""
-        place = self.inside(self.element)
+    def with_child(self, element: ET.Element, text: str) -> tuple[int, int, bytes]:
+        """Return the edit that adds a text before the end of an element."""
+        place = self.inside(element)
         if place is not None:
             return place[1], place[1], text.encode("ascii")
-        start, end = self.start_tag(self.element)
+        start, end = self.start_tag(element)
         head = self.text[start:end].removesuffix(b"/>").rstrip()
-        return start, end, head + b">" + text.encode("ascii") + b"</" + str(self.element.tag).encode() + b">"
+        return start, end, head + f">{text}</{element.tag}>".encode("ascii")
 
     def replaced(self, edits: Iterable[tuple[int, int, bytes]]) -> bytes:
         """Return the text with some stretches replaced: start, end and new text of each.
