@@ -147,16 +147,17 @@ def join(
       that of the system.
     """
     with ExitStack() as stack:
+        surfaces = dict[int, list[_Surface]]()
 
         def surfaces_of(number: int) -> list[_Surface]:
+            """Return road and ground of a level."""
             level = f" level {number}" if number else ""
-            return [
-                _Surface(name + level, meaning + level, _temporary(stack, folder), _temporary(stack, folder))
-                for name, meaning in CLASSES
-            ]
+            for name, meaning in CLASSES if number not in surfaces else ():
+                points, faces = (stack.enter_context(tempfile.TemporaryFile(dir=folder)) for _ in range(2))
+                surfaces.setdefault(number, []).append(_Surface(name + level, meaning + level, points, faces))
+            return surfaces[number]
 
-        surfaces = {0: surfaces_of(0)}
-        system = _collect(parts_of_meshes, surfaces, surfaces_of)
+        system = _collect(parts_of_meshes, surfaces_of)
         if compress:
             # Name and time of the archive are left out: equal inputs give equal bytes.
             packed = gzip.GzipFile(filename="", mode="wb", fileobj=file, compresslevel=6, mtime=0)
@@ -174,19 +175,8 @@ def join(
         file.write(b"</Surfaces>\n</LandXML>\n")
 
 
-def _temporary(stack: ExitStack, folder: Path | None) -> IO[bytes]:
-    return stack.enter_context(tempfile.TemporaryFile(dir=folder))
-
-
-def _collect(
-    parts_of_meshes: Iterable[bytes],
-    surfaces: dict[int, list[_Surface]],
-    surfaces_of: Callable[[int], list[_Surface]],
-) -> str:
-    """Add the faces of all parts to the surfaces of their level; return the meshes' CRS.
-
-    - `surfaces`: road and ground of each level; those of further levels are added.
-    """
+def _collect(parts_of_meshes: Iterable[bytes], surfaces_of: Callable[[int], list[_Surface]]) -> str:
+    """Add the faces of all parts to the surfaces of their level; return the meshes' CRS."""
     system = ""
     open_vertices: dict[int, dict[Place, _OpenVertex]] = {}
     for data in parts_of_meshes:
@@ -202,10 +192,8 @@ def _collect(
                 " export each CRS to a file of its own"
             )
         for number, own in levels.items():
-            if number not in surfaces:
-                surfaces[number] = surfaces_of(number)
-            _add(own, surfaces[number], open_vertices.setdefault(number, {}))
-    if not any(surface.faces for surface in surfaces[0]):
+            _add(own, surfaces_of(number), open_vertices.setdefault(number, {}))
+    if not any(surface.faces for surface in surfaces_of(0)):
         raise TaskError("no tile has a mesh with a face; choose an area with tiles that succeeded")
     return system
 

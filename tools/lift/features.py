@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -164,16 +164,7 @@ class _Paths:
     def of_features(self, first: int, last: int) -> _Paths:
         """Return the paths of some features."""
         start, end = np.searchsorted(self.feature, [first, last])
-        own = slice(start, end)
-        return _Paths(
-            self.values[own],
-            self.east[own],
-            self.north[own],
-            self.path[own],
-            self.feature[own] - first,
-            self.pieces[own],
-            self.length[own],
-        )
+        return _Paths(**{each.name: getattr(self, each.name)[start:end] for each in fields(self)})
 
 
 def _near(run: RunSurface, east: Floats, north: Floats, on: NDArray[np.intp]) -> Bools:

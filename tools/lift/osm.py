@@ -147,12 +147,12 @@ class _Streets:
         own, table = np.array(ids, np.int64), np.array(values).reshape(-1, 3)
         x, y, before = (np.where(np.isfinite(column), column, np.nan) for column in table.T)
         streets = any(row for *_, row in ways)
-        order = np.argsort(own, kind="stable")
-        found = [
-            _Way(name, _find(own, order, refs), level, row or not streets)
-            for name, refs, level, row in ways
-            if len(own) and len(refs) > 1 and (row or level or not streets)
-        ]
+        order, found = np.argsort(own, kind="stable"), list[_Way]()
+        for name, refs, level, row in ways:
+            if len(own) and len(refs) > 1 and (row or level or not streets):
+                index = order[np.minimum(np.searchsorted(own, refs, sorter=order), len(own) - 1)]
+                nodes = np.where(own[index] == refs, index, -1)
+                found.append(_Way(name, nodes, level, row or not streets))
         return cls(own, x, y, before, found, streets, names == DEGREES, np.full(len(own), np.nan))
 
     def find_heights(self, heights: HeightsAt) -> None:
@@ -225,13 +225,6 @@ class _Streets:
 
 def _ends(way: _Way) -> tuple[Node, Node]:
     return int(way.nodes[0]), int(way.nodes[-1])
-
-
-def _find(ids: NDArray[np.int64], order: Indices, refs: NDArray[np.int64]) -> Indices:
-    """Return the indices of nodes by their ids, -1 for those that are missing."""
-    place = np.minimum(np.searchsorted(ids, refs, sorter=order), len(ids) - 1)
-    index = order[place]
-    return np.where(ids[index] == refs, index, -1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -26,7 +26,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run, check_links, check_own
-from flexroad.pipeline.run.status import TileStatus, Track, ended, peek_statuses, untracked
+from flexroad.pipeline.run.status import Track, ended, peek_statuses, untracked
 from flexroad.pipeline.store.records import LEVELS
 from flexroad.pipeline.worker.exports import tile_photo
 from flexroad.tasks.errors import TaskError
@@ -188,8 +188,12 @@ def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any
     states, rows, errors, stale = list[int](), list[dict[str, Any]](), list[str](), list[bool]()
     for status in peek_statuses(run, tiles):
         states.append(DONE if status.done else FAILED if status.failed else PENDING)
-        rows.append(_row(status, variant))
-        errors.append(_error(status))
+        record = status.last_record
+        figures = record.rows if status.done and record else ()
+        rows.append(next((row for row in figures if row.get("variant") == variant), {}))
+        failures = record.failures if status.failed and record else ()
+        lines = dict.fromkeys(f"{f.line}{f' [{f.file}]' if f.file else ''}" for f in failures)
+        errors.append("; ".join(lines))
         stale.append(status.stale)
     bounds = [tile.grid.bounds for tile in tiles]
     measures = {name: [_figure(row.get(name)) for row in rows] for name in MEASURES}
@@ -219,18 +223,6 @@ def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any
         "tiles": columns,
     } | ({"levels": True} if any(LEVELS in row for row in rows) else {})
     return index, [tile for tile, state in zip(tiles, states, strict=True) if state == DONE]
-
-
-def _row(status: TileStatus, variant: str) -> dict[str, Any]:
-    """Return the figures of a finished tile; none of others."""
-    rows: Iterable[dict[str, Any]] = status.last_record.rows if status.done and status.last_record else ()
-    return next((row for row in rows if row.get("variant") == variant), {})
-
-
-def _error(status: TileStatus) -> str:
-    failures = status.last_record.failures if status.failed and status.last_record else ()
-    lines = dict.fromkeys(f"{f.line}{f' [{f.file}]' if f.file else ''}" for f in failures)
-    return "; ".join(lines)
 
 
 def _figure(value: Any) -> float | None:
