@@ -115,7 +115,10 @@ def step_output(tile: FinishedTile, place: Georeference) -> TileOutput:
     if not isinstance(surface, NurbsSurface):
         raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
     bounds, beyond_m2 = covered(tile.road)
-    steps_m = _steps_m(tile)
+    steps_m = 0.0
+    if isinstance(surface, SteppedSurface):
+        inside = ~tile.road.outside[tile.road.grid.window(tile.road.core)]
+        steps_m = round(float(np.abs(surface.steps[inside]).max(initial=0.0)), 6)
     about = {"bounds": list(bounds), "beyond_survey_m2": beyond_m2, "steps_max_m": steps_m}
     files = {
         f"{name}{step.NAME}": step.encode(surface, bounds, tile.id, source.datetime, place),
@@ -125,15 +128,6 @@ def step_output(tile: FinishedTile, place: Georeference) -> TileOutput:
     notes += [BEYOND] if beyond_m2 else []
     notes += [OF_LEVEL_0] if surface.levels else []
     return TileOutput(files, {"steps_max_m": steps_m} | ({"note": "; ".join(notes)} if notes else {}))
-
-
-def _steps_m(tile: FinishedTile) -> float:
-    """Return the largest step of a tile's surface within the survey (m)."""
-    surface, road = tile.surface, tile.road
-    if not isinstance(surface, SteppedSurface):
-        return 0.0
-    inside = ~road.outside[road.grid.window(road.core)]
-    return round(float(np.abs(surface.steps[inside]).max(initial=0.0)), 6)
 
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]

@@ -207,16 +207,12 @@ def _shape(row: tuple[Any, ...], layer: _Layer) -> Shape | None:
     try:
         if not isinstance(blob, bytes) or blob[:2] != b"GP":
             raise TaskError("has a geometry that is none of a GeoPackage; repair the file with ogr2ogr")
-        return of_wkb(blob[_header_size(blob) :])
+        number = blob[3] >> 1 & 7 if len(blob) > 3 else len(ENVELOPES)
+        if number >= len(ENVELOPES):
+            raise TaskError("has a damaged geometry; repair the file with ogr2ogr")
+        return of_wkb(blob[8 + ENVELOPES[number] :])
     except TaskError as error:
         raise TaskError(f"(feature {row[0]} of the layer {layer.table}) {error}") from error
-
-
-def _header_size(blob: bytes) -> int:
-    number = blob[3] >> 1 & 7 if len(blob) > 3 else len(ENVELOPES)
-    if number >= len(ENVELOPES):
-        raise TaskError("has a damaged geometry; repair the file with ogr2ogr")
-    return 8 + ENVELOPES[number]
 
 
 def _blob(old: bytes, shape: Shape) -> bytes:
