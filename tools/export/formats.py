@@ -220,9 +220,7 @@ def _write_each(
     return figures(write_outputs(tiles, folder, version, encode, source.place, executor))
 
 
-def _along_roads(title: str, version: int, write: Write) -> Format:
-    return Format(title, write, version, None, check=network, of_roads=True)
-
+_along_roads = partial(Format, precision_m=None, check=network, of_roads=True)
 
 FORMATS = {
     "3dtiles": Format(
@@ -239,8 +237,8 @@ FORMATS = {
         "STEP AP214, for CAD", partial(_write_each, step.VERSION, step_output), step.VERSION, 1e-9
     ),
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
-    "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
-    "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),
-    "lines": _along_roads("Road lines as GeoPackage, for GIS", road_lines.VERSION, road_lines.write_lines),
+    "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", along_roads.write_crg, opencrg.VERSION),
+    "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", along_roads.write_xodr, opendrive.VERSION),
+    "lines": _along_roads("Road lines as GeoPackage, for GIS", road_lines.write_lines, road_lines.VERSION),
 }
 """By the name on the command line."""

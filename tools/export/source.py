@@ -90,11 +90,6 @@ class Source:
         return vertical_crs(self.tiles[0])
 
     @property
-    def origin(self) -> tuple[float, float]:
-        """Whole-metre easting and northing that meshes of the run are relative to."""
-        return self.run.origin
-
-    @property
     def mesh_distances(self) -> dict[str, float]:
         """The largest distances of the meshes from their surfaces (m), by column of metrics.parquet."""
         known = np.fmax.reduce([snapshot.distances for snapshot in self.snapshots])
@@ -105,7 +100,7 @@ class Source:
     @property
     def place(self) -> Georeference:
         """What local coordinates of files are relative to: the run's origin, at the height 0."""
-        return Georeference(self.crs, (*self.origin, 0.0), self.vertical)
+        return Georeference(self.crs, (*self.run.origin, 0.0), self.vertical)
 
     def finished(self) -> Iterator[FinishedTile]:
         """Yield the tiles one by one, as they were when they were selected.

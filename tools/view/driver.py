@@ -39,7 +39,6 @@ from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.rasterise import Options as RoadOptions
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Floats
 from flexroad.tools.export.network import read_centre_lines
 from flexroad.tools.export.source import layer_state
 from flexroad.tools.export.tile_outputs import TileOutput, write_outputs
@@ -276,6 +275,9 @@ def script(tile: FinishedTile, look: tuple[tuple[float, float], RoadOptions]) ->
     (origin, roads), source, notes = look, tile.tile, list[str]()
     photo = _photo(source, PHOTO_PX, notes)
     quality, surface, core = tile.quality, tile.surface, source.grid
+    west, south, east, north = core.bounds
+    to_degrees = transformer(core.crs, WGS84).transform
+    corners = to_degrees([west, east, west, east], [south, south, north, north])
     top = surface.top(*np.meshgrid(core.eastings, core.northings))
     try:
         data, (estimate, _) = tile.data, tile.top_errors
@@ -296,7 +298,7 @@ def script(tile: FinishedTile, look: tuple[tuple[float, float], RoadOptions]) ->
         tile.id,
         glb.encode(tile.mesh, (*origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
-        corners(source),
+        np.column_stack(corners),
         top_height_source(quality, top),
         dsm,
         dtm,
@@ -310,15 +312,6 @@ def script(tile: FinishedTile, look: tuple[tuple[float, float], RoadOptions]) ->
         {name: encoded},
         {"tile": tile.id, "notes": notes, "picture": seen, "places": places},
     )
-
-
-def corners(tile: Tile) -> Floats:
-    """Return longitude and latitude of a tile's corners, ``(4, 2)``: SW, SE, NW, NE (degrees)."""
-    west, south, east, north = tile.grid.bounds
-    places = transformer(tile.grid.crs, WGS84).transform(
-        [west, east, west, east], [south, south, north, north]
-    )
-    return np.column_stack(places)
 
 
 def _photo(tile: Tile, largest_px: int, notes: list[str]) -> glb.Texture | None:
