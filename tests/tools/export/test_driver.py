@@ -116,8 +116,6 @@ def test_selection_by_id_and_box(city):
     assert select(city, bbox=first.grid.bounds).tiles == (first,)
     with pytest.raises(ConfigError, match="has no finished tile to export; see `flexroad status"):
         select(city, ids=[third.id])
-    with pytest.raises(ConfigError, match="exports no variant 'plane'; it has flexroad"):
-        select(city, variant="plane")
 
 
 def test_error_ends_the_progress_lines(city, tmp_path, monkeypatch):
