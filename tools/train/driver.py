@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,7 +30,7 @@ from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.segment.dinov2 import segment as segmenter
 from flexroad.tasks.types import Bools, RoadMask, TileData
 from flexroad.tools.train import fit_head
-from flexroad.tools.train.fit_head import Epoch, Sample, Trained
+from flexroad.tools.train.fit_head import Losses, Sample
 from flexroad.tools.train.mask_metrics import Quality, judge, together
 from flexroad.tools.train.spatial_split import Block, Split, inside, split, split_tile
 
@@ -124,9 +123,11 @@ class LabelledTiles:
 class Outcome:
     """A trained model and its validation."""
 
-    options: TrainOptions
     tiles: LabelledTiles
-    trained: Trained
+    model: bytes
+    """Content of the model file."""
+    history: tuple[Losses, ...]
+    """One entry per epoch, in order."""
     split: Split
     judged: tuple[Evaluation, ...]
     notes: tuple[str, ...]
@@ -152,26 +153,13 @@ class Outcome:
         return together(one.inner for one in self.judged)
 
 
-@dataclass(frozen=True)
-class Samples(Sequence[Sample]):
-    """The samples of one side; each is read when it is accessed."""
-
-    tiles: LabelledTiles
-    split: Split
-    part: Literal["train", "validate"]
-
-    @cached_property
-    def _blocks(self) -> tuple[Block, ...]:
-        return self.split.train if self.part == "train" else self.split.validate
-
-    def __len__(self) -> int:
-        return len(self._blocks)
-
-    def __getitem__(self, index: Any) -> Any:
-        block = self._blocks[index]
-        data, road = self.tiles.read(block.tile)
-        select = self.split.training_cells if self.part == "train" else inside
-        return Sample(data, road, self.tiles.usable_cells(data, road) & select(data.grid, block.bounds))
+def samples(
+    tiles: LabelledTiles, blocks: Sequence[Block], select: Callable[[Grid, Bounds], Bools]
+) -> Iterator[Sample]:
+    """Yield the sample of each block; ``select`` returns the cells of a grid that are used of some bounds."""
+    for block in blocks:
+        data, road = tiles.read(block.tile)
+        yield Sample(data, road, tiles.usable_cells(data, road) & select(data.grid, block.bounds))
 
 
 def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notify) -> Outcome:
@@ -189,15 +177,15 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notif
     notes: list[str] = []
     sides = _split(list(_labelled(catalog, tiles, notes)), options)
     notify(f"{count(len(sides.train), 'tile')} for training, {len(sides.validate)} for validation")
-    samples, validation = (Samples(tiles, sides, part) for part in ("train", "validate"))
-
-    def progress(done: int, of: int, last: Epoch) -> None:
-        notify(f"epoch {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
-
-    trained = fit_head.train(samples, validation, settings, progress)
+    trained, history = fit_head.train(
+        samples(tiles, sides.train, sides.training_cells),
+        samples(tiles, sides.validate, inside),
+        settings,
+        notify,
+    )
     with ScratchFolder() as folder:
-        model = Path(folder, f"model{trained.suffix}")
-        model.write_bytes(trained.model)
+        model = Path(folder, "model.safetensors")
+        model.write_bytes(trained)
         given = configured.model_dump() if isinstance(configured, segmenter.Options) else {}
         # Without cleanup: the figures are those of the model alone.
         applied = segmenter.Options(**given | {"model": model, "cleanup": "none"})
@@ -205,7 +193,7 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notif
             _evaluate(block, tiles, lambda data: segmenter.segment(data, applied)) for block in sides.validate
         )
     notes += [f"{each.piece.tile.id}: {each.note}" for each in judged if each.note]
-    return Outcome(options, tiles, trained, sides, judged, tuple(notes))
+    return Outcome(tiles, trained, history, sides, judged, tuple(notes))
 
 
 def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], RoadMask]) -> Evaluation:
