@@ -26,7 +26,7 @@ from flexroad.pipeline.run.status import Track, peek_statuses, untracked
 from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.types import Mesh
-from flexroad.tools.report.content import Content
+from flexroad.tools.report.content import WORST_ESTIMATES, WORST_ROADS, Content
 from flexroad.tools.report.pages import TilePictures
 from flexroad.tools.report.render import (
     _small,
@@ -76,7 +76,11 @@ def tile_pictures(
 def _shown(content: Content) -> list[str]:
     if len(content.tiles) <= MOST:
         return list(content.tiles)
-    return list(dict.fromkeys([*content.worst_estimates["tile"], *content.worst["tile"]]))
+    return list(
+        dict.fromkeys(
+            name for title in (WORST_ESTIMATES, WORST_ROADS) for name in content.tables[title][0]["tile"]
+        )
+    )
 
 
 def webp(picture: bytes, width_px: int | None = None) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ import pandas as pd
 
 from flexroad.catalog.text import count
 from flexroad.tools.report.content import FIGURES
+from flexroad.tools.report.pages import Section
 from flexroad.tools.reproduce.claims import (
     HELD,
     LEVEL,
@@ -51,16 +52,6 @@ REASONS = {
 """Why a change of the benchmark has another sign than the paper's, by variant and figure."""
 
 
-@dataclass(frozen=True, eq=False)
-class Section:
-    """One table of the page with its heading."""
-
-    title: str
-    table: pd.DataFrame
-    line: str = ""
-    """The data of the table, if not the page's main data."""
-
-
 def side_by_side(
     name: str, rows: tuple[Row, ...], ours: Mapping[str, Means], line: str = ""
 ) -> Iterator[Section]:
@@ -85,7 +76,7 @@ def side_by_side(
                 table[f"{label}, difference"] = [
                     format_difference(a - b, figure) for a, b in zip(values, paper, strict=True)
                 ]
-        yield Section(f"{name}: {label_without_unit(figures[0]).split()[0]}", table, line)
+        yield f"{name}: {label_without_unit(figures[0]).split()[0]}", table, line
 
 
 def numbers(name: str, rows: tuple[Row, ...], classes: str, means: Means, data: str) -> pd.DataFrame:
@@ -197,11 +188,11 @@ def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
         "above; opposite or flat: no change or one of the other sign. Not decided: of these, the changes for "
         f"which fewer than {LEVEL}% of the resamples give the same answer."
     )
-    sections = [Section("Table II: how close the changes are", counts, line)]
+    sections = [("Table II: how close the changes are", counts, line)]
     opposite = [change for change in scored if change.verdict == NOT_HELD]
     if opposite:
         table = pd.DataFrame([_opposite(change) for change in opposite])
-        sections.append(Section("Table II: changes that are opposite or flat", table))
+        sections.append(("Table II: changes that are opposite or flat", table, ""))
     return tuple(sections)
 
 
@@ -225,16 +216,16 @@ def _opposite(change: _Change) -> dict[str, str]:
 
 def literal_column(data: MetricsData) -> dict[str, Means]:
     """Return the means of the literal run by the name of its column; empty without such a run."""
-    return {_name(data): _means(data.literal)} if data.literal else {}
+    return {_name(data, data.literal): _means(data.literal)} if data.literal else {}
 
 
 def literal_notes(data: MetricsData) -> Iterator[str]:
     """Yield the note that explains the second column, if there is one."""
     if data.literal:
         yield (
-            f"The column “{_name(data)}” has the paper read literally: the points S(u, v) lie in space where "
-            "the weights move them, weights are positive without bounds, and the last step of the fit is its "
-            f"result (configs/literal.yaml). {data.literal.line} It was not tuned."
+            f"The column “{_name(data, data.literal)}” has the paper read literally: the points S(u, v) lie "
+            "in space where the weights move them, weights are positive without bounds, and the last step "
+            f"of the fit is its result (configs/literal.yaml). {data.literal.line} It was not tuned."
         )
 
 
@@ -266,7 +257,7 @@ def literal_sections(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Secti
         for name, means in columns.items():
             distances = distances_of(rows, means, relative=kind == "changes")
             table[f"{kind}, {name}"] = [_factor(row) for row in (*distances, distances.ravel())]
-    yield Section(
+    yield (
         "Table II: factors from the paper",
         table,
         f"Typical factor between the paper and us over L2 and MAD of road and terrain, on "
@@ -285,7 +276,7 @@ def road_sections(rows: tuple[Row, ...], means: Means, data: MetricsData) -> Ite
         table[f"{FIGURES[ROAD_L2]}, ours by the {name}"] = [
             _with_interval(column, row.variant, ROAD_L2) for row in rows
         ]
-    yield Section(
+    yield (
         "L2 on roads by the reference and by the DSM",
         table,
         "The same meshes and the same road mask, measured against the reference, and against the DSM where "
@@ -324,8 +315,6 @@ def _means(data: MetricsData) -> Means:
     return bootstrap(data.part(data.classes[0]))
 
 
-def _name(data: MetricsData) -> str:
-    if not data.literal:
-        raise ValueError("no literal run")
-    tiles, all_tiles = (int(part.tiles.complete.sum()) for part in (data.literal, data))
+def _name(data: MetricsData, literal: MetricsData) -> str:
+    tiles, all_tiles = (int(part.tiles.complete.sum()) for part in (literal, data))
     return "literal" if tiles == all_tiles else f"literal ({tiles} tiles)"

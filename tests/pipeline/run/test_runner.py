@@ -25,7 +25,7 @@ from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import TileResult
 from flexroad.tools.report.browser.relief import relief
-from flexroad.tools.report.content import gather
+from flexroad.tools.report.content import LARGEST_STEPS, gather
 from flexroad.tools.report.steps import edge_steps, find_results
 from tests.conftest import QUICK
 
@@ -478,7 +478,7 @@ def test_report_checks_every_tile_once(finished, monkeypatch):
 
     monkeypatch.setattr(Pattern, "graph", counted)
     content = gather(finished)
-    assert len(content.steps.edges) == 4
+    assert len(content.tables[LARGEST_STEPS][0]) == 4
     picture = relief(finished, finished.catalog.tiles, content.results)
     assert list(picture.places) == [tile.id for tile in finished.catalog.tiles]
     assert checked == dict.fromkeys(picture.places, 1)

@@ -20,7 +20,7 @@ from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import QUALITY
 from flexroad.tasks.products import npz
 from flexroad.tasks.quality.assess import NO_ROAD
-from flexroad.tools.report.content import WITH_ROADS, gather
+from flexroad.tools.report.content import MAIN, WITH_ROADS, WORST_ROADS, gather
 from flexroad.tools.report.steps import edge_steps
 from tests.conftest import QUICK
 from tests.whole_run import LIGHT
@@ -68,12 +68,12 @@ def test_run_tiles_without_roads_are_done_flagged_and_cached(half, tmp_path, exe
     assert rows[~bare].l2_road_m.notna().all()
     content = gather(run)
     assert content.state.startswith("Tiles: 4 done (2 of them without roads")
-    table = content.main.set_index("method")
+    table = content.tables[MAIN][0].set_index("method")
     assert set(table.tiles) == {4}
     assert set(table[WITH_ROADS]) == {2}
     mine = rows[~bare & (rows.variant == "flexroad")]
     assert table["L2 road (m)"]["flexroad"] == pytest.approx(mine.l2_road_m.mean())
-    assert len(content.worst) == 2
+    assert len(content.tables[WORST_ROADS][0]) == 2
 
 
 def test_products_of_tile_without_roads_open_and_follow_dtm(half, tmp_path):

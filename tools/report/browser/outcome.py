@@ -18,7 +18,7 @@ from flexroad.tasks.quality.assess import FLAGS, LIMITS, NO_ROAD
 from flexroad.tasks.quality.flagged import Place
 from flexroad.tasks.quality.structures import BELOW, LEAST_RISE_M, NO_ABUTMENT, NO_RISE
 from flexroad.tools.report.browser.tiles import STATES, TileTable, short
-from flexroad.tools.report.content import Content
+from flexroad.tools.report.content import MESHES, STEPS, Content
 
 OF_HEIGHTS = ("dropped", NO_ROAD)
 """Flags that a DSM far from the DTM gives."""
@@ -311,16 +311,17 @@ def _without_roads(number: int) -> Iterator[_Statement]:
 
 def _surfaces(content: Content) -> Iterator[_Statement]:
     """Say whether neighbouring tiles meet and meshes have no fault."""
-    steps = content.steps.check
+    steps, _ = content.tables[STEPS]
     own = steps[steps.variant == content.variant] if len(steps) else steps
     if len(own):
         row = own.iloc[0]
         bad = str(row.result).startswith("error")
         text = f"Neighbouring tiles ({count(int(row.edges), 'common edge')}): {row.result}."
         yield _Statement("failed" if bad else "good", text)
-    meshes = content.meshes[content.meshes.method == content.variant]
-    if len(meshes):
-        row = meshes.iloc[0]
+    meshes, _ = content.tables[MESHES]
+    own = meshes[meshes.method == content.variant]
+    if len(own):
+        row = own.iloc[0]
         bad = bool(row["meshes with faults"])
         text = f"Meshes: {count(int(row.meshes), 'mesh').replace('meshs', 'meshes')} checked, {row.result}."
         yield _Statement("failed" if bad else "good", text)

@@ -31,8 +31,8 @@ from flexroad.tools.report.browser.tiles import (
     numeric_columns,
     tile_table,
 )
-from flexroad.tools.report.content import ESTIMATE_MEANING, WORST, Content
-from flexroad.tools.report.pages import MAIN, WORST_ESTIMATES, TilePictures, sections, template
+from flexroad.tools.report.content import ESTIMATE_MEANING, MAIN, WORST, WORST_ESTIMATES, Content
+from flexroad.tools.report.pages import TilePictures, sections, template
 from flexroad.tools.report.pictures import tile_pictures
 
 pyproj = lazy("pyproj")
@@ -97,6 +97,7 @@ def html_page(
     script = SCRIPT.read_text(encoding="utf-8")
     return template("page.html.j2", HERE).render(
         content=content,
+        main=content.tables[MAIN][0],
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
         script=Markup(script),
         script_hash=f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}",
