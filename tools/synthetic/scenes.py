@@ -23,11 +23,10 @@ from flexroad.tools.prepare.from_mesh import POINTS, MeshOptions, prepare_mesh
 from flexroad.tools.prepare.options import PrepareOptions
 from flexroad.tools.prepare.output import on_failure
 from flexroad.tools.synthetic import SceneOptions, block, dsc3d, gerod, make_scene, prepared
-from flexroad.tools.synthetic.centrelines import CentreLine, centre_lines
 from flexroad.tools.synthetic.crossings import CrossingOptions, Crossings, make_crossings
-from flexroad.tools.synthetic.dsc3d import Place
+from flexroad.tools.synthetic.dsc3d import Place, encode, photogrammetry
 from flexroad.tools.synthetic.orthophoto import orthophoto
-from flexroad.tools.synthetic.photogrammetry import encode, photogrammetry
+from flexroad.tools.synthetic.scene import CentreLine, centre_lines
 
 geopandas = lazy("geopandas")
 

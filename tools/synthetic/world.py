@@ -49,13 +49,6 @@ class SceneOptions(Options):
     )
     cross_slope: float = Field(0.0, ge=0, le=0.08, description="greatest one-sided slope of a street")
     curb_m: float = Field(0.0, ge=0, le=0.3, description="height of pavements over the carriageway (m)")
-    wall_m: float = Field(
-        0.0,
-        ge=-6,
-        le=6,
-        description="height of retaining walls along streets; negative: the ground beyond lies lower (m)",
-    )
-    hump_m: float = Field(0.0, ge=0, le=2, description="rise of streets over streams, as on hump bridges (m)")
     medians: float = Field(
         0.0, ge=0, le=1, description="fraction of the main streets that are dual carriageways"
     )

@@ -8,9 +8,8 @@ from flexroad.catalog.grid import Grid
 from flexroad.tools.prepare.mesh.sample import orthophoto as mesh_orthophoto
 from flexroad.tools.prepare.mesh.sample import project_down
 from flexroad.tools.synthetic import Kind
-from flexroad.tools.synthetic.dsc3d import SITES, SIZE_M, survey
+from flexroad.tools.synthetic.dsc3d import GSD_M, SITES, SIZE_M, photogrammetry, survey
 from flexroad.tools.synthetic.orthophoto import orthophoto
-from flexroad.tools.synthetic.photogrammetry import GSD_M, photogrammetry
 
 SEED = 3
 
