@@ -146,7 +146,7 @@ def gather(run: Run, track: Track = untracked) -> Content:
         [(f.tile_id, f.stage, f.kind, f.message, f.file) for f in counts.failures],
         columns=["tile", "stage", "error", "message", "file"],
     )
-    steps = edge_steps(run, results, track=track)
+    steps, largest_steps, which = edge_steps(run, results, track)
     return Content(
         title=f"FlexRoad: {run.config.name} over {count(counts.tiles, 'tile')}",
         state=_state(counts),
@@ -166,8 +166,8 @@ def gather(run: Run, track: Track = untracked) -> Content:
             "Decks and tunnels": (decks_and_tunnels(of_levels, exported), DECKS_MEANING),
             HELD_OUT: (held_out(done, variants), HOLDOUT),
             MESHES: (mesh_checks(rows, run.config.chains), MESH_MEANING),
-            STEPS: (steps.check, steps.note),
-            LARGEST_STEPS: (steps.edges.head(10), ""),
+            STEPS: (steps, which),
+            LARGEST_STEPS: (largest_steps.head(10), ""),
             "Failures": (failures, ""),
         },
         versions=run.versions,

@@ -97,14 +97,8 @@ def verdicts_table(verdicts: Mapping[str, list[Verdict]]) -> pd.DataFrame:
     """Return claims with their verdicts: all columns for the first run, two columns for each other run."""
     first, *others = verdicts.values()
     table = pd.DataFrame(
-        {
-            "claim": [v.claim.text for v in first],
-            "section": [v.claim.where for v in first],
-            "paper": [v.paper for v in first],
-            "ours": [v.ours for v in first],
-            "certainty": [v.certainty for v in first],
-            "verdict": [v.verdict for v in first],
-        }
+        [(v.claim.text, v.claim.where, v.paper, v.ours, v.certainty, v.verdict) for v in first],
+        columns=["claim", "section", "paper", "ours", "certainty", "verdict"],
     )
     for name, other in zip(list(verdicts)[1:], others, strict=True):
         table[f"ours, {name}"] = [v.ours for v in other]

@@ -40,8 +40,6 @@ from flexroad.tools.synthetic.survey_errors import (
 )
 from flexroad.tools.synthetic.world import DEFAULTS, SceneOptions, field, generator
 
-__all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
-
 OBJECT_REACH_M = 45.0
 """Greatest distance of a house, crown, car or patch from its street's centre line (m)."""
 DTM_BLUR_M = 1.0

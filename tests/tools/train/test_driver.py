@@ -18,8 +18,7 @@ from flexroad.tasks import load
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.segment.dinov2 import segment
 from flexroad.tools.synthetic.scenes import write_scenes
-from flexroad.tools.train.driver import LabelledTiles, TrainOptions, samples, train
-from flexroad.tools.train.spatial_split import inside, split
+from flexroad.tools.train.driver import LabelledTiles, TrainOptions, inside, samples, split, train
 from tests.command_line import call
 from tests.make_backbone import save_backbone
 from tests.pipeline.cli.test_main import flexroad
