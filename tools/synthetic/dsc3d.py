@@ -18,14 +18,12 @@ from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy import ndimage
 from scipy.optimize import brentq
 from scipy.special import ndtri
 
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
-from flexroad.tasks import options as base
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.prepare.mesh.sample import TexturedMesh
 from flexroad.tools.synthetic.orthophoto import orthophoto
@@ -47,7 +45,7 @@ COARSE_M = 3.0
 PIL, pv = lazy("PIL"), lazy("pyvista")
 rasterio, trimesh = lazy("rasterio"), lazy("trimesh")
 
-BUMP_M = (1.5, 15.0)
+BUMP_WAVES_M = (1.5, 15.0)
 """Shortest and longest wave of the bumps (m)."""
 BLANK_M = (4.0, 20.0)
 """Shortest and longest wave of the random field that places areas without matches (m)."""
@@ -55,6 +53,12 @@ TEXTURELESS = (Kind.GROUND, Kind.DECK, Kind.PAVED, Kind.BUILDING)
 """Kinds that may have no texture: asphalt (on roads and car parks) and flat roofs."""
 OVERHEAD_M, ALLEY_M = 4.0, 2.0
 """Ground may be hidden within `ALLEY_M` of a surface that is `OVERHEAD_M` higher (m)."""
+MELT_M, BUMPS_M = 0.6, 0.04
+"""Gaussian smoothing of all edges, and root mean square height of bumps (m)."""
+BRIDGED_M2, OPEN = 8.0, 0.3
+"""Area up to which holes are always bridged (m2), and fraction of the larger holes that stay open."""
+FRAGMENTS = 8
+"""Number of floating pieces of surface."""
 GHOST = 0.25
 """Fraction of the height of moving objects that remains."""
 NODE_M = 0.5
@@ -70,23 +74,6 @@ RIM = 7
 """Number of corners of a floating fragment."""
 
 
-class _Faults(base.Options):
-    """Size of the faults of a reconstruction."""
-
-    melt_m: float = Field(0.6, ge=0, le=3, description="Gaussian smoothing of all edges (m)")
-    bumps_m: float = Field(0.04, ge=0, le=1, description="root mean square height of bumps (m)")
-    blank: float = Field(
-        0.04, ge=0, lt=1, description="fraction of the surfaces without texture that have no matches"
-    )
-    # RGT on roads, 0.195 m: ground bridged at walls is too high, and the mask covers it.
-    hidden: float = Field(
-        0.1, ge=0, lt=1, description="fraction of the ground at walls that no photograph shows"
-    )
-    bridged_m2: float = Field(8.0, ge=0, description="area up to which holes are always bridged (m2)")
-    open: float = Field(0.3, ge=0, le=1, description="fraction of the larger holes that stay open")
-    fragments: int = Field(8, ge=0, description="number of floating pieces of surface")
-
-
 @dataclass(frozen=True)
 class _Site:
     """Properties of one scene, independent of its location."""
@@ -99,7 +86,11 @@ class _Site:
     """Number of triangles of its mesh."""
     options: SceneOptions
     """Slope, humps, embankments and direction are set from the rise and the location."""
-    faults: _Faults
+    blank: float = 0.04
+    """Fraction of the surfaces without texture that have no matches."""
+    hidden: float = 0.1
+    """Fraction of the ground at walls that no photograph shows. It follows from RGT on roads, 0.195 m: ground
+    bridged at walls is too high, and the mask covers it."""
 
 
 TOWN = SceneOptions(
@@ -123,11 +114,11 @@ TOWN = SceneOptions(
 SUBURB = TOWN.model_copy(update={"block_m": 80, "storeys": 2.2})
 
 SITES = (
-    _Site("boulevard", "urban", 4.5, 101_000, TOWN.model_copy(update={"block_m": 90.0}), _Faults()),
-    _Site("courtyards", "urban", 8.0, 78_000, TOWN.model_copy(update={"built": 0.5}), _Faults(hidden=0.2)),
-    _Site("garden_suburb", "suburban", 14.0, 35_000, SUBURB, _Faults()),
-    _Site("hillside", "suburban", 23.0, 46_000, SUBURB, _Faults()),
-    _Site("steep_quarter", "urban", 33.9, 60_000, TOWN, _Faults(blank=0.06)),
+    _Site("boulevard", "urban", 4.5, 101_000, TOWN.model_copy(update={"block_m": 90.0})),
+    _Site("courtyards", "urban", 8.0, 78_000, TOWN.model_copy(update={"built": 0.5}), hidden=0.2),
+    _Site("garden_suburb", "suburban", 14.0, 35_000, SUBURB),
+    _Site("hillside", "suburban", 23.0, 46_000, SUBURB),
+    _Site("steep_quarter", "urban", 33.9, 60_000, TOWN, blank=0.06),
 )
 """The ends of the ranges are the paper's; the values between them and their order are assumptions."""
 
@@ -195,17 +186,17 @@ class Reconstruction:
     """Holes without a surface, ``(H, W)``."""
 
 
-def reconstruct(scene: Scene, seed: int, faults: _Faults) -> Reconstruction:
+def reconstruct(scene: Scene, seed: int, site: _Site) -> Reconstruction:
     """Return a scene's surface with the faults of a reconstruction.
 
     - `scene`: a scene without noise; cells of 0.5 m resolve cars and walls.
     - `seed`: seed of the world; bumps and holes are functions of seed and coordinates.
     """
     grid = scene.grid
-    smoothed = ndimage.gaussian_filter(_static_surface(scene), faults.melt_m / grid.cell, mode="nearest")
-    uneven = smoothed + _bumps(grid, seed, faults.bumps_m)
-    holes = _textureless(scene, seed, faults.blank) | _hidden(scene, seed, faults.hidden)
-    still_open = _open_holes(holes, grid, seed, faults)
+    smoothed = ndimage.gaussian_filter(_static_surface(scene), MELT_M / grid.cell, mode="nearest")
+    uneven = smoothed + _bumps(grid, seed)
+    holes = _textureless(scene, seed, site.blank) | _hidden(scene, seed, site.hidden)
+    still_open = _open_holes(holes, grid, seed)
     bridged = holes & ~still_open
     return Reconstruction(grid, _bridge(uneven, bridged), bridged, still_open)
 
@@ -222,12 +213,12 @@ def _static_surface(scene: Scene) -> Floats:
     return hulled
 
 
-def _bumps(grid: Grid, seed: int, rms_m: float) -> Floats:
-    """Return bumps of root mean square ``rms_m`` (m), higher in some areas than in others."""
+def _bumps(grid: Grid, seed: int) -> Floats:
+    """Return bumps (m), higher in some areas than in others."""
     x, y = np.meshgrid(grid.eastings, grid.northings)
-    bumps = field(seed, "bumps", BUMP_M, 40)(x, y)
+    bumps = field(seed, "bumps", BUMP_WAVES_M, 40)(x, y)
     patchy = np.exp(waves(generator(seed, "matching"), np.geomspace(15, 80, 9), 0.15)(x, y))
-    uneven: Floats = rms_m * patchy / np.sqrt(np.mean(patchy**2)) * bumps
+    uneven: Floats = BUMPS_M * patchy / np.sqrt(np.mean(patchy**2)) * bumps
     return uneven
 
 
@@ -256,13 +247,13 @@ def _patches(grid: Grid, seed: int, purpose: str, share: float) -> Bools:
     return covered
 
 
-def _open_holes(holes: Bools, grid: Grid, seed: int, faults: _Faults) -> Bools:
+def _open_holes(holes: Bools, grid: Grid, seed: int) -> Bools:
     """Return the holes that stay open: a fraction of the large ones, ``(H, W)``."""
     numbers: NDArray[np.int32]
     numbers, count = ndimage.label(holes)
     area = np.bincount(numbers.ravel(), minlength=count + 1) * grid.cell**2
-    drawn = generator(seed, "open", *map(int, grid.origin)).random(count + 1) < faults.open
-    stays_open = drawn & (area > faults.bridged_m2)
+    drawn = generator(seed, "open", *map(int, grid.origin)).random(count + 1) < OPEN
+    stays_open = drawn & (area > BRIDGED_M2)
     stays_open[0] = False
     cells: Bools = stays_open[numbers]
     return cells
@@ -303,14 +294,13 @@ def photogrammetry(place: Place, seed: int) -> _PhotogrammetryScene:
     site, grid = place.site, place.grid
     truth = make_scene(grid, seed, site.stratum, place.options)
     surface = make_scene(_nodes(grid), seed, site.stratum, place.options)
-    reconstruction = reconstruct(surface, seed, site.faults)
+    reconstruction = reconstruct(surface, seed, site)
     origin = np.array([grid.west, grid.south, math.floor(reconstruction.height.min())])
     rng = generator(seed, "fragments", *map(int, grid.origin))
     # Random points above the surface, relative to the origin.
-    number = site.faults.fragments
-    x, y = rng.uniform(0, grid.width * grid.cell, (2, number))
+    x, y = rng.uniform(0, grid.width * grid.cell, (2, FRAGMENTS))
     height = reconstruction.height[reconstruction.grid.cells(x + origin[0], y + origin[1])]
-    centres = np.column_stack([x, y, height - origin[2] + rng.uniform(*FLOATING_M, number)])
+    centres = np.column_stack([x, y, height - origin[2] + rng.uniform(*FLOATING_M, FRAGMENTS)])
     floating, pieces = fragments(centres, rng)
     east, north = reconstruction.grid.eastings - origin[0], reconstruction.grid.northings - origin[1]
     nodes = lattice(east, north, reconstruction.height - origin[2], reconstruction.open)

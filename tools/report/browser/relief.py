@@ -67,7 +67,11 @@ def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = unt
         square = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]
         square[:] = _square(*found, side)
         places[tile.id] = len(places)
-    return _Relief(_encoded(picture), side, columns, places) if places else None
+    if not places:
+        return None
+    buffer = io.BytesIO()
+    Image.fromarray(picture, "LA").convert("RGBA").save(buffer, "webp", quality=QUALITY, method=4)
+    return _Relief(buffer.getvalue(), side, columns, places)
 
 
 def _square(surface: Surface, road: RoadMask, side: int) -> NDArray[np.uint8]:
@@ -79,26 +83,16 @@ def _square(surface: Surface, road: RoadMask, side: int) -> NDArray[np.uint8]:
     east: Floats = np.asarray(grid.west + beyond * step_x)
     north: Floats = np.asarray(grid.north - beyond * step_y)
     height = surface.lattice(east, north)
-    grey = _shade(height, step_x, step_y)[1:-1, 1:-1]
+    to_south, to_east = np.gradient(EXAGGERATION * height, step_y, step_x)
+    light = sunlight(np.asarray(to_east), np.asarray(to_south))
+    grey = np.clip(LEVEL * light, 0.35 * LEVEL, 255.0)[1:-1, 1:-1]
     share, outside = (_resampled(cells, road, side) for cells in (road.mask, road.outside))
     grey = grey + OPACITY * share * (ROAD - grey)
     visible = np.isfinite(grey) & (outside < 0.5)
     return np.dstack([np.where(visible, np.nan_to_num(grey), LEVEL), 255 * visible]).astype(np.uint8)
 
 
-def _shade(height: Floats, step_x: float, step_y: float) -> Floats:
-    """Return the light on a surface by Lambert's law as grey, with the sun in the north-west."""
-    south, east = np.gradient(EXAGGERATION * height, step_y, step_x)
-    return np.asarray(np.clip(LEVEL * sunlight(np.asarray(east), np.asarray(south)), 0.35 * LEVEL, 255.0))
-
-
 def _resampled(cells: NDArray[np.bool_], road: RoadMask, side: int) -> Floats:
     """Return the share of True cells in each pixel."""
     core = np.ascontiguousarray(cells[road.grid.window(road.core)], np.float32)
     return np.asarray(cv2.resize(core, (side, side), interpolation=cv2.INTER_AREA), np.float64)
-
-
-def _encoded(picture: NDArray[np.uint8]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(picture, "LA").convert("RGBA").save(buffer, "webp", quality=QUALITY, method=4)
-    return buffer.getvalue()
