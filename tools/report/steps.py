@@ -132,7 +132,9 @@ def _step(
     step = np.abs(a.height(east, north) - b.height(east, north))
     angle = _angle_deg(a.normal(east, north), b.normal(east, north))
     on_road = inside & road.mask[cells]
-    return _mean(step[inside]), _largest(step[inside]), _mean(step[on_road]), _largest(angle[inside])
+    # Other than max, fmax leaves out NaN, and is NaN if there is nothing else.
+    largest, turn = (float(np.fmax.reduce(values[inside], initial=math.nan)) for values in (step, angle))
+    return _mean(step[inside]), largest, _mean(step[on_road]), turn
 
 
 def _angle_deg(a: Floats, b: Floats) -> Floats:
@@ -144,8 +146,3 @@ def _angle_deg(a: Floats, b: Floats) -> Floats:
 def _mean(values: Floats) -> float:
     values = values[np.isfinite(values)]
     return float(values.mean()) if values.size else math.nan
-
-
-def _largest(values: Floats) -> float:
-    values = values[np.isfinite(values)]
-    return float(values.max()) if values.size else math.nan

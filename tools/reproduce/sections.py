@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -136,45 +135,15 @@ def _with_interval(means: Means, variant: str, figure: str) -> str:
     return f"{mean} [{low_text}, {high_text}]"
 
 
-class _Change(NamedTuple):
-    """One cell of Table II as a change from the full pipeline, and ours."""
-
-    row: Row
-    figure: str
-    paper: float
-    """The paper's ratio to the full pipeline."""
-    ours: float
-    verdict: str
-    """`HELD`, `WEAKER`, `STRONGER` or `NOT_HELD`, by the rule for claims."""
-    certain: bool
-    """Whether enough resamples of the tiles give this verdict."""
-
-
-def changes(rows: tuple[Row, ...], means: Means) -> list[_Change]:
-    """Return the changes of Table II that exceed `LEAST` in the paper."""
-    base = next(row for row in rows if row.variant == BASE)
-    scored = []
-    for row in rows:
-        for figure in FIGURES_SCORED:
-            paper = row.value(figure) / base.value(figure)
-            if row is base or abs(paper - 1) <= LEAST:
-                continue
-            ours, resampled = means.ratio(row.variant, BASE, figure)
-            verdict = strength(ours, paper)
-            if verdict != NOT_TESTED:
-                certain = decided(verdict, paper, resampled)
-                scored.append(_Change(row, figure, paper, ours, verdict, certain))
-    return scored
-
-
 def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
     """Return the counts of the changes by figure, and the list of those that are opposite or flat."""
-    scored = changes(rows, means)
+    scored, opposite = _changes(rows, means)
     if not scored:
         return ()
-    counts = pd.DataFrame([_counts(f"{label_without_unit(f)}", [c for c in scored if c.figure == f])
-                           for f in FIGURES_SCORED] + [_counts("all", scored)])  # fmt: skip
-    verdicts = Counter(change.verdict for change in scored)
+    labels = [label_without_unit(figure) for figure in FIGURES_SCORED]
+    parts = {label: [change for change in scored if change[0] == label] for label in labels}
+    counts = pd.DataFrame([_counts(name, part) for name, part in (parts | {"all": scored}).items()])
+    verdicts = Counter(verdict for _, verdict, _ in scored)
     kinds = ", ".join(f"{verdicts[kind]} {name}" for kind, name in KINDS.items())
     line = (
         f"{len(scored)} changes of L2 and MAD by more than {LEAST:.0%} in the paper: {kinds}. Within: the "
@@ -183,29 +152,46 @@ def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
         f"which fewer than {LEVEL}% of the resamples give the same answer."
     )
     sections = [("Table II: how close the changes are", counts, line)]
-    opposite = [change for change in scored if change.verdict == NOT_HELD]
     if opposite:
-        table = pd.DataFrame([_opposite(change) for change in opposite])
-        sections.append(("Table II: changes that are opposite or flat", table, ""))
+        sections.append(("Table II: changes that are opposite or flat", pd.DataFrame(opposite), ""))
     return tuple(sections)
 
 
-def _counts(name: str, scored: list[_Change]) -> dict[str, str]:
-    verdicts = Counter(change.verdict for change in scored)
-    undecided = sum(not change.certain for change in scored)
+def _changes(rows: tuple[Row, ...], means: Means) -> tuple[list[tuple[str, str, bool]], list[dict[str, str]]]:
+    """Return the changes that exceed `LEAST` in the paper, and the rows of the table of opposite ones.
+
+    Of each change: the figure's label, the verdict by the rule for claims, and whether enough resamples of
+    the tiles give it.
+    """
+    base = next(row for row in rows if row.variant == BASE)
+    scored, opposite = [], []
+    for row in rows:
+        for figure in FIGURES_SCORED:
+            label, paper = label_without_unit(figure), row.value(figure) / base.value(figure)
+            if row is base or abs(paper - 1) <= LEAST:
+                continue
+            ours, resampled = means.ratio(row.variant, BASE, figure)
+            verdict = strength(ours, paper)
+            if verdict != NOT_TESTED:
+                scored.append((label, verdict, decided(verdict, paper, resampled)))
+            if verdict == NOT_HELD:
+                reason = REASONS.get((row.variant, figure), "–")
+                cells = {
+                    "variant": row.label,
+                    "figure": label,
+                    "paper": percent(paper),
+                    "ours": percent(ours),
+                }
+                opposite.append(cells | {"reason": reason})
+    return scored, opposite
+
+
+def _counts(name: str, scored: list[tuple[str, str, bool]]) -> dict[str, str]:
+    verdicts = Counter(verdict for _, verdict, _ in scored)
+    undecided = sum(not certain for _, _, certain in scored)
     cells = {"figure": name, "changes": len(scored)}
     cells |= {column: verdicts[kind] for kind, column in KINDS.items()} | {NOT_DECIDED: undecided}
     return {column: str(value) for column, value in cells.items()}
-
-
-def _opposite(change: _Change) -> dict[str, str]:
-    return {
-        "variant": change.row.label,
-        "figure": label_without_unit(change.figure),
-        "paper": percent(change.paper),
-        "ours": percent(change.ours),
-        "reason": REASONS.get((change.row.variant, change.figure), "–"),
-    }
 
 
 def literal_column(data: MetricsData) -> dict[str, Means]:

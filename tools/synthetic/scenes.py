@@ -179,7 +179,13 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
         "width_m": [line.width_m for line in lines],
     }
     if any(line.level for line in lines):
-        columns |= _level_columns(lines)
+        # OSM's tags of decks and tunnels, and the level as a number.
+        columns |= {
+            "bridge": ["yes" if line.level > 0 else None for line in lines],
+            "tunnel": ["yes" if line.level < 0 else None for line in lines],
+            "layer": [str(line.level) if line.level else None for line in lines],
+            "level": [line.level for line in lines],
+        }
     shapes = [shapely.LineString(line.points) for line in lines]
     try:
         with vector_date(MADE):
@@ -187,16 +193,6 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _level_columns(lines: Sequence[CentreLine]) -> dict[str, list[Any]]:
-    """Return OSM's tags of decks and tunnels, and the level as a number."""
-    return {
-        "bridge": ["yes" if line.level > 0 else None for line in lines],
-        "tunnel": ["yes" if line.level < 0 else None for line in lines],
-        "layer": [str(line.level) if line.level else None for line in lines],
-        "level": [line.level for line in lines],
-    }
 
 
 def _with_truth(tile: Tile, folder: str, dataset: str) -> Tile:
