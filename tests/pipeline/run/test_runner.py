@@ -25,8 +25,8 @@ from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import TileResult
 from flexroad.tools.report import steps
-from flexroad.tools.report.browser.relief import relief
 from flexroad.tools.report.content import LARGEST_STEPS, gather
+from flexroad.tools.report.pictures import relief
 from flexroad.tools.report.steps import edge_steps
 from tests.conftest import QUICK
 

@@ -21,7 +21,6 @@ from flexroad.pipeline.run.status import Track, untracked
 from flexroad.tasks.quality.assess import FLAGS, LIMITS
 from flexroad.tools.report.browser.figures import Comparison, compare, histograms
 from flexroad.tools.report.browser.outcome import cards, described, headline, reasons, statements
-from flexroad.tools.report.browser.relief import relief
 from flexroad.tools.report.browser.tiles import (
     LABELS,
     TileTable,
@@ -33,7 +32,7 @@ from flexroad.tools.report.browser.tiles import (
 )
 from flexroad.tools.report.content import ESTIMATE_MEANING, MAIN, WORST, WORST_ESTIMATES, Content
 from flexroad.tools.report.pages import TilePictures, sections, template
-from flexroad.tools.report.pictures import tile_pictures
+from flexroad.tools.report.pictures import relief, tile_pictures
 
 pyproj = lazy("pyproj")
 
