@@ -15,7 +15,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.prepare.points.binning import Points, bins
-from flexroad.tools.synthetic.network import Box, Plan, Stream, Street, find_stratum
+from flexroad.tools.synthetic.network import Box, Plan, Stream, Street
 from flexroad.tools.synthetic.objects import GroundAt
 from flexroad.tools.synthetic.population import Objects, populate
 from flexroad.tools.synthetic.spoilers import BARE, Canvas, Kind, surface_model
@@ -105,8 +105,6 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     """
     if seed < 0:
         raise TaskError(f"a seed is 0 or more, not {seed}")
-    if stratum is not None:
-        find_stratum(stratum)
     plan = plan_of(seed, stratum, options)
     # A margin, so that the smoothing of the terrain model has no edge effect on the tile.
     wide = grid.buffered(4 * DTM_BLUR_M)
