@@ -64,7 +64,7 @@ reproduce: $(SURVEY) $(SCENES) $(LITERAL_SURVEY) ## The paper's tables and figur
 	$(BIN)/flexroad figures $(REPRODUCED)/segmented -o $(RESULTS)
 
 # Made once: rasters written anew have new times, and all that hangs on them would be computed again.
-MESHED := $(addprefix tools/synthetic/,command.py dsc3d.py photogrammetry.py)
+MESHED := $(addprefix tools/synthetic/,command.py dsc3d.py)
 MADE := $(filter-out $(MESHED),$(wildcard tools/synthetic/*.py))
 runs/synthetic-%-$(SEED)/survey/catalog.parquet: $(MADE) | $(STAMP)
 	$(BIN)/flexroad catalog synthetic --preset gerod -o $(@D) --tiles $* --seed $(SEED)

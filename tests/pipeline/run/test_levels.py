@@ -29,8 +29,8 @@ from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.products import npz
 from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.spline.levelled import LevelledSurface
-from flexroad.tools.synthetic.centrelines import MAIN, SIDE
 from flexroad.tools.synthetic.crossings import CROSS_M, MAIN_M, Crossings
+from flexroad.tools.synthetic.scene import MAIN, SIDE
 from flexroad.tools.synthetic.scenes import write_scenes
 from flexroad.tools.view.driver import write_viewer
 from tests import validators
