@@ -81,13 +81,9 @@ def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats
     return span[:, 0] - degree, values, _pair(degree * share, -degree * share)
 
 
-def kept_basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats]:
-    """Return first functions and values of `basis`, kept for the next call: they must not be changed."""
-    return _kept_basis(knots.tobytes(), degree, u.tobytes())
-
-
 @lru_cache(maxsize=KEPT)
-def _kept_basis(knots: bytes, degree: int, u: bytes) -> tuple[Starts, Floats]:
+def kept_basis(knots: bytes, degree: int, u: bytes) -> tuple[Starts, Floats]:
+    """Return first functions and values of `basis`, kept for the next call: they must not be changed."""
     start, values, _ = basis(np.frombuffer(knots), degree, np.frombuffer(u))
     return start, values
 
