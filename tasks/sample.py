@@ -28,9 +28,9 @@ from flexroad.catalog.grid import Bounds
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.meshing.abutment_lines import (
-    JoinedGround,
     LevelOutline,
     level_outline,
+    with_abutments,
     without_abutments,
 )
 from flexroad.tasks.meshing.lines import (
@@ -263,18 +263,21 @@ def _dynamic(
         fine = fine[outline.contains(fine)]
     lines += [part for other in others for part in (other.abutments, other.feet)]
     free = np.concatenate([fine, coarse])
-    joined = JoinedGround(surface, road.core.origin, others) if others else None
     if frame:
         free = free[~on_border(free, local)]
-    border = _border((joined or surface).height, road, local, options, frame, lines)
+
+    def height(easting: Floats, northing: Floats) -> Floats:
+        z = surface.height(easting, northing)
+        return with_abutments(z, easting, northing, surface, others, road.core.origin)
+
+    border = _border(height, road, local, options, frame, lines)
     free = free[apart_from(free, lines, options.road_m / 2)]
     if limit:
         free = free[limit.covers(free)]
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
     place = (plan + road.core.origin).T
     z = breaks(plan) if breaks else surface.height(*place)
-    if joined:
-        z = joined.on_abutments(place[0], place[1], z)
+    z = with_abutments(z, place[0], place[1], surface, others, road.core.origin)
     if isinstance(surface, MovingNurbs):
         free, border = (_in_space(part, surface, road.core.origin) for part in (free, border))
     points, number = without_duplicates(np.concatenate([free, border, np.column_stack([plan, z])]))

@@ -34,7 +34,7 @@ from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import Lattice, Range, Space, check_cells, start_heights, surface_on
 from flexroad.tasks.spline.stencil import bending_energy
-from flexroad.tasks.spline.stepped import border_steps, ground_beside, spline_around, with_steps
+from flexroad.tasks.spline.stepped import border_steps, spline_around, with_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Level, LevelSpline, RoadClusters, RoadMask, TileData
 
@@ -94,8 +94,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
     surface = _spline(seen, clusters, options, frame)
     if clusters.levels:
         surface = LevelledSurface.of(surface, _level_splines(data, clusters, options, frame), data.core)
-    beside = ground_beside(seen, clusters, frame) if options.steps else None
-    return with_steps(beside, surface, data.core) if beside else surface
+    return with_steps(seen, clusters, surface, frame) if options.steps else surface
 
 
 def _level_splines(
