@@ -305,14 +305,16 @@ class Mesh:
         if self.level is None:
             return self
         chosen = self.level == number
-        used, faces = np.unique(self.faces[chosen], return_inverse=True)
-        return replace(
-            self,
-            vertices=self.vertices[used],
-            faces=faces.reshape(-1, 3).astype(np.int32),
-            road=self.road[chosen],
-            level=None,
-        )
+        used, faces = self.part(chosen)
+        return replace(self, vertices=self.vertices[used], faces=faces, road=self.road[chosen], level=None)
+
+    def part(self, faces: Bools) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+        """Return the vertices that some faces, ``(F,)``, use, ascending, and these faces in their numbers."""
+        chosen = self.faces[faces]
+        is_used = np.zeros(len(self.vertices), np.bool_)
+        is_used[chosen] = True
+        number = np.cumsum(is_used, dtype=np.int32) - np.int32(1)
+        return np.flatnonzero(is_used), number[chosen]
 
 
 @dataclass(frozen=True)

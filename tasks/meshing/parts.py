@@ -1,4 +1,4 @@
-"""Parts of a mesh: some of its faces, with the vertices that these use."""
+"""Meshes of several levels, and places of faces and vertices."""
 
 from __future__ import annotations
 
@@ -8,24 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
-from flexroad.tasks.types import Bools, Floats, Mesh
-
-Indices = NDArray[np.intp]
-
-
-def part(mesh: Mesh, faces: Bools) -> tuple[Indices, Indices]:
-    """Return the vertices that some faces use, and these faces in numbers of those vertices.
-
-    - `mesh`: with ``F`` faces.
-    - `faces` ``(F,)``: the faces of the part.
-    - `used` ``(n,)``: indices of vertices of the mesh, ascending.
-    - `corners` ``(k, 3)``: indices into ``used``.
-    """
-    chosen = mesh.faces[faces]
-    is_used = np.zeros(len(mesh.vertices), np.bool_)
-    is_used[chosen] = True
-    number = np.cumsum(is_used) - 1
-    return np.flatnonzero(is_used), number[chosen]
+from flexroad.tasks.types import Floats, Mesh
 
 
 def with_levels(meshes: Mapping[int, Mesh]) -> Mesh:

@@ -11,7 +11,7 @@ import shapely
 
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
-from flexroad.tasks.roads.flat_patches import flat_patches
+from flexroad.tasks.roads.flat_patches import flat_cells
 from flexroad.tasks.types import Bools, Floats
 
 rasterio = lazy("rasterio")
@@ -58,8 +58,7 @@ def likely_decks(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> list[Deck
     - `grid`: the grid of all of them.
     """
     points = road & np.isfinite(dsm)
-    patches = flat_patches(dsm, points, grid.cell, ROUGHNESS_M, BEND)
-    flat = scipy.ndimage.binary_dilation(patches.centres, np.ones((2 * patches.reach + 1,) * 2)) & points
+    flat = flat_cells(dsm, points, grid.cell, ROUGHNESS_M, BEND) & points
     rise = dsm - dtm
     street = flat & (np.abs(rise) <= STREET_M)
     parts, number = scipy.ndimage.label(flat & (rise > RISE_M), EVERY_WAY)

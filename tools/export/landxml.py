@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 from flexroad.catalog import crs
 from flexroad.catalog.text import printable
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.meshing import parts
-from flexroad.tasks.meshing.parts import Indices
 from flexroad.tasks.types import Bools, Floats, Mesh
 
 VERSION = 1
@@ -158,14 +156,14 @@ def part(mesh: Mesh, joined: bool = True) -> Part:
 
 
 def _part_surface(mesh: Mesh, faces: Bools, points: Floats, row: NDArray[np.int32]) -> PartSurface:
-    used, corners = parts.part(mesh, faces)
+    used, corners = mesh.part(faces)
     east, north, height = points[used].T
     columns = zip(north.tolist(), east.tolist(), height.tolist(), strict=True)
     text = "".join(map(POINT_END.__mod__, columns)).encode()
     at_rim = np.flatnonzero(row[used] >= 0).astype(np.int32)
     rim = np.column_stack([at_rim, row[used][at_rim]])
     limits = np.array([height.min(), height.max()] if len(used) else [np.inf, -np.inf])
-    return PartSurface(text, corners.astype(np.int32), rim, limits)
+    return PartSurface(text, corners, rim, limits)
 
 
 def join(
@@ -275,7 +273,7 @@ def _at_rim(one: Part, open_vertices: dict[Place, _OpenVertex]) -> list[_OpenVer
     return found
 
 
-def _rim(mesh: Mesh) -> Indices:
+def _rim(mesh: Mesh) -> NDArray[np.intp]:
     """Return the vertices at edges with one face only."""
     faces = mesh.faces.astype(np.int64)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.meshing.parts import highest_first, part, texture_coordinates, with_levels
+from flexroad.tasks.meshing.parts import highest_first, texture_coordinates, with_levels
 from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.types import Mesh
 from tests.crossing import DECK_M, RISE, SOUTH, WEST, Crossing
@@ -14,13 +14,13 @@ MESH = Mesh("EPSG:25832", (295500.0, 5629250.0, 150.0), VERTICES, FACES, np.arra
 
 
 def test_part_has_the_same_triangles_and_only_their_vertices():
-    used, corners = part(MESH, MESH.road)
+    used, corners = MESH.part(MESH.road)
     np.testing.assert_array_equal(used, [0, 2, 3])
     np.testing.assert_array_equal(VERTICES[used][corners], VERTICES[FACES[MESH.road]])
 
 
 def test_part_without_faces_is_empty():
-    used, corners = part(MESH, np.zeros(3, bool))
+    used, corners = MESH.part(np.zeros(3, bool))
     assert (used.shape, corners.shape) == ((0,), (0, 3))
 
 

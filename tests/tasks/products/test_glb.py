@@ -11,7 +11,6 @@ from scipy.ndimage import map_coordinates
 
 from flexroad.catalog import Grid
 from flexroad.tasks.meshing.normals import mesh_normals
-from flexroad.tasks.meshing.parts import part
 from flexroad.tasks.meshing.relief import Relief, Sheet, sheet
 from flexroad.tasks.products import glb
 from flexroad.tasks.spline.surface import NurbsSurface
@@ -153,7 +152,7 @@ def test_encode_normals_on_the_border_are_those_of_the_surface():
     truth = surface.normal(x + west, y + south)
     np.testing.assert_array_equal(normals, np.where(border[:, None], truth, faces_alone))
     written = attribute(glb.encode(mesh, RUN_ORIGIN, normals=normals), "road", "NORMAL")
-    used, _ = part(mesh, mesh.road)
+    used, _ = mesh.part(mesh.road)
     east, north, up = normals[used].T
     np.testing.assert_allclose(written, np.c_[east, up, -north], atol=1e-6)
 
