@@ -246,11 +246,3 @@ def _lacking(road: Bools, classes: NDArray[np.uint8], below: Bools, cell: float)
         known = road & ((classes == HeightSource.MEASURED) | (classes == HeightSource.DTM))
         lacking[by_deck] = distances(by_deck, known) * cell > TUNNEL_M / 2
     return np.asarray(lacking)
-
-
-def heights_fitted(data: TileData, clusters: RoadClusters) -> Floats:
-    """Return the heights of a fit, ``(H, W)``, m; NaN where none enters.
-
-    They are those of `with_road_heights` on kept road cells, else the valid DTM.
-    """
-    return ground_to_fit(with_road_heights(data, clusters), clusters)
