@@ -47,10 +47,10 @@ from flexroad.tasks.meshing.parts import middles, with_levels
 from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, breaklines, survey_limit
 from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
-from flexroad.tasks.spline.frame import Frame
-from flexroad.tasks.spline.mesh_border import (
+from flexroad.tasks.spline.frame import (
     NUDGE,
     SAME_M,
+    Frame,
     border_heights,
     border_points,
     joined,

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rasterio.enums import Resampling
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.crs import bounds_in, in_plan, same, short
@@ -205,10 +204,7 @@ def _window(tile: Tile, layer: Layer, file: SourceFile, grid: Grid, core: Grid) 
     if file.extent and max(map(abs, file.extent)) <= FARTHEST:
         # Where a file without georeference lies: the same for all tiles.
         core = Grid.covering(core.crs, file.extent, core.cell)
-    resampling = Resampling.average if heights else Resampling.mode
-    return read_window(
-        file.path, file.title, grid, core, layer.crs, resampling, heights, layer.reproject, tile.missing
-    )
+    return read_window(file.path, file.title, grid, core, layer.crs, heights, layer.reproject, tile.missing)
 
 
 def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow | None) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.meshing.lines import AT_BORDER_M, GRID_M, parts_of
 from flexroad.tasks.meshing.road_outline import encoded, lines_of
-from flexroad.tasks.spline.mesh_border import SAME_M, on_border
+from flexroad.tasks.spline.frame import SAME_M, on_border
 from flexroad.tasks.types import Bools, Floats, Level, Surface
 
 WALL_M = 0.25

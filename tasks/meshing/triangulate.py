@@ -82,11 +82,7 @@ def constrained(points: Floats, segments: Edges, lattices: Sequence[Lattice] = (
     - `lattices`: lattices on which many of the points lie.
     - result ``(F, 3)``: counter-clockwise; beside the segments the triangulation is Delaunay's.
     """
-    return with_edges(points, delaunay(points, lattices), segments)
-
-
-def with_edges(points: Floats, faces: Faces, segments: Edges) -> Faces:
-    """Return faces of a triangulation, changed so that segments are edges, ``(F, 3)``; see `constrained`."""
+    faces = delaunay(points, lattices)
     if not len(segments):
         return faces
     missing = segments[~_has_edges(faces, segments, len(points))]

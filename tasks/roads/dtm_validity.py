@@ -11,20 +11,12 @@ from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 DSM_DTM_TOLERANCE_M = 0.3
 """Largest difference of two heights of the same ground (m)."""
-
-
 NEAR_M = 5.0
 """Standard deviation of the Gaussian weights of the kept cells around a gap (m)."""
-
-
 REACH_M = 3 * NEAR_M
 """Farther than this from any kept cell the DTM is not checked (m)."""
-
-
 CREST_M = 100.0
 """Smallest radius of crests and sags expected where a road is hidden (m)."""
-
-
 THIN_M2 = 0.2
 """Cells whose variance in some direction is below this (m2) lie on a line and define no plane."""
 
