@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.lazy import lazy
-from flexroad.tasks.meshing.normals import mesh_normals, vertex_normals
+from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.meshing.parts import texture_coordinates
-from flexroad.tasks.meshing.relief import Sheet
 from flexroad.tasks.types import Floats, Mesh, Orthophoto
 
 Image = lazy("PIL.Image")
@@ -139,35 +138,27 @@ def encode(
     return file.encoded(tile, _georeference(mesh, run_origin))
 
 
-def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes, photo: bool) -> bytes:
-    """Return a coarse copy of meshes with its image as GLB.
+def encode_ground(
+    places: Floats, normals: Floats, uv: Floats, faces: NDArray[np.int32], image: bytes, photo: bool
+) -> bytes:
+    """Return a mesh with an image as GLB with one node, ``ground``.
 
     Parameters
     ----------
-    sheet : Sheet
-        Triangles and skirt.
-    local : ndarray, (V, 3)
-        Its points in a frame of their own: east, north and up (m).
-    bounds : tuple of float
-        West, south, east and north of the image's outer edges (m, in the CRS of the sheet).
+    places, normals : ndarray, (V, 3)
+        The vertices in a frame of their own: east, north and up (m), and their unit normals.
+    uv : ndarray, (V, 2)
+        Their places in the image, from west to east and from south to north.
+    faces : ndarray, (F, 3)
+        Counter-clockwise from above.
     image : bytes
         The image seen from above, JPEG.
     photo : bool
         Whether the image is made of photos, which are shown without a light.
-
-    Returns
-    -------
-    bytes
-        One node, ``ground``. Axes: x east, y up, z south; metres. The skirt has the colours and normals of
-        the edge above it, so that it does not show.
     """
-    top = vertex_normals(local[: sheet.top.max() + 1], sheet.faces[: sheet.count])
-    west, south, east, north = bounds
-    uv = (sheet.points[sheet.top, :2] - (west, south)) / (east - west, north - south)
     file = _File()
     material = _material("ground", (), file.add_image(image), photo)
-    node = file.add_mesh(local, top[sheet.top], uv, sheet.faces, material)
-    return file.encoded(node)
+    return file.encoded(file.add_mesh(places, normals, uv, faces, material))
 
 
 def _y_up(points: Floats) -> Floats:

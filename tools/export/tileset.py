@@ -29,14 +29,13 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name
-from flexroad.tasks.meshing import relief
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.meshing.parts import highest_first
-from flexroad.tasks.meshing.relief import Relief
 from flexroad.tasks.products import glb
-from flexroad.tools.export import aerial, tiles3d
+from flexroad.tools.export import aerial, relief, tiles3d
 from flexroad.tools.export.aerial import Aerial
 from flexroad.tools.export.georeference import Datum, Ellipsoidal
+from flexroad.tools.export.relief import Relief
 from flexroad.tools.export.source import Options, Source, TileItem, aerial_of, layer_state, texture_of
 from flexroad.tools.export.tile_outputs import ManifestRow, TileOutput, write_outputs
 
@@ -139,7 +138,7 @@ def branch_output(branch: Branch, place: Place) -> TileOutput:
     uri = f"{MESHES}/{branch.id.removeprefix(PREFIX)}{glb.NAME}"
     placed, local = tiles3d.sheet_placed(uri, sheet.points, place.conversion)
     photo = any(row["photo"] for row in branch.parts)
-    data = glb.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY), photo)
+    data = relief.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY), photo)
     error_m = max(ground.error_m, SHARP * level.pixel_m, *(row["error_m"] for row in branch.parts))
     files, referred = record(branch.id, ground, image)
     row = row_of(branch.id, branch.cell, placed, error_m, photo) | {"vertical_m": ground.error_m}

@@ -16,7 +16,9 @@ import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
+from flexroad.tasks.meshing.normals import vertex_normals
 from flexroad.tasks.metrics.mesh_distance import at_nodes
+from flexroad.tasks.products.glb import encode_ground
 from flexroad.tasks.types import Bools, Floats
 
 Faces = NDArray[np.int32]
@@ -118,6 +120,22 @@ def sheet(relief: Relief, depth_m: float) -> Sheet:
         np.concatenate([np.arange(len(points)), rim]),
         len(faces),
     )
+
+
+def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes, photo: bool) -> bytes:
+    """Return a coarse copy of meshes with its image as GLB.
+
+    The skirt has the colours and normals of the edge above it, so that it does not show.
+
+    - `local` ``(V, 3)``: its points in a frame of their own: east, north and up (m).
+    - `bounds`: west, south, east and north of the image's outer edges (m, in the CRS of the sheet).
+    - `image`: the image seen from above, JPEG.
+    - `photo`: whether the image is made of photos, which are shown without a light.
+    """
+    top = vertex_normals(local[: sheet.top.max() + 1], sheet.faces[: sheet.count])
+    west, south, east, north = bounds
+    uv = (sheet.points[sheet.top, :2] - (west, south)) / (east - west, north - south)
+    return encode_ground(local, top[sheet.top], uv, sheet.faces, image, photo)
 
 
 def _shape(bounds: Bounds, spacing_m: float) -> tuple[int, int]:

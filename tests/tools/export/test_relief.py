@@ -5,8 +5,10 @@ import pytest
 import trimesh
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 
-from flexroad.tasks.meshing.relief import Relief, joined, of_mesh, sheet
 from flexroad.tasks.meshing.triangulate import delaunay
+from flexroad.tasks.products import glb
+from flexroad.tools.export.relief import Relief, Sheet, encode_sheet, joined, of_mesh, sheet
+from tests.tasks.products.test_glb import attribute, gltf_json
 
 WEST, SOUTH = 500_000.0, 5_600_000.0
 
@@ -140,3 +142,34 @@ def test_sheet_skirt_hangs_from_the_whole_rim_and_looks_outward():
         outward = np.cross(*(made.points[face[1:]] - made.points[face[0]]))[:2]
         x, y = made.points[face].mean(axis=0)[:2] - 0.5 * outward / np.linalg.norm(outward)
         assert cells[int((40 - y) // 10), int(x // 10)]
+
+
+def coarse(jpeg: bytes, photo: bool = False) -> tuple[bytes, Sheet]:
+    """Return the GLB of a slope of 3 x 2 cells of 10 m with a skirt of 4 m."""
+    heights = np.add.outer(np.arange(3.0), 2 * np.arange(4.0))
+    made = sheet(Relief((100.0, 200.0, 130.0, 220.0), heights, np.ones((2, 3), bool), 0.5), 4.0)
+    local = made.points - (100, 200, 0)
+    return encode_sheet(made, local, (100.0, 200.0, 130.0, 220.0), jpeg, photo), made
+
+
+def test_encode_sheet_skirt_has_normals_and_colours_of_the_edge():
+    data, made = coarse(glb.jpeg(np.full((8, 8, 3), 90, np.uint8), 85))
+    position, normal, uv = (attribute(data, "ground", name) for name in ("POSITION", "NORMAL", "TEXCOORD_0"))
+    np.testing.assert_allclose(
+        np.column_stack([position[:, 0], -position[:, 2]]), made.points[:, :2] - (100, 200)
+    )
+    np.testing.assert_allclose(normal, normal[made.top])
+    np.testing.assert_allclose(uv, uv[made.top])
+    # Per cell of 10 m, heights rise by 2 m to the east and by 1 m to the south.
+    slope = np.array([-0.2, 1.0, -0.1])
+    np.testing.assert_allclose(normal, np.tile(slope / np.linalg.norm(slope), (len(normal), 1)), atol=1e-6)
+    np.testing.assert_allclose(uv, np.column_stack([position[:, 0] / 30, 1 + position[:, 2] / 20]), atol=1e-6)
+
+
+@pytest.mark.parametrize("photo", [False, True])
+def test_encode_sheet_is_unlit_if_it_has_photos(photo):
+    tree = gltf_json(coarse(b"", photo)[0])
+    assert tree.get("extensionsUsed") == (["KHR_materials_unlit"] if photo else None)
+    assert [material.get("extensions") for material in tree["materials"]] == [
+        {"KHR_materials_unlit": {}} if photo else None
+    ]
