@@ -16,7 +16,7 @@ outline, and meets level 0 on its abutments (`tasks.meshing.abutment_lines`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -39,11 +39,11 @@ from flexroad.tasks.meshing.lines import (
     axis,
     divided,
     ends_at_border,
+    middles,
     parts_of,
     points_and_segments,
     without_duplicates,
 )
-from flexroad.tasks.meshing.parts import middles, with_levels
 from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, breaklines, survey_limit
 from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
@@ -201,6 +201,32 @@ def _levels(
             if len(faces):
                 meshes[outline.number] = _mesh(points, faces, road, np.ones_like(mask))
     return with_levels(meshes)
+
+
+def with_levels(meshes: Mapping[int, Mesh]) -> Mesh:
+    """Return the meshes of several levels of a tile as one; they share no vertex.
+
+    - `meshes`: by number of the level; level 0 is the first.
+    """
+    first, *others = meshes.values()
+    if not others:
+        return first
+    east, north, _ = first.origin
+    datum = min(mesh.origin[2] for mesh in meshes.values())
+    counts = [len(mesh.vertices) for mesh in meshes.values()]
+    starts = np.cumsum([0, *counts[:-1]], dtype=np.int32)
+    return Mesh(
+        crs=first.crs,
+        origin=(east, north, datum),
+        vertices=np.concatenate(
+            [mesh.vertices + np.array([0.0, 0.0, mesh.origin[2] - datum]) for mesh in meshes.values()]
+        ),
+        faces=np.concatenate(
+            [mesh.faces + start for mesh, start in zip(meshes.values(), starts, strict=True)]
+        ),
+        road=np.concatenate([mesh.road for mesh in meshes.values()]),
+        level=np.repeat(np.array([*meshes], np.int8), [len(mesh.faces) for mesh in meshes.values()]),
+    )
 
 
 def _other_level(

@@ -316,6 +316,17 @@ class Mesh:
         number = np.cumsum(is_used, dtype=np.int32) - np.int32(1)
         return np.flatnonzero(is_used), number[chosen]
 
+    def texture_coordinates(self, bounds: Bounds) -> Floats:
+        """Return the places of the vertices in an image seen from above, ``(V, 2)``.
+
+        They are 0 to 1 from west to east, and from south to north.
+
+        - `bounds`: west, south, east and north of the image's outer edges (m).
+        """
+        west, south, east, north = bounds
+        place = self.vertices[:, :2] + self.origin[:2]
+        return np.asarray((place - (west, south)) / (east - west, north - south), np.float64)
+
 
 @dataclass(frozen=True)
 class Metrics:

@@ -21,7 +21,7 @@ import startinpy
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.meshing.parts import middles
+from flexroad.tasks.meshing.lines import middles
 from flexroad.tasks.types import Bools, Floats
 
 SNAP_TOLERANCE_M = 1e-9

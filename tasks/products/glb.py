@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.meshing.normals import mesh_normals
-from flexroad.tasks.meshing.parts import texture_coordinates
 from flexroad.tasks.types import Floats, Mesh, Orthophoto
 
 Image = lazy("PIL.Image")
@@ -109,7 +108,7 @@ def encode(
         number of its level. Axes: x east, y up, z south; metres. Equal inputs give equal bytes.
     """
     normals = mesh_normals(mesh) if normals is None else normals
-    uv = texture_coordinates(mesh, texture.bounds) if texture else None
+    uv = mesh.texture_coordinates(texture.bounds) if texture else None
     file = _File()
     shift = _y_up(np.subtract(mesh.origin, run_origin)).tolist()
     tile = file.add("nodes", {"name": name, "children": [], "matrix": [*IDENTITY, *shift, 1.0]})

@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.tasks.meshing.parts import middles
+from flexroad.tasks.meshing.lines import middles
 from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M, valid_dtm
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 

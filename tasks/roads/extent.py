@@ -1,7 +1,6 @@
 """The extent of the survey: cells beyond it get no mesh.
 
-A fitted surface goes on beyond the survey, but its heights there are no heights of the ground. Formats
-without meshes ask here what is covered.
+A fitted surface goes on beyond the survey, but its heights there are no heights of the ground.
 """
 
 from __future__ import annotations
@@ -9,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from flexroad.catalog.grid import Bounds
-from flexroad.tasks.types import Bools, RoadMask, TileData
+from flexroad.tasks.types import Bools, TileData
 
 
 def beyond_extent(data: TileData) -> Bools:
@@ -29,24 +27,3 @@ def beyond_extent(data: TileData) -> Bools:
     beyond[0] = False
     outside: Bools = beyond[labels]
     return outside
-
-
-def covered(road: RoadMask) -> tuple[Bounds, float]:
-    """Return the smallest rectangle around all covered cells of a tile, and what of it is beyond the survey.
-
-    - `bounds`: west, south, east and north (m); those of the core if none of its cells is covered.
-    - `beyond_m2`: area within the bounds that is beyond the survey (m2).
-    """
-    core, inside = road.core, ~road.outside[road.grid.window(road.core)]
-    if inside.all() or not inside.any():
-        return core.bounds, float((~inside).sum() * core.cell**2)
-    rows, cols = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-    top, bottom, left, right = rows[0], rows[-1] + 1, cols[0], cols[-1] + 1
-    west, north = core.bounds[0], core.bounds[3]
-    bounds = (
-        float(west + left * core.cell),
-        float(north - bottom * core.cell),
-        float(west + right * core.cell),
-        float(north - top * core.cell),
-    )
-    return bounds, float((~inside[top:bottom, left:right]).sum() * core.cell**2)

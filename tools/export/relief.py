@@ -19,7 +19,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.tasks.meshing.normals import vertex_normals
 from flexroad.tasks.metrics.mesh_distance import at_nodes
 from flexroad.tasks.products.glb import encode_ground
-from flexroad.tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats, Mesh
 
 Faces = NDArray[np.int32]
 ON_LINE = 1e-9
@@ -53,6 +53,14 @@ class Relief:
         number = np.arange(self.heights.size, dtype=np.int32).reshape(self.heights.shape)
         nw, ne, sw, se = (part[self.cells] for part in _corners(number))
         return np.stack([nw, sw, se, nw, se, ne], axis=-1).reshape(-1, 3)
+
+
+def highest_first(mesh: Mesh) -> NDArray[np.int32]:
+    """Return the faces of a mesh, ``(F, 3)``, those of the highest level first.
+
+    Where several faces are above a place, a relief takes the height of the first.
+    """
+    return mesh.faces if mesh.level is None else mesh.faces[np.argsort(-mesh.level, kind="stable")]
 
 
 def of_mesh(points: Floats, faces: Faces, spacing_m: float) -> Relief:

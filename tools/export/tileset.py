@@ -30,7 +30,6 @@ from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name
 from flexroad.tasks.meshing.normals import mesh_normals
-from flexroad.tasks.meshing.parts import highest_first
 from flexroad.tasks.products import glb
 from flexroad.tools.export import aerial, relief, tiles3d
 from flexroad.tools.export.aerial import Aerial
@@ -285,7 +284,7 @@ def leaf_output(leaf: TileItem, place: Place, drape: bool) -> TileOutput:
     uri = f"tiles/{name}{glb.NAME}"
     placed = tiles3d.placed(uri, grid.bounds, heights, place.origin, place.conversion)
     pixel_m = TILE.pixel_m
-    ground = relief.of_mesh(points, highest_first(mesh), TILE.spacing_m)
+    ground = relief.of_mesh(points, relief.highest_first(mesh), TILE.spacing_m)
     colours = glb.ROAD_SRGB, glb.TERRAIN_SRGB
     image = aerial.of_classes(points, mesh.faces, mesh.road, colours, ground.bounds, pixel_m)
     if texture:

@@ -1,13 +1,18 @@
 """Reliefs cover the meshes that they stand for; their error is the largest vertical distance from them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 
+from flexroad.catalog.grid import Grid
 from flexroad.tasks.meshing.triangulate import delaunay
+from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.products import glb
-from flexroad.tools.export.relief import Relief, Sheet, encode_sheet, joined, of_mesh, sheet
+from flexroad.tools.export.relief import Relief, Sheet, encode_sheet, highest_first, joined, of_mesh, sheet
+from tests import crossing
 from tests.tasks.products.test_glb import attribute, gltf_json
 
 WEST, SOUTH = 500_000.0, 5_600_000.0
@@ -173,3 +178,14 @@ def test_encode_sheet_is_unlit_if_it_has_photos(photo):
     assert [material.get("extensions") for material in tree["materials"]] == [
         {"KHR_materials_unlit": {}} if photo else None
     ]
+
+
+def test_height_over_faces_of_the_highest_level_is_that_of_the_deck():
+    mesh, _ = crossing.Crossing((40.0, 30.0)).mesh()
+    grid = Grid(mesh.crs, crossing.WEST + 35, crossing.SOUTH + 32, 1.0, 10, 4)
+    top = drape(replace(mesh, faces=highest_first(mesh)), grid) + mesh.origin[2]
+    np.testing.assert_allclose(
+        top, crossing.DECK_M + crossing.RISE * np.tile(grid.eastings - crossing.WEST, (4, 1)), atol=2e-3
+    )
+    ground = mesh.at(0)
+    assert highest_first(ground) is ground.faces
