@@ -44,7 +44,7 @@ from flexroad.tasks.meshing.lines import (
     points_and_segments,
     without_duplicates,
 )
-from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
+from flexroad.tasks.meshing.road_outline import road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, breaklines, survey_limit
 from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
 from flexroad.tasks.spline.frame import (
@@ -277,16 +277,16 @@ def _dynamic(
     """
     fine = _lattice(surface, road, mask, local, options.road_m)
     coarse = _lattice(surface, road, ~mask, local, options.terrain_m)
-    limit, outline = _limit(road, local, frame), None
+    limit, roads = _limit(road, local, frame), None
     lines = [] if limit is None else [_divided(limit.lines, road, mask, options)]
     breaks = None
     if isinstance(surface, SteppedSurface) and options.breaklines:
         edges, breaks = breaklines(surface, local)
         lines.append(without_abutments(_divided(edges, road, mask, options), others))
     if road.areas is not None and options.mask == "raw":
-        outline = road_outline(road.areas, local, options.road_m)
-        lines.append(without_abutments(outline.lines, others))
-        fine = fine[outline.contains(fine)]
+        roads, edges_of_roads = road_outline(road.areas, local, options.road_m)
+        lines.append(without_abutments(edges_of_roads, others))
+        fine = fine[shapely.contains_xy(roads, fine[:, 0], fine[:, 1])]
     lines += [part for other in others for part in (other.abutments, other.feet)]
     free = np.concatenate([fine, coarse])
     if frame:
@@ -314,7 +314,7 @@ def _dynamic(
     faces = constrained(points, number[len(free) + len(border) + segments], lattices)
     if limit:
         faces = faces[limit.covers(middles(points, faces))]
-    return _mesh(points, faces, road, mask, outline)
+    return _mesh(points, faces, road, mask, roads)
 
 
 def _in_space(points: Floats, surface: MovingNurbs, origin: tuple[float, float]) -> Floats:
@@ -390,9 +390,12 @@ def _border(
 
 
 def _mesh(
-    points: Floats, faces: Faces, road: RoadMask, mask: Bools, outline: RoadOutline | None = None
+    points: Floats, faces: Faces, road: RoadMask, mask: Bools, roads: shapely.MultiPolygon | None = None
 ) -> Mesh:
-    """Return the mesh of the faces that have heights, without unused vertices."""
+    """Return the mesh of the faces that have heights, without unused vertices.
+
+    - `roads`: areas that class the faces, in place of the cells of ``mask``.
+    """
     east, north = road.core.origin
     known = np.isfinite(points[:, 2])
     faces = faces if known.all() else faces[known[faces].all(axis=1)]
@@ -405,5 +408,9 @@ def _mesh(
     vertices = points[used]
     datum = float(np.floor(vertices[:, 2].min()))
     vertices[:, 2] -= datum
-    is_road = outline.contains(places) if outline else mask[road.grid.cells(*(places + road.core.origin).T)]
+    is_road = (
+        mask[road.grid.cells(*(places + road.core.origin).T)]
+        if roads is None
+        else shapely.contains_xy(roads, *places.T)
+    )
     return Mesh(road.core.crs, (east, north, datum), vertices, number[faces], is_road)

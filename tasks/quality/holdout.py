@@ -41,7 +41,6 @@ def holdout(
 
     - `data`, `road`, `clusters`: as in `tasks.quality.assess.assess`.
     - `refit`: the fit; not needed if ``share`` is 0.
-    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     - `share`: share of the squares that are withheld, from 0 to 1.
     - result: the figures of `Quality` by name.
     """
