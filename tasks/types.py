@@ -12,7 +12,10 @@ import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location
+
+scipy = lazy("scipy")
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -83,6 +86,23 @@ class TileData:
     def lacks_road(self, mask: Bools) -> bool:
         """Return whether no cell of the tile's core is road in a mask, ``(H, W)``."""
         return not mask[self.grid.window(self.core)].any()
+
+    def beyond_extent(self) -> Bools:
+        """Return the cells beyond the survey, ``(H, W)``.
+
+        These are the cells with neither DSM nor DTM in a void (4-connected) that touches the grid's edge. A
+        void inside, as in water or deep shade, is not beyond the survey: meshes bridge it.
+        """
+        void = np.isnan(self.dsm) & np.isnan(self.dtm)
+        if not any(side.any() for side in (void[0], void[-1], void[:, 0], void[:, -1])):
+            return np.zeros(void.shape, np.bool_)
+        labels, count = scipy.ndimage.label(void)
+        beyond = np.zeros(count + 1, np.bool_)
+        for side in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+            beyond[side] = True
+        beyond[0] = False
+        outside: Bools = beyond[labels]
+        return outside
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,16 +91,12 @@ def extrapolated_plane(
         # Central moments give two equations for the slopes, then the height at offset 0.
         rr, rc, cc = rr - r * r, rc - r * c, cc - c * c
         mr, mc = mr - m * r, mc - m * c
-        determinant = np.where(_least_spread(rr, rc, cc) >= THIN_M2, rr * cc - rc * rc, np.nan)
+        least_variance = (rr + cc) / 2 - np.hypot((rr - cc) / 2, rc)
+        determinant = np.where(least_variance >= THIN_M2, rr * cc - rc * rc, np.nan)
         by_row, by_col = (mr * cc - mc * rc) / determinant, (mc * rr - mr * rc) / determinant
         left = mm - m * m - by_row * mr - by_col * mc
         height, scatter = datum + m - by_row * r - by_col * c, np.sqrt(np.maximum(left, 0.0))
     return height, scatter, np.sqrt(nearest) * cell
-
-
-def _least_spread(rr: Floats, rc: Floats, cc: Floats) -> Floats:
-    """Return the smaller eigenvalue of symmetric 2 x 2 matrices."""
-    return np.asarray((rr + cc) / 2 - np.hypot((rr - cc) / 2, rc))
 
 
 @compiled()

@@ -15,7 +15,6 @@ from flexroad.tasks.border import ENDS, BorderStages
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.roads.dtm_validity import ground_to_fit
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.segment import mask
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import basis_matrix, uniform_knots
@@ -45,7 +44,7 @@ def part(world, grid, core):
 
 
 def filtered(data):
-    road = RoadMask(data.grid, data.core, data.road_mask, beyond_extent(data))
+    road = RoadMask(data.grid, data.core, data.road_mask, data.beyond_extent())
     return road, planar.ecsrc(data, road, FILTER)
 
 
