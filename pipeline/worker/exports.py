@@ -167,9 +167,9 @@ def _cog(
     with quiet():
         height_source, others = _of_levels(core, road.outside[window], surface, quality, vertical)
         return {
-            HEIGHT: cog.encode_height(heights, core, vertical),
-            ROAD: cog.encode_mask(kept, core),
-            HEIGHT_SOURCE: cog.encode_height_source(height_source, core),
+            HEIGHT: cog.encode(heights, core, cog.HEIGHT, vertical),
+            ROAD: cog.encode(kept, core, cog.ROAD),
+            HEIGHT_SOURCE: cog.encode(height_source, core, cog.HEIGHT_SOURCE),
             **others,
         }
 
@@ -189,9 +189,9 @@ def _of_levels(
             lower[number] = np.where(here, surface.at(number).height(*at), np.nan)
     files = {}
     for number, heights in sorted(lower.items()):
-        files[of_level(HEIGHT, number)] = cog.encode_height(heights, core, vertical)
-        files[of_level(HEIGHT_SOURCE, number)] = cog.encode_height_source(
-            quality.at(number).height_source, core
+        files[of_level(HEIGHT, number)] = cog.encode(heights, core, cog.HEIGHT, vertical)
+        files[of_level(HEIGHT_SOURCE, number)] = cog.encode(
+            quality.at(number).height_source, core, cog.HEIGHT_SOURCE
         )
     return top_height_source(quality, top), files
 

@@ -41,7 +41,7 @@ from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.options import Options
 from flexroad.tasks.roads import attributes, coregistration, rasterise
-from flexroad.tasks.roads.flat_patches import flat_patches
+from flexroad.tasks.roads.flat_patches import flat_cells
 from flexroad.tasks.types import Bools, Floats, TileData
 
 rasterio = lazy("rasterio")
@@ -305,8 +305,7 @@ def likely_decks(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> list[Deck
     - `grid`: the grid of all of them.
     """
     points = road & np.isfinite(dsm)
-    patches = flat_patches(dsm, points, grid.cell, ROUGHNESS_M, BEND)
-    flat = scipy.ndimage.binary_dilation(patches.centres, np.ones((2 * patches.reach + 1,) * 2)) & points
+    flat = flat_cells(dsm, points, grid.cell, ROUGHNESS_M, BEND) & points
     rise = dsm - dtm
     street = flat & (np.abs(rise) <= STREET_M)
     parts, number = scipy.ndimage.label(flat & (rise > RISE_M), EVERY_WAY)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
@@ -22,7 +22,7 @@ from flexroad.pipeline.run.finished import FinishedTile, GroundTile, passing
 from flexroad.pipeline.run.sampler import LARGEST_STEP_M, TileSampler, length_text
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
+from flexroad.tasks.levels.along_route import PlaceLevels, route_levels, structures
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats, HeightAt
@@ -140,7 +140,7 @@ class RouteUnit:
 
     def levels(self, x: Floats, y: Floats) -> PlaceLevels | None:
         """Return the levels of places in the local frame; None if the route is on level 0 alone."""
-        return None if self._levels is None else self._levels.at(x, y)
+        return None if self._levels is None else self._levels(x, y)
 
     def levels_on(self, x: Floats, y: Floats) -> NDArray[np.int8]:
         """Return the levels of the centre line at places on it."""
@@ -148,8 +148,8 @@ class RouteUnit:
         return np.zeros(x.shape, np.int8) if found is None else found.of_line
 
     @cached_property
-    def _levels(self) -> RouteLevels | None:
-        return RouteLevels.of(self.route)
+    def _levels(self) -> Callable[[Floats, Floats], PlaceLevels] | None:
+        return route_levels(self.route)
 
     def height(self, work: Work, steps: bool = False) -> HeightAt:
         """Return, in the local frame, the surface without steps, or how much higher the one with steps is."""

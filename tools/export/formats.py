@@ -18,7 +18,6 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import FinishedTile
-from flexroad.tasks.roads.extent import covered
 from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tools.export import (
@@ -114,7 +113,7 @@ def step_output(tile: FinishedTile, place: Georeference) -> TileOutput:
     surface, source, name = tile.surface, tile.tile, safe_name(tile.id)
     if not isinstance(surface, NurbsSurface):
         raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
-    bounds, beyond_m2 = covered(tile.road)
+    bounds, beyond_m2 = step.covered(tile.road)
     steps_m = 0.0
     if isinstance(surface, SteppedSurface):
         inside = ~tile.road.outside[tile.road.grid.window(tile.road.core)]

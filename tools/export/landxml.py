@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 from flexroad.catalog import crs
 from flexroad.catalog.text import printable
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.meshing import parts
-from flexroad.tasks.meshing.parts import Indices
 from flexroad.tasks.types import Floats, Mesh
 
 VERSION = 1
@@ -115,14 +113,14 @@ def _part(mesh: Mesh, joined: bool) -> Arrays:
     places = np.rint(points[rim] * 10**DECIMALS).astype(np.int64)
     arrays = {"places": places, "angles": _angles(mesh)[rim]}
     for number, faces in enumerate((mesh.road, ~mesh.road)):
-        used, corners = parts.part(mesh, faces)
+        used, corners = mesh.part(faces)
         east, north, height = points[used].T
         columns = zip(north.tolist(), east.tolist(), height.tolist(), strict=True)
         text = "".join(map(POINT_END.__mod__, columns)).encode()
         at_rim = np.flatnonzero(row[used] >= 0).astype(np.int32)
         arrays |= {
             f"points{number}": np.frombuffer(text, np.uint8),
-            f"corners{number}": corners.astype(np.int32),
+            f"corners{number}": corners,
             f"rim{number}": np.column_stack([at_rim, row[used][at_rim]]),
             f"limits{number}": np.array([height.min(), height.max()] if len(used) else [np.inf, -np.inf]),
         }
@@ -223,7 +221,7 @@ class _OpenVertex:
     """Its numbers in the surfaces of road and ground; 0 where it is not in them."""
 
 
-def _rim(mesh: Mesh) -> Indices:
+def _rim(mesh: Mesh) -> NDArray[np.intp]:
     """Return the vertices at edges with one face only."""
     faces = mesh.faces.astype(np.int64)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)

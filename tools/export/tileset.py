@@ -33,15 +33,13 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name
-from flexroad.tasks.meshing import relief
 from flexroad.tasks.meshing.normals import mesh_normals
-from flexroad.tasks.meshing.parts import highest_first
-from flexroad.tasks.meshing.relief import Relief
 from flexroad.tasks.metrics.mesh_distance import at_nodes
 from flexroad.tasks.products import glb
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.export import tiles3d
+from flexroad.tools.export import relief, tiles3d
 from flexroad.tools.export.georeference import Datum, Georeference
+from flexroad.tools.export.relief import Relief
 from flexroad.tools.export.source import Options, Source, layer_state, texture_of
 from flexroad.tools.export.tile_outputs import ManifestRow, TileOutput, write_outputs
 
@@ -126,7 +124,7 @@ def branch_output(branch: Branch, place: Place) -> TileOutput:
     (georeference, datum), points = place, sheet.points
     placed, local = tiles3d.sheet_placed(uri, points, georeference.crs, datum)
     photo = any(row["photo"] for row in branch.parts)
-    data = glb.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY), photo)
+    data = relief.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY), photo)
     error_m = max(ground.error_m, SHARP * pixel_m, *(row["error_m"] for row in branch.parts))
     files, referred = record(branch.id, ground, image)
     row = row_of(branch.id, branch.cell, placed, error_m, photo) | {"vertical_m": ground.error_m}
@@ -272,7 +270,7 @@ def leaf_output(tile: FinishedTile, place: Place, drape: bool) -> TileOutput:
     uri = f"tiles/{name}{glb.NAME}"
     placed = tiles3d.placed(uri, grid.bounds, heights, *place)
     spacing_m, pixel_m = TILE_M
-    ground = relief.of_mesh(points, highest_first(mesh), spacing_m)
+    ground = relief.of_mesh(points, relief.highest_first(mesh), spacing_m)
     colours = glb.ROAD_SRGB, glb.TERRAIN_SRGB
     image = of_classes(points, mesh.faces, mesh.road, colours, ground.bounds, pixel_m)
     if texture:

@@ -30,7 +30,6 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.segment.dinov2 import segment as segmenter
 from flexroad.tasks.types import Bools, RoadMask, TileData
 from flexroad.tools.train import fit_head
@@ -147,7 +146,7 @@ class LabelledTiles:
         """Return the cells within the survey and outside the band along label edges, ``(H, W)``."""
         cell, width = data.grid.cell, self.options.ignore_m
         band = within(road, cell, width) & within(~road, cell, width)
-        return ~beyond_extent(data) & ~band
+        return ~data.beyond_extent() & ~band
 
     def blocks(self, tile: Tile, parts: Sequence[Bounds]) -> list[Block]:
         """Return a block for each part of a tile that has labelled cells."""
@@ -243,7 +242,7 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notif
 
 def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], RoadMask]) -> Evaluation:
     data, road = tiles.read(block.tile)
-    surveyed = inside(data.grid, block.bounds) & ~beyond_extent(data)
+    surveyed = inside(data.grid, block.bounds) & ~data.beyond_extent()
     note = ""
     try:
         mask = segment(data)

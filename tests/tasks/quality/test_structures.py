@@ -9,10 +9,17 @@ import shapely
 
 from flexroad.catalog.grid import Grid
 from flexroad.pipeline.store.artefacts import decode, encode
-from flexroad.tasks.quality.assess import Options, assess, cell_errors
+from flexroad.tasks.quality.assess import (
+    BELOW,
+    NO_ABUTMENT,
+    NO_RISE,
+    Options,
+    assess,
+    cell_errors,
+    structures,
+)
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.height_source import HeightSource
-from flexroad.tasks.quality.structures import BELOW, NO_ABUTMENT, NO_RISE, structures
 from flexroad.tasks.types import Level, RoadClusters, RoadMask, Structures, TileData
 from tests.tasks.spline.test_levelled import GRID, LEVEL, SOUTH, WEST, made_surface
 

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Transformer
 
-from flexroad.tasks.meshing.relief import Relief, sheet
-from flexroad.tasks.products import glb
 from flexroad.tools.export.georeference import Datum, Georeference, geocentric
+from flexroad.tools.export.relief import Relief, encode_sheet, sheet
 from flexroad.tools.export.tiles3d import (
     around,
     east_north_up,
@@ -104,7 +103,7 @@ def back(points):
 def test_sheet_of_4_km_is_where_its_points_are_within_2_mm(east):
     """As a viewer reads it: float32 vertices with the transform of the tile."""
     made, placed_sheet, local = sheet_of(4000.0, east, 5_600_000.0, 64.0)
-    data = glb.encode_sheet(made, local, (east, 5_600_000.0, east + 4000, 5_604_000.0), b"", False)
+    data = encode_sheet(made, local, (east, 5_600_000.0, east + 4000, 5_604_000.0), b"", False)
     scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
     x, y, z = scene.geometry["ground"].vertices.astype(np.float32).T.astype(np.float64)
     matrix = matrix_of(tile(placed_sheet, 64.0))

@@ -16,12 +16,12 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.tasks.meshing.relief import of_mesh
 from flexroad.tasks.products import glb
 from flexroad.tools.export import tile_outputs
 from flexroad.tools.export import tileset as coarse
 from flexroad.tools.export.driver import export
 from flexroad.tools.export.georeference import Datum, Georeference
+from flexroad.tools.export.relief import of_mesh
 from flexroad.tools.export.source import Options, select
 from flexroad.tools.export.tiles3d import placed
 from flexroad.tools.export.tileset import Aerial, Node, aerial_of, blocks, joined

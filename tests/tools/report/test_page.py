@@ -17,8 +17,7 @@ from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import COLUMNS, METRICS, metrics_frame
-from flexroad.tasks.quality.assess import FLAGS, NO_ROAD
-from flexroad.tasks.quality.structures import STRUCTURE_FLAGS
+from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, STRUCTURE_FLAGS
 from flexroad.tools.report import _viewer_address, write_report
 from flexroad.tools.report.browser.figures import compare, histograms
 from flexroad.tools.report.browser.outcome import MEANINGS, headline, reasons, statements

@@ -14,9 +14,16 @@ import pandas as pd
 
 from flexroad.catalog.text import count, printable
 from flexroad.tasks.io.dsm_and_dtm import is_offset
-from flexroad.tasks.quality.assess import FLAGS, LIMITS, NO_ROAD
+from flexroad.tasks.quality.assess import (
+    BELOW,
+    FLAGS,
+    LEAST_RISE_M,
+    LIMITS,
+    NO_ABUTMENT,
+    NO_RISE,
+    NO_ROAD,
+)
 from flexroad.tasks.quality.flagged import Place
-from flexroad.tasks.quality.structures import BELOW, LEAST_RISE_M, NO_ABUTMENT, NO_RISE
 from flexroad.tools.report.browser.tiles import STATES, TileTable, short
 from flexroad.tools.report.content import MESHES, STEPS, Content
 
