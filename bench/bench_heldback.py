@@ -149,7 +149,7 @@ def scanned(
     others: Path | None = None,
 ) -> Place:
     """Withhold points of a scan and prepare it without them."""
-    call("prepare", "points", *files, *options, *roads, "-o", folder / "whole", "--workers", 1)
+    call("prepare", *files, *options, *roads, "-o", folder / "whole", "--workers", 1)
     clouds = [laspy.read(file) for file in files]
     x, y, z = (np.concatenate([np.asarray(cloud[a]) for cloud in clouds]) * unit for a in "xyz")
     kind = np.concatenate([np.asarray(cloud.classification) for cloud in clouds])
@@ -164,7 +164,7 @@ def scanned(
         (folder / "points").mkdir(exist_ok=True)
         left.write(folder / "points" / file.name)
     kept_files = [folder / "points" / file.name for file in files]
-    call("prepare", "points", *kept_files, *options, *roads, "-o", folder / "left", "--workers", 1)
+    call("prepare", *kept_files, *options, *roads, "-o", folder / "left", "--workers", 1)
     dtm, mask = folder / "whole" / "dtm.tif", folder / "whole" / "road_mask.tif"
     has_classes = (kind == GROUND).mean() > 0.01
     ground = np.isin(kind, (GROUND, DECK)) if has_classes else np.abs(bilinear(dtm, x, y) - z) < NEAR_M

@@ -17,6 +17,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.guard import las_header
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.scan.inputs import POINTS as SUFFIXES
 from flexroad.catalog.text import access_reason, one_line
 
 laspy = lazy("laspy")
@@ -24,7 +25,6 @@ laspy = lazy("laspy")
 T = TypeVar("T")
 Floats = NDArray[np.float64]
 
-SUFFIXES = (".las", ".laz")
 NOISE = (7, 18)
 """Classes of low and high noise (ASPRS LAS 1.4)."""
 CHUNK = 1_000_000

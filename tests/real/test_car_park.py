@@ -25,7 +25,7 @@ def folder(real_data, tmp_path_factory):
     path, autzen = tmp_path_factory.mktemp("autzen"), real_data / "autzen"
     roads = autzen / "roads" / "autzen_north_roads.gpkg"
     scan = str(autzen / "autzen_north.laz")
-    command(["prepare", "points", scan, "--roads", str(roads), *shlex.split(PREPARE)], path)
+    command(["prepare", scan, "--roads", str(roads), *shlex.split(PREPARE)], path)
     run = ["run", "--catalog", "data/catalog.parquet", "--out", "run", "--allow", str(roads.parent)]
     command(run, path)
     return path

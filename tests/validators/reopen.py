@@ -337,7 +337,7 @@ def autzen(data: Path, folder: Path) -> Survey:
     if not (survey.folder / "catalog.parquet").exists():
         layer = ["--roads", roads, "--roads-layer", "road_polygons", "--roads-where", ROADS]
         points = data / "autzen" / "autzen_north.laz"
-        _flexroad(survey.folder, "prepare", "points", points, "--crs", "EPSG:2994", *layer, "-o", ".")
+        _flexroad(survey.folder, "prepare", points, "--crs", "EPSG:2994", *layer, "-o", ".")
     return _exported(survey, "--drape", "--roads", roads, "--roads-layer", "road_centerlines")
 
 

@@ -1,4 +1,4 @@
-"""``flexroad prepare photos``: rasters from overlapping photographs, via a mesh as in the paper.
+"""``flexroad prepare``: rasters from overlapping photographs, via a mesh as in the paper.
 
 GNSS tags -> poses and sparse points -> dense cloud -> Poisson mesh -> rasters as of any other mesh.
 """
@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.scan.inputs import PHOTOS as SUFFIXES
 from flexroad.catalog.text import some
-from flexroad.pipeline.config.options import INPUTS, option
+from flexroad.pipeline.config.options import PHOTOS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.tasks import TaskError
@@ -34,7 +35,6 @@ from flexroad.tools.prepare.roads import check_roads
 
 cv2 = lazy("cv2")
 
-SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 ON_GPU, ON_CPU = "PatchMatch on the GPU", "semi-global matching on the CPU, as pycolmap has no GPU"
 PIXELS_PER_CELL = 4
 """Width of the smallest useful cell, in pixels of the depth maps."""
@@ -46,10 +46,10 @@ MERGED_AT_ONCE = 5_000_000
 
 @dataclass(frozen=True)
 class PhotosOptions:
-    """The options that only ``prepare photos`` has."""
+    """The options that only photographs have."""
 
     control: Path | None = option(
-        None, INPUTS, "Ground control, CSV: image,x_px,y_px,easting,northing,height.", "FILE"
+        None, PHOTOS, "Ground control, CSV: image,x_px,y_px,easting,northing,height.", "FILE"
     )
     """A column ``name`` is optional."""
     control_crs: str | None = None

@@ -21,6 +21,7 @@ from flexroad.catalog.crs_checks import angle_fault
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
 from flexroad.catalog.guard.open_vector import encoding_note, in_its_encoding, vector_name
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.scan.inputs import MESHES
 from flexroad.catalog.scan.valid_cells import read_valid
 from flexroad.catalog.scan.vectors import VectorFile, layers, listed, opened
 from flexroad.catalog.text import count
@@ -38,7 +39,6 @@ from flexroad.tools.prepare.raster_writer import RasterWriter
 geopandas = lazy("geopandas")
 pyogrio = lazy("pyogrio")
 
-MESHES = (".obj", ".ply", ".glb", ".gltf")
 AREAS = ("Polygon", "MultiPolygon")
 RASTER_BYTES = 4
 """Memory that reading a raster takes, as a multiple of its values: masked, compared and copied."""

@@ -192,9 +192,9 @@ def test_valid_roads_pass_the_check(tmp_path):
     check_roads(PrepareOptions(roads=tmp_path / "out" / "road_mask.tif"))
 
 
-@pytest.mark.parametrize("command", ["points", "mesh", "photos"])
-def test_prepare_checks_roads_before_it_reads_its_input(command, tmp_path):
-    broken = tmp_path / "input"
+@pytest.mark.parametrize("name", ["input.laz", "input.obj", "input.jpg"])
+def test_prepare_checks_roads_before_it_reads_its_input(name, tmp_path):
+    broken = tmp_path / name
     broken.write_text("nothing")
-    words = ("prepare", command, broken, "-o", tmp_path / "out", "--roads", tmp_path / "none.gpkg")
+    words = ("prepare", broken, "-o", tmp_path / "out", "--roads", tmp_path / "none.gpkg")
     assert call(*words).expected(2).errors == [f"error: --roads {tmp_path / 'none.gpkg'} does not exist"]
