@@ -305,8 +305,8 @@ def run(place: Place, config: str, options: Sequence[str], folder: Path) -> flex
     file = folder.with_suffix(".yaml")
     file.write_text(f"extends: {config}\nvariants: {{flexroad: {{}}}}\n")
     chosen = [word for option in options for word in ("--set", option)]
-    call("run", "--config", file, *chosen, "--executor", "serial",
-         "--catalog", place.catalog, "--out", folder, "--allow", place.catalog.anchor)  # fmt: skip
+    call("--allow", place.catalog.anchor, "run", "--config", file, *chosen, "--executor", "serial",
+         "--catalog", place.catalog, "--out", folder)  # fmt: skip
     return flexroad.open_run(folder, allow=[place.catalog.anchor])
 
 

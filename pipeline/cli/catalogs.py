@@ -265,9 +265,7 @@ def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] 
         return f"before a run: {error}"
     # Many catalogs are called catalog.parquet: their folder tells them apart.
     title = path.stem if path.stem != "catalog" else path.absolute().parent.name or "run"
-    words = ["flexroad", "run", "--config", name, *(word for change in changes for word in ("--set", change))]
-    words += ["--catalog", str(path), "--out", f"runs/{title}"]
-    # Of all layers, so that the same options suit `catalog check` and `train`.
-    for folder in needed(catalog, path.parent):
-        words += ["--allow", folder]
-    return f"next: {shlex.join(words)}"
+    # Of all layers, so that the same folders suit `catalog check` and `train`.
+    allow = [word for folder in needed(catalog, path.parent) for word in ("--allow", folder)]
+    words = [*allow, "run", "--config", name, *(word for change in changes for word in ("--set", change))]
+    return f"next: {shlex.join(['flexroad', *words, '--catalog', str(path), '--out', f'runs/{title}'])}"

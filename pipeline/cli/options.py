@@ -22,10 +22,6 @@ def under(heading: str, help: str, *names: str, **more: Any) -> Any:
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run, or its address (s3://...).")]
 OutputFolder = Annotated[Path, under(OUTPUTS, "Output folder.", "-o", "--output", metavar="FOLDER")]
 CatalogFile = Annotated[Path, typer.Argument(metavar="CATALOG", help="Catalog of tiles.")]
-Allow = Annotated[
-    list[str] | None,
-    under(INPUTS, "Allow source files in this folder, too; repeatable.", metavar="FOLDER|URL"),
-]
 TileIds = Annotated[
     list[str] | None, under(TILES, "Only these tiles: --tile ID ID ...", "--tile", metavar="ID")
 ]
@@ -76,6 +72,11 @@ WorkerSettings = Annotated[
         rich_help_panel=WORK,
     ),
 ]
+
+
+def allowed(ctx: typer.Context) -> list[str]:
+    """Return the folders of the program's option ``--allow``."""
+    return ctx.find_root().params["allow"] or []
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:

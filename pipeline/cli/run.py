@@ -75,6 +75,7 @@ StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "as
 @app.command(cls=Command)
 @ignore_write_errors()
 def run(
+    ctx: typer.Context,
     catalog: Annotated[Path, options.under(INPUTS, "Catalog of tiles.", metavar="CATALOG")],
     out: Annotated[
         Path, options.under(OUTPUTS, "Folder of the run; an existing run is resumed.", metavar="RUN")
@@ -86,7 +87,6 @@ def run(
         ),
     ] = "production",
     settings: options.Settings = None,
-    allow: options.Allow = None,
     checksum: Annotated[
         bool, options.under(INPUTS, "Detect changed sources by content, not by size and time.", "--checksum")
     ] = False,
@@ -119,7 +119,7 @@ def run(
     if dry_run:
         chosen = load_config(config, settings or ())
         selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
-        tiles, selected = selection.of(path, source, allow or (), chosen)
+        tiles, selected = selection.of(path, source, options.allowed(ctx), chosen)
         planned = Run.planned(path, chosen, tiles, root, checksum)
         raise typer.Exit(plan(planned, selected.tiles, echo, workers, verbose))
     with _interruptible() as shown:
@@ -132,7 +132,7 @@ def run(
             selection,
             store=root,
             checksum=checksum,
-            allow=allow or (),
+            allow=options.allowed(ctx),
             workers=Workers(executor, workers, scheduler, dashboard),
             observer=shown,
         ) as prepared:
@@ -143,6 +143,7 @@ def run(
 @app.command(cls=Command)
 @ignore_write_errors()
 def rerun(
+    ctx: typer.Context,
     path: options.Run,
     tile: Annotated[
         list[str] | None, options.under(TILES, "These tiles: --tile ID ID ...", metavar="ID")
@@ -155,7 +156,6 @@ def rerun(
         ),
     ] = None,
     settings: options.WorkerSettings = None,
-    allow: options.Allow = None,
     executor: options.Executor = "auto",
     scheduler: Scheduler = None,
 ) -> None:
@@ -172,7 +172,7 @@ def rerun(
             failed=failed,
             from_stage=from_stage,
             settings=settings or (),
-            allow=allow or (),
+            allow=options.allowed(ctx),
             workers=Workers(executor, scheduler=scheduler),
             observer=shown,
         ) as prepared,
@@ -319,15 +319,15 @@ def _exit(shown: Shown) -> None:
 
 @app.command(cls=Command)
 def status(
+    ctx: typer.Context,
     path: options.Run,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
     geojson: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a map of the tile states, for QGIS.")
     ] = None,
-    allow: options.Allow = None,
 ) -> None:
     """Show the state of a run and the failures of its tiles."""
-    opened = Run.open(parse_location(path), allow or ())
+    opened = Run.open(parse_location(path), options.allowed(ctx))
     if geojson is not None:
         write_states(opened, parse_location(geojson))
         echo(str(geojson))

@@ -26,7 +26,7 @@ def folder(real_data, tmp_path_factory):
     roads = autzen / "roads" / "autzen_north_roads.gpkg"
     scan = str(autzen / "autzen_north.laz")
     command(["prepare", scan, "--roads", str(roads), *shlex.split(PREPARE)], path)
-    run = ["run", "--catalog", "data/catalog.parquet", "--out", "run", "--allow", str(roads.parent)]
+    run = ["--allow", str(roads.parent), "run", "--catalog", "data/catalog.parquet", "--out", "run"]
     command(run, path)
     return path
 

@@ -32,6 +32,7 @@ app = group()
 @app.command(cls=Command)
 @options.with_options
 def export(
+    ctx: typer.Context,
     path: options.Run,
     formats: Annotated[
         str,
@@ -78,7 +79,6 @@ def export(
     bbox: options.Box = None,
     area: options.Area = None,
     area_layer: options.AreaLayer = None,
-    allow: options.Allow = None,
     workers: options.Parallel = 1,
 ) -> None:
     """Write finished tiles in the formats of other programs.
@@ -98,7 +98,7 @@ def export(
             parse_location(path),
             tile or (),
             bbox,
-            allow=[str(place) for place in allow or ()],
+            allow=options.allowed(ctx),
             area=Area.read(area, area_layer) if area else None,
             track=track,
         )

@@ -33,6 +33,7 @@ STDIN = Path("-")
 
 @app.command(cls=Command)
 def query(
+    ctx: typer.Context,
     path: options.Run,
     points: Annotated[
         Path | None,
@@ -93,7 +94,6 @@ def query(
             rich_help_panel=OUTPUTS,
         ),
     ] = None,
-    allow: options.Allow = None,
 ) -> None:
     """Print heights, classes and flags at points or along lines.
 
@@ -105,7 +105,7 @@ def query(
     if output is not None and output.suffix.lower() not in (".csv", ".gpkg"):
         raise ConfigError(f"-o {output}: give a name that ends in .csv or .gpkg")
     wanted = _level(level)
-    sampler = RunSampler.open(path, variant, allow or (), earlier=True)
+    sampler = RunSampler.open(path, variant, options.allowed(ctx), earlier=True)
     if line is not None:
         result = along_lines(sampler, read_lines(line, crs, layer, required_crs(sampler)), step, wanted)
     elif points == STDIN:

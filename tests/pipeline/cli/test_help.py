@@ -33,7 +33,7 @@ METAVARS = {
     Path: PATHS,
     str: {
         "NAME", "NAME|FILE", "ID", "KEY=VALUE", "PATTERN", "CRS", "SQL", "ADDRESS", "CMD|URL",
-        "FOLDER|URL", "FILE", "FILE|'X Y, X Y'", "RUN", "N|all",
+        "FILE", "FILE|'X Y, X Y'", "RUN", "N|all",
     },
     datetime: {"YYYY-MM-DD"},
     tuple: {"W S E N", "E N H", "E N"},
