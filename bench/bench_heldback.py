@@ -268,7 +268,7 @@ def places(data: Path | None, roads: Path) -> dict[str, Maker]:
     drawn = data / "autzen" / "roads" / "autzen_north_roads.gpkg"
     found["Autzen north"] = lambda folder, draw: scanned(
         [data / "autzen" / "autzen_north.laz"],
-        ["--roads", drawn, "--roads-layer", "road_polygons", "--roads-where", where],
+        ["--roads", f"{drawn}|layername=road_polygons", "--roads-where", where],
         ["--crs", "EPSG:2994"], folder, draw, FOOT_M, data / "autzen" / "autzen-thin.las",
     )  # fmt: skip
     found["IGN"] = lambda folder, draw: scanned(

@@ -60,8 +60,12 @@ RoadMask = Annotated[str | None, _files("Files of the road mask or land cover.")
 RoadValue = Annotated[
     list[int] | None, _files("Values of the mask that mean road; default: all except 0.", "N")
 ]
-Roads = Annotated[str | None, _files("Vector files of roads: a file, or a pattern relative to ROOT.")]
-RoadsLayer = Annotated[str | None, _files("Layer of the roads, if --roads has several.", "NAME")]
+Roads = Annotated[
+    str | None,
+    _files(
+        "Vector files of roads: a file, or a pattern relative to ROOT; FILE|layername=NAME for one layer."
+    ),
+]
 Crs = Annotated[str | None, _files("CRS of files without one: EPSG:25832.", "CRS")]
 Reproject = Annotated[
     bool, options.under(INPUTS, "Warp rasters in another CRS or in feet when they are read.", "--reproject")
@@ -94,7 +98,6 @@ def catalog_rasters(
     road_mask: RoadMask = None,
     road_value: RoadValue = None,
     roads: Roads = None,
-    roads_layer: RoadsLayer = None,
     reference: Annotated[str | None, _files("Reference heights, for the evaluation.")] = None,
     reference_road: Annotated[str | None, _files("Reference road mask, for the evaluation.")] = None,
     crs: Crs = None,
@@ -131,7 +134,6 @@ def catalog_rasters(
         date=date,
         crs=crs,
         min_cover=min_cover,
-        roads_layer=roads_layer,
         conversion=Conversion(reproject, to_crs, height_unit),
     )
     _write_catalog(result, output, strict)
@@ -147,7 +149,6 @@ def catalog_nrw(
     road_mask: RoadMask = None,
     road_value: RoadValue = None,
     roads: Roads = None,
-    roads_layer: RoadsLayer = None,
     tile_size: TileSize = 250,
     min_cover: MinCover = MIN_COVER,
     date: Date = None,
@@ -167,7 +168,6 @@ def catalog_nrw(
         min_cover=min_cover,
         derived=output.parent / f"{output.stem}_bridges",
         roads=roads,
-        roads_layer=roads_layer,
         reproject=reproject,
     )
     _write_catalog(result, output, strict)

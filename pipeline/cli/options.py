@@ -31,9 +31,13 @@ Box = Annotated[
 ]
 Area = Annotated[
     Path | None,
-    under(TILES, "Only tiles that touch the polygons of this file, in any CRS.", "--area", metavar="FILE"),
+    under(
+        TILES,
+        "Only tiles that touch the polygons of this file, in any CRS; FILE|layername=NAME for one layer.",
+        "--area",
+        metavar="FILE",
+    ),
 ]
-AreaLayer = Annotated[str | None, under(TILES, "Layer of --area, if it has several.", metavar="NAME")]
 Workers = Annotated[int | None, under(WORK, "Worker processes; default: one per core.", min=1, metavar="N")]
 MostWorkers = Annotated[
     int | None,

@@ -98,7 +98,6 @@ def run(
     tile: options.TileIds = None,
     bbox: options.Box = None,
     area: options.Area = None,
-    area_layer: options.AreaLayer = None,
     executor: options.Executor = "auto",
     workers: options.MostWorkers = None,
     scheduler: Scheduler = None,
@@ -118,13 +117,13 @@ def run(
     root = parse_location(store) if store else None
     if dry_run:
         chosen = load_config(config, settings or ())
-        selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
+        selection = Selection(tile or (), bbox, Area.read(area) if area else None)
         tiles, selected = selection.of(path, source, options.allowed(ctx), chosen)
         planned = Run.planned(path, chosen, tiles, root, checksum)
         raise typer.Exit(plan(planned, selected.tiles, echo, workers, verbose))
     with _interruptible() as shown:
         chosen = load_config(config, settings or ())
-        selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
+        selection = Selection(tile or (), bbox, Area.read(area) if area else None)
         with created(
             path,
             source,

@@ -335,10 +335,10 @@ def autzen(data: Path, folder: Path) -> Survey:
     """Return the north of the Autzen survey, with its centre lines."""
     survey, roads = Survey("Autzen", folder / "autzen"), data / "autzen" / "roads" / "autzen_north_roads.gpkg"
     if not (survey.folder / "catalog.parquet").exists():
-        layer = ["--roads", roads, "--roads-layer", "road_polygons", "--roads-where", ROADS]
+        layer = ["--roads", f"{roads}|layername=road_polygons", "--roads-where", ROADS]
         points = data / "autzen" / "autzen_north.laz"
         _flexroad(survey.folder, "prepare", points, "--crs", "EPSG:2994", *layer, "-o", ".")
-    return _exported(survey, "--drape", "--roads", roads, "--roads-layer", "road_centerlines")
+    return _exported(survey, "--drape", "--roads", f"{roads}|layername=road_centerlines")
 
 
 def _exported(survey: Survey, *options: object) -> Survey:

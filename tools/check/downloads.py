@@ -62,7 +62,7 @@ NO_CRS = "it has no CRS: which is it (--crs)?"
 
 LAYERS = ("dsm", "dtm", "road_height", "dop", "road_mask")
 """Layers that rasters are given for."""
-LAYER = "--roads-layer with the layer of the roads"
+LAYER = "|layername=NAME to --roads, in quotes, with the layer of the roads"
 """What to add for a vector file of several layers."""
 
 
@@ -215,7 +215,7 @@ def _vectors(path: Path) -> Download:
     if not any(re.search(ROADS, name.lower()) for name in (path.stem, *layers)):
         unclear = "are these roads? If so, give it with --roads"
         return Download(path, "vector", listed(layers), question=unclear)
-    question = "which layer are the roads (--roads-layer)?" if len(layers) > 1 else ""
+    question = "which layer are the roads (--roads FILE|layername=NAME)?" if len(layers) > 1 else ""
     return Download(path, "roads", listed(layers), question=question)
 
 

@@ -78,7 +78,6 @@ def export(
     tile: options.TileIds = None,
     bbox: options.Box = None,
     area: options.Area = None,
-    area_layer: options.AreaLayer = None,
     workers: options.Parallel = 1,
 ) -> None:
     """Write finished tiles in the formats of other programs.
@@ -86,8 +85,6 @@ def export(
     The same command goes on after an interruption. FOLDER/export.json says what was written.
     """
     chosen = replace(chosen, datum=_datum(vertical, geoid, height_offset))
-    if chosen.roads_layer and not chosen.roads:
-        raise ConfigError("--roads-layer needs --roads; of the catalog, the layer is known")
     folder = parse_location(output)
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)
@@ -99,7 +96,7 @@ def export(
             tile or (),
             bbox,
             allow=options.allowed(ctx),
-            area=Area.read(area, area_layer) if area else None,
+            area=Area.read(area) if area else None,
             track=track,
         )
         if source.left_out:

@@ -39,8 +39,8 @@ def query(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Points: CSV (easting, northing in m), GeoPackage or GeoJSON; - reads a CSV from standard "
-            "input.",
+            help="Points: CSV (easting, northing in m), GeoPackage or GeoJSON, FILE|layername=NAME for one "
+            "layer; - reads a CSV from standard input.",
             rich_help_panel=INPUTS,
         ),
     ] = None,
@@ -62,14 +62,6 @@ def query(
             metavar="CRS",
             help="CRS of the points or the line, if it is another one: EPSG:4326 for degrees. First east, "
             "then north.",
-            rich_help_panel=INPUTS,
-        ),
-    ] = None,
-    layer: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Layer of a vector file; needed if it has several.",
             rich_help_panel=INPUTS,
         ),
     ] = None,
@@ -107,12 +99,12 @@ def query(
     wanted = _level(level)
     sampler = RunSampler.open(path, variant, options.allowed(ctx), earlier=True)
     if line is not None:
-        result = along_lines(sampler, read_lines(line, crs, layer, required_crs(sampler)), step, wanted)
+        result = along_lines(sampler, read_lines(line, crs, required_crs(sampler)), step, wanted)
     elif points == STDIN:
         result = at_points(sampler, parse_csv(sys.stdin.buffer.read(), "standard input", crs), wanted)
     else:
         assert points is not None
-        result = at_points(sampler, read_points(points, crs, layer), wanted)
+        result = at_points(sampler, read_points(points, crs), wanted)
     if output is not None and output.suffix.lower() == ".gpkg":
         result.write_geopackage(output)
     else:
