@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -45,14 +45,6 @@ MostWorkers = Annotated[
 ]
 Parallel = Annotated[
     int, under(WORK, "Worker processes; default: this process alone.", "--workers", min=1, metavar="N")
-]
-Executor = Annotated[
-    Literal["auto", "dask", "serial"],
-    under(
-        WORK,
-        "auto: worker processes if they save more time than their start takes; dask: always; serial: never.",
-        "--executor",
-    ),
 ]
 Dashboard = Annotated[bool, under(WORK, "Serve Dask's dashboard and print its address.", "--dashboard")]
 Verify = Annotated[

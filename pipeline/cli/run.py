@@ -29,7 +29,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES, WORK
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.dask import check_address
-from flexroad.pipeline.run.api import Prepared, Selection, Workers, created, process, reopened
+from flexroad.pipeline.run.api import EXECUTORS, Prepared, Selection, Workers, created, process, reopened
 from flexroad.pipeline.run.collection import write_states
 from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.lock import describe_owner, exit_reason, owner
@@ -47,23 +47,24 @@ SHOWN = 5
 """Tiles to look at that ``status`` names; summary.json has all."""
 
 
-def _address(value: str | None) -> str | None:
-    """Return the address of a scheduler; a wrong one is refused before the catalog is read."""
-    if value is not None:
+def _known(value: str) -> str:
+    """Return the value of ``--executor``; a wrong one is refused before the catalog is read."""
+    if value not in EXECUTORS:
         try:
             check_address(value)
         except ConfigError as error:
-            raise typer.BadParameter(str(error)) from error
+            raise typer.BadParameter(f"{error}, or {', '.join(EXECUTORS)}") from error
     return value
 
 
-Scheduler = Annotated[
-    str | None,
+Executor = Annotated[
+    str,
     options.under(
         WORK,
-        "A running Dask scheduler: tcp://host:8786, tls://host:8786.",
-        metavar="ADDRESS",
-        callback=_address,
+        "auto: worker processes if they save more time than their start takes; dask: always; serial: never; "
+        "tcp://host:8786 or tls://host:8786: a running Dask scheduler.",
+        metavar="auto|dask|serial|ADDRESS",
+        callback=_known,
     ),
 ]
 REPAIR = "repair what was skipped, repeat the `flexroad catalog` command, then `flexroad run`"
@@ -98,9 +99,8 @@ def run(
     tile: options.TileIds = None,
     bbox: options.Box = None,
     area: options.Area = None,
-    executor: options.Executor = "auto",
+    executor: Executor = "auto",
     workers: options.MostWorkers = None,
-    scheduler: Scheduler = None,
     dashboard: options.Dashboard = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print why each tile would be computed, and what would fail.")
@@ -132,7 +132,7 @@ def run(
             store=root,
             checksum=checksum,
             allow=options.allowed(ctx),
-            workers=Workers(executor, workers, scheduler, dashboard),
+            workers=Workers(executor, workers, dashboard),
             observer=shown,
         ) as prepared:
             _process(prepared, verify, shown)
@@ -155,8 +155,7 @@ def rerun(
         ),
     ] = None,
     settings: options.WorkerSettings = None,
-    executor: options.Executor = "auto",
-    scheduler: Scheduler = None,
+    executor: Executor = "auto",
 ) -> None:
     """Bring tiles of a run up to date again.
 
@@ -172,7 +171,7 @@ def rerun(
             from_stage=from_stage,
             settings=settings or (),
             allow=options.allowed(ctx),
-            workers=Workers(executor, scheduler=scheduler),
+            workers=Workers(executor),
             observer=shown,
         ) as prepared,
     ):

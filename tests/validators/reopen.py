@@ -344,7 +344,7 @@ def autzen(data: Path, folder: Path) -> Survey:
 def _exported(survey: Survey, *options: object) -> Survey:
     """Run and export a survey."""
     _flexroad(survey.folder, "run", "--catalog", "catalog.parquet", "--out", "run")
-    formats = ["--format", FORMATS, "--height-offset", OFFSET_M, *options]
+    formats = ["--format", FORMATS, "--vertical", OFFSET_M, *options]
     _flexroad(survey.folder, "export", "run", *formats, "-o", "out")
     return survey
 

@@ -164,11 +164,19 @@ class Datum:
     value: str
     """The vertical CRS (EPSG:7837), the file of a geoid (GTX or GeoTIFF), or a number of metres."""
 
+    @classmethod
+    def of(cls, text: str) -> Datum:
+        """Return the datum that a user names: by a number of metres, the file of a geoid, or a CRS."""
+        try:
+            return cls("offset", f"{float(text):g}")
+        except ValueError:
+            return cls("geoid" if text.lower().endswith((".gtx", ".tif", ".tiff")) else "crs", text)
+
     def __post_init__(self) -> None:
         if self.kind == "geoid" and not Path(self.value).is_file():
-            raise CatalogError(f"--geoid {self.value} does not exist")
+            raise CatalogError(f"--vertical {self.value} does not exist")
         if self.kind == "offset" and not np.isfinite(float(self.value)):
-            raise CatalogError(f"--height-offset {self.value} is no number of metres")
+            raise CatalogError(f"--vertical {self.value} is no number of metres")
 
     @property
     def text(self) -> str:
@@ -207,7 +215,7 @@ class Ellipsoidal:
     def _failure(self, reason: str) -> str:
         return (
             f"no exact conversion from {short(self.crs)} and {self.datum.text} to the ellipsoid of WGS 84: "
-            f"{reason}; give the geoid's grid with --geoid FILE, or a constant with --height-offset"
+            f"{reason}; give the geoid's grid with --vertical FILE, or a constant with --vertical METRES"
         )
 
 

@@ -32,8 +32,8 @@ METAVARS = {
     float: {"METRES", "SHARE", "NUMBER", "PERCENT"},
     Path: PATHS,
     str: {
-        "NAME", "NAME|FILE", "ID", "KEY=VALUE", "PATTERN", "CRS", "SQL", "ADDRESS", "CMD|URL",
-        "FILE", "FILE|'X Y, X Y'", "RUN", "N|all",
+        "NAME", "NAME|FILE", "ID", "KEY=VALUE", "PATTERN", "CRS", "SQL", "auto|dask|serial|ADDRESS",
+        "CRS|FILE|METRES", "FILE", "FILE|'X Y, X Y'", "RUN", "N|all",
     },
     datetime: {"YYYY-MM-DD"},
     tuple: {"W S E N", "E N H", "E N"},
@@ -101,7 +101,7 @@ def test_help_lists_options_under_headings():
     page = command.get_help(command.make_context("run", [], resilient_parsing=True))
     headings = re.findall(r"^(\w.*):$", page, re.MULTILINE)
     assert headings == ["Inputs", "Tiles", "Outputs", "Parallel work", "Options"]
-    assert page.index("Parallel work:") < page.index("--executor <auto|dask|serial>")
+    assert page.index("Parallel work:") < page.index("--executor auto|dask|serial|ADDRESS")
 
 
 def test_rerun_from_offers_every_stage():

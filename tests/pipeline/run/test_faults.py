@@ -127,7 +127,7 @@ def test_run_scheduler_killed_keeps_done_tiles(
 
     monkeypatch.setattr(EventLog, "tile", kill)
     words = ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out]
-    said = flexroad("run", *words, "--scheduler", processes.address)
+    said = flexroad("run", *words, "--executor", processes.address)
     assert said.code == 1
     name = f"the Dask scheduler at {processes.address}"
     assert said.errors == [f"error: {name} is gone; the same command goes on from here"]
