@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from flexroad.catalog.errors import CatalogError
@@ -44,12 +44,21 @@ def recognised(inputs: Collection[Path]) -> tuple[str, list[Path]]:
             for kinds, path in examples.items()
         )
         raise CatalogError(f"{', '.join(found)}; give inputs of one kind: {ACCEPTED}")
-    places: Sequence[Path] = [*inputs]
-    if kind == "mesh":
-        places = [file for path in inputs for file in _files(path) if file.suffix.lower() in MESHES]
+    places = files_of(inputs, kind) if kind == "mesh" else [*inputs]
     if kind in ("mesh", "odm") and len(places) > 1:
         raise CatalogError(f"{some([str(path) for path in places])}: give {TITLES[kind]} alone")
-    return kind, [*places]
+    return kind, places
+
+
+def files_of(inputs: Iterable[Path], kind: str) -> list[Path]:
+    """Return files, and of folders the files of a kind, each once."""
+    files: dict[Path, None] = {}
+    for path in inputs:
+        inside = [file for file in _files(path) if file == path or file.suffix.lower() in SUFFIXES[kind]]
+        if not inside:
+            raise CatalogError(f"{path} has no {TITLES[kind]} ({', '.join(SUFFIXES[kind])})")
+        files.update(dict.fromkeys(inside))
+    return [*files]
 
 
 def _files(path: Path) -> list[Path]:

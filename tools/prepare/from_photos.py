@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.scan.inputs import PHOTOS as SUFFIXES
+from flexroad.catalog.scan.inputs import files_of
 from flexroad.catalog.text import some
 from flexroad.pipeline.config.options import PHOTOS, option
 from flexroad.pipeline.errors import ConfigError
@@ -95,7 +95,9 @@ def prepare_photos(
     """
     check_roads(common)
     sfm.colmap()
-    files = _files(images)
+    files = files_of(images, "photos")
+    if strange := [file for file in files if not file.is_file()]:
+        raise ConfigError(f"{strange[0]} is not a file; leave it out")
     placed = place_photos([read_shot(path) for path in files], common.to_crs)
     control = photos_options.control and read_control(
         photos_options.control, placed, photos_options.control_crs
@@ -133,23 +135,6 @@ def prepare_photos(
         )
         published = publish_mesh(mesh, source, out, common, mesh_options, options, executor, log)
     return published.with_notes(*notes)
-
-
-def _files(images: Iterable[Path]) -> list[Path]:
-    files: dict[Path, None] = {}
-    for path in images:
-        if not path.exists():
-            raise ConfigError(f"{path} does not exist")
-        inside = (
-            sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
-        )
-        if not inside:
-            raise ConfigError(f"{path} has no photographs ({', '.join(SUFFIXES)})")
-        strange = next((file for file in inside if not file.is_file()), None)
-        if strange is not None:
-            raise ConfigError(f"{strange} is not a file; leave it out")
-        files.update(dict.fromkeys(inside))
-    return list(files)
 
 
 def _cameras(placed: PlacedPhotos) -> str:
