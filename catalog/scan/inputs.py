@@ -37,13 +37,14 @@ def recognised(inputs: Collection[Path]) -> tuple[str, list[Path]]:
     examples: dict[tuple[str, ...], Path] = {}
     for path in inputs:
         examples.setdefault(_kinds(path), path)
-    kind, *others = {kind for kinds in examples for kind in kinds} or ("",)
-    if others or () in examples:
+    known = {kind for kinds in examples for kind in kinds}
+    if len(known) != 1 or () in examples:
         found = (
             f"{path} has {' and '.join(TITLES[kind] for kind in kinds) or 'no known input'}"
             for kinds, path in examples.items()
         )
         raise CatalogError(f"{', '.join(found)}; give inputs of one kind: {ACCEPTED}")
+    (kind,) = known
     places = files_of(inputs, kind) if kind == "mesh" else [*inputs]
     if kind in ("mesh", "odm") and len(places) > 1:
         raise CatalogError(f"{some([str(path) for path in places])}: give {TITLES[kind]} alone")

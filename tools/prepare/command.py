@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -30,7 +30,6 @@ from flexroad.tools.prepare.output import check_replaced, disk_errors
 from flexroad.tools.prepare.photos import mvs_cpu, sfm
 from flexroad.tools.prepare.points import ground_filter, morphological
 from flexroad.tools.prepare.points.to_rasters import Options
-from flexroad.tools.prepare.raster_writer import PreparedDataset
 
 app = group()
 
@@ -74,6 +73,15 @@ class _Options:
             return Options(ground="morphological", morphological=morphological.Options(**given), **classes)
         return Options(ground="filter", filter=ground_filter.Options(**given), **classes)
 
+    def of_photos(self, photos: from_photos.PhotosOptions) -> from_photos.PhotosOptions:
+        """Return the options of photographs with the sizes."""
+        return replace(
+            photos,
+            sfm=sfm.Options(**_given(image_size=self.image_size)),
+            stereo=mvs_cpu.Options(**_given(size=self.stereo_size)),
+            **_given(patchmatch_size=self.stereo_size),
+        )
+
 
 def _given(**options: Any) -> dict[str, Any]:
     """Return the options that are not None; the others keep the defaults of their models."""
@@ -85,31 +93,21 @@ def _log(line: str) -> None:
 
 
 @contextlib.contextmanager
-def _held(out: Path) -> Iterator[None]:
-    """Make the output folder, check that it can be written, and hold its lock; no empty one is left."""
+def _making(out: Path) -> Iterator[None]:
+    """Make the output folder and hold its lock; a failure or an interruption leaves no files behind."""
     check_replaced(out)
-    with contextlib.ExitStack() as stack:
-        with disk_errors(out):
-            stack.enter_context(made_folder(out))
-            check_writable(out)
-        stack.enter_context(run_lock(out, lambda line: _log(f"note: {line}")))
-        yield
-
-
-def _run(out: Path, make: Callable[[], PreparedDataset]) -> None:
-    """Run a command and print its result; an interruption leaves no files behind."""
     try:
-        with _held(out):
-            dataset = make()
+        with contextlib.ExitStack() as stack:
+            with disk_errors(out):
+                stack.enter_context(made_folder(out))
+                check_writable(out)
+            stack.enter_context(run_lock(out, lambda line: _log(f"note: {line}")))
+            yield
     except TaskError as error:
         raise ConfigError(str(error)) from error
     except KeyboardInterrupt:
         echo("interrupted; nothing was written", err=True)
         raise typer.Exit(INTERRUPTED) from None
-    for note in dataset.notes:
-        echo(f"note: {note}", err=True)
-    echo(f"{count(dataset.tiles, 'tile')} in {dataset.catalog}")
-    echo(after_catalog(dataset.catalog))
 
 
 def _check_options(ctx: typer.Context, kind: str, source: Path) -> None:
@@ -153,21 +151,20 @@ def prepare(
         kind, paths = from_odm.found(paths[0])
     _check_options(ctx, kind, paths[0])
     rasters = chosen.of_rasters()
-
-    def make() -> PreparedDataset:
-        executor = SerialExecutor() if workers == 1 else DaskExecutor(workers)
+    executor = SerialExecutor() if workers == 1 else DaskExecutor(workers)
+    with _making(output):
         if kind == "odm":
-            return from_odm.prepare_odm(paths[0], output, common, rasters, _log)
-        if kind == "mesh":
-            return from_mesh.prepare_mesh(paths[0], output, common, mesh_options, rasters, executor, _log)
-        if kind == "points":
-            return from_points.prepare_points(paths, output, common, rasters, executor, _log, chosen.ground)
-        sizes = replace(
-            photos_options,
-            sfm=sfm.Options(**_given(image_size=chosen.image_size)),
-            stereo=mvs_cpu.Options(**_given(size=chosen.stereo_size)),
-            **_given(patchmatch_size=chosen.stereo_size),
-        )
-        return from_photos.prepare_photos(paths, output, common, sizes, rasters, executor, _log)
-
-    _run(output, make)
+            dataset = from_odm.prepare_odm(paths[0], output, common, rasters, _log)
+        elif kind == "mesh":
+            dataset = from_mesh.prepare_mesh(paths[0], output, common, mesh_options, rasters, executor, _log)
+        elif kind == "points":
+            dataset = from_points.prepare_points(
+                paths, output, common, rasters, executor, _log, chosen.ground
+            )
+        else:
+            sizes = chosen.of_photos(photos_options)
+            dataset = from_photos.prepare_photos(paths, output, common, sizes, rasters, executor, _log)
+    for note in dataset.notes:
+        _log(f"note: {note}")
+    echo(f"{count(dataset.tiles, 'tile')} in {dataset.catalog}")
+    echo(after_catalog(dataset.catalog))
