@@ -10,21 +10,13 @@ from flexroad.catalog.text import some
 
 POINTS = (".las", ".laz")
 MESHES = (".obj", ".ply", ".glb", ".gltf")
-PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-SUFFIXES = {"points": POINTS, "mesh": MESHES, "photos": PHOTOS}
+SUFFIXES = {"points": POINTS, "mesh": MESHES, "photos": (".jpg", ".jpeg", ".png", ".tif", ".tiff")}
 """Kind of input -> endings of its files."""
+TITLES = {"points": "point clouds", "mesh": "a mesh", "photos": "photographs", "odm": "an ODM project"}
+ACCEPTED = ", ".join(f"{TITLES[kind]} ({', '.join(endings)})" for kind, endings in SUFFIXES.items())
+ACCEPTED += ", folders of them, or the folder of an OpenDroneMap project"
 PROJECT = ("odm_dem", "odm_orthophoto", "odm_georeferencing", "odm_texturing")
 """Folders of an OpenDroneMap project."""
-TITLES = {
-    "points": "point clouds",
-    "mesh": "a mesh",
-    "odm": "an OpenDroneMap project",
-    "photos": "photographs",
-}
-ACCEPTED = (
-    f"point clouds ({', '.join(POINTS)}), a mesh ({', '.join(MESHES)}), photographs ({', '.join(PHOTOS)}), "
-    f"folders of them, or the folder of an OpenDroneMap project"
-)
 
 
 def is_project(folder: Path) -> bool:

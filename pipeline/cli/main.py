@@ -119,10 +119,7 @@ def _show_version(wanted: bool) -> None:
 def _root(
     allow: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="FOLDER|URL",
-            help="Allow source files in this folder, too; before the command; repeatable.",
-        ),
+        typer.Option(metavar="FOLDER|URL", help="Allow source files in this folder, too; repeatable."),
     ] = None,
     version: Annotated[
         bool,
