@@ -47,7 +47,7 @@ TRUE_SURVEY := $(REPRODUCED)/survey/catalog_true.parquet
 LITERAL_SURVEY := $(if $(GEROD_ROOT),$(SURVEY),runs/synthetic-$(LITERAL_TILES)-$(SEED)/survey/catalog.parquet)
 RESULTS ?= $(REPRODUCED)/results
 # The published dataset lies elsewhere than its catalog; an archive is unpacked beside itself.
-ABLATE = $(BIN)/flexroad run $(if $(GEROD_ROOT),--allow $(GEROD_ROOT:.zip=)) --store $(REPRODUCED)/store
+ABLATE = $(BIN)/flexroad $(if $(GEROD_ROOT),--allow $(GEROD_ROOT:.zip=)) run --store $(REPRODUCED)/store
 # DSC3D cannot be had as rasters: five synthetic scenes stand in for it, by the paper's reference and by the truth.
 STANDIN := runs/standin-$(SEED)
 SCENES := $(STANDIN)/scenes/catalog.parquet

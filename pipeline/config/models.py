@@ -65,7 +65,7 @@ DEFAULT_MEMORY_BYTES = 4 * 1024**3
 
 
 class Cluster(Options):
-    """The workers that process the tiles; `--workers` and `--scheduler` override it for one command."""
+    """The workers that process the tiles; `--workers` and `--executor` override it for one command."""
 
     kind: Literal["local", "slurm"] = Field(
         "local",
@@ -95,8 +95,8 @@ class Cluster(Options):
     security: Literal["tls", "none"] = Field(
         "tls",
         description="tls: scheduler and workers answer only processes with certificates made for this "
-        "command; none: whoever reaches their ports can run programs as you; for --scheduler "
-        "Dask's own configuration counts",
+        "command; none: whoever reaches their ports can run programs as you; for a running "
+        "scheduler Dask's own configuration counts",
     )
     flush: bool = Field(
         True,

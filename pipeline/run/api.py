@@ -14,7 +14,7 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from flexroad.catalog import Bounds, Catalog, Tile
 from flexroad.catalog.area import Area
@@ -41,7 +41,7 @@ from flexroad.pipeline.run.status import open_database, recorded, tile_files
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import FAILED
 
-Kind = Literal["auto", "serial", "dask"]
+EXECUTORS = ("auto", "serial", "dask")
 SECTION = "cluster"
 
 
@@ -49,12 +49,11 @@ SECTION = "cluster"
 class Workers:
     """Where tiles are processed."""
 
-    executor: Kind = "auto"
-    """auto: worker processes if they pay; serial: this process; dask: workers."""
+    executor: str = "auto"
+    """auto: worker processes if they pay; serial: this process; dask: workers; else the address of a running
+    Dask scheduler, whose workers are used."""
     number: int | None = None
     """Most worker processes; None: as the configuration says."""
-    scheduler: str | None = None
-    """Address of a running Dask scheduler, whose workers are used; None: workers are started."""
     dashboard: bool = False
     """Whether Dask's dashboard is served."""
 
@@ -297,10 +296,8 @@ def _executor(run: Run, workers: Workers, died: bool, observer: Observer) -> Exe
         return SerialExecutor()
     cluster = run.config.cluster
     logs = run.path.resolve() / "logs" if isinstance(run.path, Path) else None
-    parallel = DaskExecutor(
-        workers.number, workers.scheduler, cluster, workers.dashboard, observer.line, logs
-    )
-    needed = workers.scheduler or workers.dashboard or cluster.needs_workers
-    if workers.executor == "dask" or died or needed:
+    scheduler = None if workers.executor in EXECUTORS else workers.executor
+    parallel = DaskExecutor(workers.number, scheduler, cluster, workers.dashboard, observer.line, logs)
+    if workers.executor != "auto" or died or workers.dashboard or cluster.needs_workers:
         return parallel
     return AdaptiveExecutor(workers.number or cluster.workers, parallel, observer.line)

@@ -145,7 +145,7 @@ class Run:
         origin = (old or read_summary(path)).get("origin")
         if not origin:
             origin = [min(axis) for axis in zip(*(tile.grid.origin for tile in catalog.usable), strict=True)]
-        store = store or _store(old, path, "--store")
+        store = store or _store(old, path, "add --store")
         exported = _exported(old, config)
         origin = (origin[0], origin[1])
         folders, collection = folders_of(catalog), _collection(old, path)
@@ -165,7 +165,7 @@ class Run:
             raise ConfigError(
                 f"{path} is no run: run.json is missing or damaged; make one with `flexroad run --out {path}`"
             )
-        store = _store(record, path, "--allow", allow)
+        store = _store(record, path, "begin with flexroad --allow", allow)
         config = _config(path / "config.yaml").model_copy(update={"name": record["config"]})
         listed = record.get("allowed", [])
         allowed = tuple(listed) if sealed(listed, record.get("seal")) else ()
@@ -332,8 +332,8 @@ def versions() -> dict[str, str]:
     return by_name
 
 
-def _store(record: dict[str, Any] | None, run: Location, option: str, allow: Sequence[Any] = ()) -> Location:
-    """Return the store of a run; one outside its folder must be sealed or allowed (`option`)."""
+def _store(record: dict[str, Any] | None, run: Location, remedy: str, allow: Sequence[Any] = ()) -> Location:
+    """Return the store of a run; one outside its folder must be sealed or allowed (`remedy`)."""
     if record is None or not record["shared_store"]:
         return run / "store"
     named = str(record["store"])
@@ -341,7 +341,7 @@ def _store(record: dict[str, Any] | None, run: Location, option: str, allow: Seq
     if not permitted and not sealed({"store": named}, record.get("store_seal")):
         raise ConfigError(
             f"{run} has its store in {named}, which this user has not given on this machine; if it is right, "
-            f"add {option} {shlex.quote(named)}"
+            f"{remedy} {shlex.quote(named)}"
         )
     return parse_location(named)
 

@@ -39,7 +39,7 @@ def test_file_outside_folder_raises_error_with_option(tmp_path, file, allow):
     option = f"--allow {allow.format(tmp_path / 'dsm')}"
     with pytest.raises(CatalogError, match="^tile one: dsm names ") as caught:
         check(tile_catalog, home)
-    assert str(caught.value).endswith(f"to allow it, add {option}")
+    assert str(caught.value).endswith(f"to allow it, begin with flexroad {option}")
     (folder,) = needed(tile_catalog, AllowedFolders.of(home))
     assert folder in option
     check(tile_catalog, home, [folder])
@@ -90,7 +90,7 @@ def test_link_in_folder_that_leads_out_needs_allow(tmp_path, file):
     (home / "link.tif").symlink_to(data / "a.tif")
     tile_catalog = catalog("inside.tif", file, root=home)
     target = data / file.rpartition("/")[2].replace("link", "a")
-    line = f"^tile one: dsm names .*, by a link {target}, outside .*; to allow it, add --allow {data}$"
+    line = f"^tile one: dsm names .*, by a link {target}, outside .*; .* begin with flexroad --allow {data}$"
     with pytest.raises(CatalogError, match=line):
         check(tile_catalog, home)
     assert needed(tile_catalog, AllowedFolders.of(home)) == (str(data),)

@@ -52,7 +52,7 @@ def test_address_with_credentials_is_refused_without_them(take, monkeypatch):
     assert "wJalr" not in str(raised.value)
 
 
-@pytest.mark.parametrize("place", ["--catalog", "--out", "--store", "--scheduler"])
+@pytest.mark.parametrize("place", ["--catalog", "--out", "--store", "--executor"])
 def test_commands_show_no_credentials(flexroad, survey, tmp_path, place):
     words = {"--catalog": survey, "--out": tmp_path / "run"}
     words[place] = f"s3://AKIA:{SECRET}@bucket/x"

@@ -42,7 +42,7 @@ SAME = ("variant", "crs", "tiles", "results")
 """Entries of the manifest that two exports into one folder have in common if both are of the same results."""
 DATUM_REMEDY = (
     "needs heights above the ellipsoid of WGS 84, and the heights of a run are above a vertical datum; say "
-    "which: --vertical EPSG:N (PROJ needs its grid), --geoid FILE (.gtx or .tif), or --height-offset METRES"
+    "which: --vertical EPSG:N (PROJ needs its grid), --vertical FILE (.gtx or .tif), or --vertical METRES"
 )
 MANIFEST = "export.json"
 BEGUN = ".flexroad-export"

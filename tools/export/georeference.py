@@ -142,11 +142,19 @@ class Datum:
     value: str
     """The vertical CRS (EPSG:7837), the file of a geoid (GTX or GeoTIFF), or a number of metres."""
 
+    @classmethod
+    def of(cls, text: str) -> Datum:
+        """Return the datum that a user names: by a number of metres, the file of a geoid, or a CRS."""
+        try:
+            return cls("offset", f"{float(text):g}")
+        except ValueError:
+            return cls("geoid" if text.lower().endswith((".gtx", ".tif", ".tiff")) else "crs", text)
+
     def __post_init__(self) -> None:
         if self.kind == "geoid" and not Path(self.value).is_file():
-            raise CatalogError(f"--geoid {self.value} does not exist")
+            raise CatalogError(f"--vertical {self.value} does not exist")
         if self.kind == "offset" and not np.isfinite(float(self.value)):
-            raise CatalogError(f"--height-offset {self.value} is no number of metres")
+            raise CatalogError(f"--vertical {self.value} is no number of metres")
 
     @property
     def text(self) -> str:
@@ -178,7 +186,7 @@ class Datum:
             reason = str(error)
         raise CatalogError(
             f"no exact conversion from {short(crs)} and {self.text} to the ellipsoid of WGS 84: {reason}; "
-            "give the geoid's grid with --geoid FILE, or a constant with --height-offset"
+            "give the geoid's grid with --vertical FILE, or a constant with --vertical METRES"
         )
 
 

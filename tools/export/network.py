@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, union
-from flexroad.catalog.scan.vectors import opened
+from flexroad.catalog.scan.vectors import file_and_layer, opened
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import types
@@ -98,7 +97,7 @@ def _read(source: Source, options: Options) -> CentreLines:
     """Return the centre lines whose boxes touch the tiles."""
     stage = source.run.config.chains[source.variant]["segment"]
     if options.roads is not None:
-        file = _given(Path(options.roads), options.roads_layer, source.crs)
+        file = _given(options.roads, source.crs)
         places = {file: union([tile.grid.bounds for tile in source.tiles])}
         chosen = rasterise.Options()
     else:
@@ -111,8 +110,9 @@ def _read(source: Source, options: Options) -> CentreLines:
         raise ConfigError(str(error)) from error
 
 
-def _given(path: Path, sublayer: str | None, crs: str) -> types.Source:
+def _given(roads: str, crs: str) -> types.Source:
     """Return the file that the user names."""
+    path, sublayer = file_and_layer(roads)
     if not path.is_file():
         raise ConfigError(f"--roads {path}: no such file; name a vector file of centre lines")
     try:

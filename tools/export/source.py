@@ -50,10 +50,9 @@ class Options:
     roads: str | None = option(
         None,
         INPUTS,
-        "Centre lines for crg, xodr and lines; default: the roads of the run's catalog.",
+        "Centre lines for crg, xodr and lines, FILE|layername=NAME for one layer; default: the catalog's.",
         "FILE",
     )
-    roads_layer: str | None = option(None, INPUTS, "Layer of --roads, if it has several.", "NAME")
     left_hand: bool = option(False, INPUTS, "Traffic keeps left, for xodr.")
     formats: frozenset[str] = frozenset()
     """Names of the formats that are written together: some refer to files of other formats."""

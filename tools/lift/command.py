@@ -25,6 +25,7 @@ app = group()
 @app.command(cls=Command)
 @options.with_options
 def lift(
+    ctx: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Road network or features without heights.")],
     path: options.Run,
     output: Annotated[
@@ -63,7 +64,6 @@ def lift(
         bool,
         typer.Option("--allow-steps", help="End with exit code 0 although the tiles below do not meet."),
     ] = False,
-    allow: options.Allow = None,
 ) -> None:
     """Write a road network or features with heights of a run.
 
@@ -76,7 +76,7 @@ def lift(
     if report is None and (grade, crossfall) != (None, None):
         raise ConfigError("places above limits are written beside the report; give --report FILE.csv")
     wanted = replace(wanted, grade_limit=grade, crossfall_limit=crossfall)
-    ground = RunSampler.open(path, allow=allow or (), earlier=True)
+    ground = RunSampler.open(path, allow=options.allowed(ctx), earlier=True)
     result = lift_file(ground, file, output, wanted, crs, offset, report)
     echo(f"{output}: {result.summary}")
     if result.earlier:

@@ -208,7 +208,7 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int) -> Path:
     """Write the stand-in for DSC3D; return the path of the catalog with the paper's reference.
 
     The folder of a scene contains ``mesh.glb``, its true layers (``known/<layer>/<scene>.tif``), and the
-    rasters and catalog that ``prepare mesh`` writes. In the folder above are the catalogs of all scenes.
+    rasters and catalog that ``prepare`` writes. In the folder above are the catalogs of all scenes.
 
     - `scenes`: number of scenes; all five if None.
     """

@@ -143,7 +143,5 @@ def test_formats_that_cannot_be_written_are_refused_before_any_work():
         check_formats([], OPTIONS)
     with pytest.raises(ConfigError, match="--format gltf is unknown; known are 3dtiles, landxml"):
         check_formats(["landxml", "gltf"], OPTIONS)
-    with pytest.raises(
-        ConfigError, match="3dtiles needs heights above the ellipsoid .*--height-offset METRES"
-    ):
+    with pytest.raises(ConfigError, match="3dtiles needs heights above the ellipsoid .*--vertical METRES"):
         check_formats(["3dtiles"], Options())

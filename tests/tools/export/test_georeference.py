@@ -122,12 +122,12 @@ def test_geoid_is_added_at_each_place(geoid):
 
 
 def test_geoid_that_does_not_cover_the_area_raises(geoid):
-    with pytest.raises(CatalogError, match=r"no exact conversion from EPSG:25833 .*--geoid FILE"):
+    with pytest.raises(CatalogError, match=r"no exact conversion from EPSG:25833 .*--vertical FILE"):
         Datum("geoid", str(geoid)).geographic("EPSG:25833", *POINT)
 
 
 def test_vertical_crs_without_its_grid_raises_and_is_not_ignored():
-    with pytest.raises(CatalogError, match=r"heights of EPSG:7837 .*; give the geoid's grid with --geoid"):
+    with pytest.raises(CatalogError, match=r"heights of EPSG:7837 .*; give the geoid's grid with --vertical"):
         Datum("crs", "EPSG:7837").geographic("EPSG:25832", *POINT)
 
 
@@ -145,7 +145,13 @@ def test_geocentric_agrees_with_the_equations_of_the_ellipsoid():
     np.testing.assert_allclose(geocentric(longitude, latitude, height)[0], np.ravel(expected), atol=1e-6)
 
 
-@pytest.mark.parametrize(("kind", "value"), [("geoid", "none.gtx"), ("offset", "nan")])
-def test_datum_that_cannot_be_used_raises(kind, value):
-    with pytest.raises(CatalogError, match=value):
-        Datum(kind, value)
+@pytest.mark.parametrize("value", ["none.gtx", "nan"])
+def test_datum_that_cannot_be_used_raises(value):
+    with pytest.raises(CatalogError, match=f"--vertical {value}"):
+        Datum.of(value)
+
+
+def test_datum_is_a_number_a_geoid_or_a_crs(geoid):
+    assert Datum.of("-47.50") == Datum("offset", "-47.5")
+    assert Datum.of(str(geoid)) == Datum("geoid", str(geoid))
+    assert Datum.of("EPSG:7837") == Datum("crs", "EPSG:7837")
