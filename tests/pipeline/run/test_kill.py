@@ -130,7 +130,7 @@ def test_run_scheduler_killed_keeps_done_tiles(processes, words, flexroad, monke
         scheduler.kill()
 
     monkeypatch.setattr(EventLog, "tile", kill)
-    said = flexroad(*words, "--scheduler", processes.address).expected(1)
+    said = flexroad(*words, "--executor", processes.address).expected(1)
     name = f"the Dask scheduler at {processes.address}"
     assert said.errors == [f"error: {name} is gone; the same command goes on from here"]
     told = json.loads((out / "summary.json").read_text())
@@ -215,7 +215,7 @@ def run(flexroad, processes, words, places, monkeypatch):
     """The command that runs the survey on the workers."""
     monkeypatch.setattr("flexroad.pipeline.execute.clusters.WORKER_LOST_TIMEOUT_S", 1)
     processes.scheduler()
-    return lambda: flexroad(*words, "--scheduler", processes.address)
+    return lambda: flexroad(*words, "--executor", processes.address)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from flexroad.catalog.storage.paths import parse_location, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run import lock
-from flexroad.pipeline.run.lock import Heartbeat, Owner, describe_owner, owner, run_lock, started
+from flexroad.pipeline.run.lock import Owner, describe_owner, owner, run_lock, started
 from flexroad.pipeline.run.lock_file import InBucket
 from tests.faulty_files import intercepted
 from tests.power_loss import Recording, states
@@ -28,7 +28,7 @@ with run_lock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
 """
-QUICK = Heartbeat(interval_s=0.05, stale_s=0.5)
+QUICK = {"interval_s": 0.05, "stale_s": 0.5}
 ELSEWHERE = Owner("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
 
 
@@ -47,10 +47,10 @@ def write_lock(folder, holder: Owner, age_s: float = 0.0) -> None:
     os.utime(folder / "lock.json", (modified, modified))
 
 
-def take_lock(folder, heartbeat: Heartbeat = QUICK) -> list[str]:
+def take_lock(folder, times: dict[str, float] = QUICK) -> list[str]:
     """Take and release the lock; return its messages."""
     messages: list[str] = []
-    with run_lock(folder, messages.append, heartbeat):
+    with run_lock(folder, messages.append, **times):
         assert owner(folder).pid == os.getpid()
     assert not (folder / "lock.json").exists()
     return messages
@@ -89,20 +89,8 @@ UPTIME_S, LONG_AGO_S = lock._uptime_s(), 86400.0
 OTHER_BOOT = replace(ME, boot="other", **GONE)
 REFUSED = {
     "the process lives": (ME, LONG_AGO_S, QUICK, UPTIME_S, "is in use by pid"),
-    "same image, this one started long ago": (
-        OTHER_BOOT,
-        20,
-        Heartbeat(),
-        LONG_AGO_S,
-        "life 20 s ago; if it is",
-    ),
-    "same image, this one started just now": (
-        OTHER_BOOT,
-        20,
-        Heartbeat(),
-        5.0,
-        "life 20 s ago; if it is dead",
-    ),
+    "same image, this one started long ago": (OTHER_BOOT, 20, {}, LONG_AGO_S, "life 20 s ago; if it is dead"),
+    "same image, this one started just now": (OTHER_BOOT, 20, {}, 5.0, "life 20 s ago; if it is dead"),
     "another container": (
         replace(ME, machine="m pid:[2]", **GONE),
         0,
@@ -117,11 +105,11 @@ TAKEN_OVER = {
     "number of another": (replace(ME, start=1), -3600, QUICK, UPTIME_S, "its number was given to another"),
     "process gone": (replace(ME, **GONE), -3600, QUICK, UPTIME_S, "that process is gone"),
     "clock set back": (ELSEWHERE, -LONG_AGO_S, QUICK, UPTIME_S, "no sign of life for"),
-    "restarted": (replace(ME, boot="before"), UPTIME_S + 100, Heartbeat(30, 1e9), UPTIME_S, "was restarted"),
+    "restarted": (replace(ME, boot="before"), UPTIME_S + 100, {"stale_s": 1e9}, UPTIME_S, "was restarted"),
     "same image": (replace(ME, boot="other"), 400, QUICK, LONG_AGO_S, "no sign of life for 400 s"),
     "another machine": (ELSEWHERE, 400, QUICK, UPTIME_S, "pid 4711 on node7: no sign of life for 400 s"),
 }
-"""Owner, age of the lock (s), heartbeat, time since this machine was started (s), and part of the message.
+"""Owner, age of the lock (s), times of renewal, uptime of this machine (s), and part of the message.
 
 A machine of the same image has the name of this one. The process table decides if it can, not the age.
 """
@@ -129,19 +117,19 @@ A machine of the same image has the name of this one. The process table decides 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_lock_of_an_owner_that_may_be_alive_is_refused(name, tmp_path, monkeypatch):
-    holder, age_s, heartbeat, uptime_s, message = REFUSED[name]
+    holder, age_s, times, uptime_s, message = REFUSED[name]
     monkeypatch.setattr(lock, "_uptime_s", lambda: uptime_s)
     write_lock(tmp_path, holder, age_s)
     with pytest.raises(ConfigError, match=message):
-        take_lock(tmp_path, heartbeat)
+        take_lock(tmp_path, times)
 
 
 @pytest.mark.parametrize("name", TAKEN_OVER)
 def test_lock_of_a_dead_owner_is_taken_over(name, tmp_path, monkeypatch):
-    holder, age_s, heartbeat, uptime_s, reason = TAKEN_OVER[name]
+    holder, age_s, times, uptime_s, reason = TAKEN_OVER[name]
     monkeypatch.setattr(lock, "_uptime_s", lambda: uptime_s)
     write_lock(tmp_path, holder, age_s)
-    *watching, taken_over = take_lock(tmp_path, heartbeat)
+    *watching, taken_over = take_lock(tmp_path, times)
     assert taken_over.startswith("took over the lock of")
     assert reason in taken_over
     # Only an owner that the process table does not know is watched for a while.
@@ -162,7 +150,7 @@ def test_clock_jump_keeps_lock_of_living_owner(age_s, tmp_path):
     renewal.start()
     try:
         with pytest.raises(ConfigError, match="pid 4711 on node7"):
-            take_lock(tmp_path, Heartbeat(interval_s=1, stale_s=300))
+            take_lock(tmp_path, {"interval_s": 1, "stale_s": 300})
     finally:
         stop.set()
         renewal.join()
@@ -177,7 +165,7 @@ def test_damaged_lock_is_taken_over_when_stale(tmp_path):
 
 
 def test_held_lock_is_renewed_and_restored_after_deletion(tmp_path):
-    with run_lock(tmp_path, heartbeat=QUICK):
+    with run_lock(tmp_path, **QUICK):
         os.utime(tmp_path / "lock.json", (1, 1))
         _until(lambda: (tmp_path / "lock.json").stat().st_mtime > 1)
         (tmp_path / "lock.json").unlink()
@@ -189,7 +177,7 @@ def test_process_that_lost_its_lock_ends(tmp_path):
     messages: list[str] = []
 
     def lose() -> None:
-        with run_lock(tmp_path, messages.append, QUICK):
+        with run_lock(tmp_path, messages.append, **QUICK):
             write_lock(tmp_path, ELSEWHERE)
             _until(lambda: bool(messages), 10)
             time.sleep(30)
@@ -245,7 +233,7 @@ def in_bucket(test):
 
 @in_bucket
 def test_lock_in_bucket_is_exclusive_renewed_and_released(run):
-    with run_lock(run, heartbeat=QUICK):
+    with run_lock(run, **QUICK):
         assert owner(run).token != ELSEWHERE.token
         with pytest.raises(ConfigError, match="is in use by pid"), run_lock(run):
             pass
@@ -266,10 +254,10 @@ def test_lock_in_bucket_of_dead_owner_is_taken_over(run):
     assert "that process is gone" in messages[0]
     write(run / "lock.json", ELSEWHERE.data)
     with pytest.raises(ConfigError, match="the same command takes over"):
-        run_lock(run, heartbeat=Heartbeat(stale_s=60)).__enter__()
+        run_lock(run, stale_s=60).__enter__()
     # Times of a bucket's objects are whole seconds.
     time.sleep(1.1)
-    with run_lock(run, messages.append, QUICK):
+    with run_lock(run, messages.append, **QUICK):
         assert owner(run).token != "t7"
     assert messages[-1].startswith("took over the lock of pid 4711 on node7: no sign of life")
 

@@ -23,10 +23,10 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.store.tables import METRICS, PREVIOUS, read_metrics
-from flexroad.tools.report import write_report
-from flexroad.tools.report.browser.relief import relief
-from flexroad.tools.report.content import gather
-from flexroad.tools.report.steps import edge_steps, find_results
+from flexroad.tools.report import steps, write_report
+from flexroad.tools.report.content import LARGEST_STEPS, gather
+from flexroad.tools.report.pictures import relief
+from flexroad.tools.report.steps import edge_steps
 from tests.builders import LIGHT
 from tests.conftest import QUICK
 from tests.whole_run import rows
@@ -391,32 +391,27 @@ def test_report_compares_with_the_state_before(own_run):
     assert "Compared with the state before the last run: 4 tiles done in both runs." in page
 
 
-def test_configuration_of_a_run_without_extends_keeps_its_options(own_run):
-    file = own_run.path / "config.yaml"
-    text = file.read_text()
-    assert text.startswith("extends: defaults\n")
-    file.write_text(text.removeprefix("extends: defaults\n"))
-    assert Run.open(own_run.path).config.chains == own_run.config.chains
-
-
 # --- steps and relief of the report -------------------------------------------------------------------
 
 
-def test_edge_steps_of_large_run_are_a_sample(light_run):
-    whole, part = edge_steps(light_run), edge_steps(light_run, most=2)
+def test_edge_steps_of_large_run_are_a_sample(light_run, monkeypatch):
+    results = gather(light_run).results
+    check, whole, note = edge_steps(light_run, results)
+    assert (len(whole), note) == (4, "")
+    assert list(check.result) == ["tiles are fitted independently"]
+    monkeypatch.setattr(steps, "MOST", 2)
+    _, part, note = edge_steps(light_run, results)
     pairs = ["tile", "neighbour"]
-    assert (len(whole.edges), whole.note) == (4, "")
-    assert 0 < len(part.edges) < len(whole.edges)
-    chosen = pd.MultiIndex.from_frame(part.edges[pairs])
-    assert part.edges.set_index(pairs).equals(whole.edges.set_index(pairs).loc[chosen])
-    assert part.note == "Of one tile in 2, against its neighbours in the east and north."
-    assert list(whole.check.result) == ["tiles are fitted independently"]
+    assert 0 < len(part) < len(whole)
+    chosen = pd.MultiIndex.from_frame(part[pairs])
+    assert part.set_index(pairs).equals(whole.set_index(pairs).loc[chosen])
+    assert note == "Of one tile in 2, against its neighbours in the east and north."
 
 
 def test_report_checks_every_tile_once(light_run, monkeypatch):
     checked = counted_graphs(monkeypatch)
     content = gather(light_run)
-    assert len(content.steps.edges) == 4
+    assert len(content.tables[LARGEST_STEPS][0]) == 4
     picture = relief(light_run, light_run.catalog.tiles, content.results)
     assert list(picture.places) == [tile.id for tile in light_run.catalog.tiles]
     assert checked == dict.fromkeys(picture.places, 1)
@@ -424,8 +419,8 @@ def test_report_checks_every_tile_once(light_run, monkeypatch):
 
 def test_relief_has_tiles_with_results_in_the_store(own_run):
     first, second, *others = own_run.catalog.tiles
-    results = find_results(own_run, [first, second])
-    assert set(results["flexroad"]) == {first.id, second.id}
+    stored = gather(own_run).results["flexroad"]
+    results = {"flexroad": {tile.id: stored[tile.id] for tile in (first, second)}}
     (surface,) = own_run.store.glob(f"fit/*/{results['flexroad'][first.id][0]}.npz")
     surface.unlink()
     assert list(relief(own_run, own_run.catalog.tiles, results).places) == [second.id]

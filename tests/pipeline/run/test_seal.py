@@ -90,8 +90,8 @@ def test_programs_given_to_run_hold_for_its_user(flexroad, survey, light_config,
     flexroad("rerun", run, *words).expected(0)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another"))
     option = ("--allow", survey.parent)
-    assert "cluster.prologue can start programs" in flexroad("rerun", run, *words, *option).expected(2).err
-    flexroad("rerun", run, *words, *option, *given).expected(0)
+    assert "cluster.prologue can start programs" in flexroad(*option, "rerun", run, *words).expected(2).err
+    flexroad(*option, "rerun", run, *words, *given).expected(0)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_store_outside_of_a_foreign_run_needs_allow(flexroad, made, tmp_path):
     Run.create(run, made.config, made.catalog, store)
     assert Run.open(run).store == store
     change_record(run, "store", str(other))
-    line = f"{run} has its store in {other}, which this user has not given .* add --allow {other}$"
+    line = f"{run} has its store in {other}, which this user has not .* begin with flexroad --allow {other}$"
     with pytest.raises(ConfigError, match=line):
         Run.open(run)
     with pytest.raises(ConfigError, match=f"add --store {other}$"):
@@ -152,7 +152,7 @@ def test_changed_list_of_a_run_allows_nothing(flexroad, made, survey, allowed):
         tile.paths(tile.layers[0])
     for command in ("rerun", "status", "clean"):
         assert option in flexroad(command, run).expected(2).err
-    flexroad("status", run, *option.split()).expected(0)
+    flexroad(*option.split(), "status", run).expected(0)
     tile = Run.open(run, [str(survey.parent)]).catalog.tiles[0]
     assert tile.paths(tile.layers[0])
 

@@ -13,7 +13,7 @@ from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.run import progress as shown
 from flexroad.pipeline.run.lock import Owner, owner, run_lock
-from flexroad.pipeline.run.progress import ProgressDisplay, StepProgress, said_repeatedly
+from flexroad.pipeline.run.progress import ProgressDisplay, said_repeatedly, step_progress
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import last_record, matches, progress
 from flexroad.pipeline.store.database import NAME, RunDatabase
@@ -149,7 +149,7 @@ def test_run_without_results_speaks_in_a_pipe(log):
 
 
 def test_step_in_a_pipe_says_how_many_are_done(log):
-    items = StepProgress(Console(file=log))(iter("abc"), "checking tiles", 3)
+    items = step_progress(Console(file=log))(iter("abc"), "checking tiles", 3)
     assert [next(items), next(items)] == ["a", "b"]
     assert log.has("checking tiles: 1 of 3, ")
     assert list(items) == ["c"]
@@ -157,5 +157,5 @@ def test_step_in_a_pipe_says_how_many_are_done(log):
 
 def test_step_on_a_terminal_has_a_bar(log):
     console = Console(file=log, force_terminal=True, width=80)
-    assert list(StepProgress(console)(range(3), "checking tiles", 3)) == [0, 1, 2]
+    assert list(step_progress(console)(range(3), "checking tiles", 3)) == [0, 1, 2]
     assert "checking tiles" in log.getvalue()

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -90,9 +91,8 @@ def test_loss_equals_paper_equations():
 def test_gradient_equals_autograd(degree, free):
     loss_function, at = random_objective(degree, free)
     loss, gradient = loss_function(at)
-    torch_objective = adam.TorchObjective(loss_function, at.shape[1:], "cpu")
-    variables = torch_objective.tensor(at).requires_grad_()
-    peer = torch_objective(variables)
+    variables = torch.tensor(at).requires_grad_()
+    peer = adam.torch_loss(loss_function, at.shape[1:], "cpu")(variables)
     peer.backward()
     assert loss == pytest.approx(peer.item(), rel=1e-12)
     np.testing.assert_allclose(gradient, variables.grad.numpy(), rtol=1e-9, atol=1e-14)
@@ -125,32 +125,33 @@ def test_adam_lowers_loss():
     evaluate = nurbs.objective_of(data, clusters.mask, space, 160.0, opts)
     z = np.zeros((15, 15))
     limit = np.array([np.inf, 1.0])[:, None, None]
-    _, losses = adam.minimise(evaluate, np.stack([z, z]), limit, adam.Schedule(0.1, 200, 1e-4, 20))
+    _, losses = adam.minimise(evaluate, np.stack([z, z]), limit, 0.1, 200)
     assert losses[-1] < 0.15 < 1 < losses[0]
 
 
 def test_adam_stops_when_loss_is_stable():
-    schedule = adam.Schedule(rate=0.1, iterations=50, tolerance=1e-4, window=5)
     steps = []
 
     def flat(x):
         steps.append(1)
         return 1.0, np.zeros_like(x)
 
-    adam.minimise(flat, np.zeros(3), np.full(3, np.inf), schedule)
-    assert len(steps) == 6
-    assert not schedule.has_finished([1.0, 1.0, 1.0, 1.0, 1.0, 0.99])
-    assert schedule.has_finished(list(np.linspace(1, 0, 51)))
+    def falling(x):
+        return 1.0 - x[0], -np.ones_like(x)
+
+    adam.minimise(flat, np.zeros(3), np.full(3, np.inf), 0.1, 50)
+    assert len(steps) == 1 + adam.STOP_WINDOW
+    assert len(adam.minimise(falling, np.zeros(3), np.full(3, np.inf), 0.1, 50)[1]) == 51
 
 
 @pytest.mark.parametrize("engine", ["numba", "torch"])
 def test_minimise_returns_variables_of_lowest_loss(engine):
     loss_function, at = random_objective()
-    limit, schedule = np.full((2, 1, 1), 2.0), adam.Schedule(5.0, 20, 0, 20)
+    limit = np.full((2, 1, 1), 2.0)
     if engine == "torch":
-        best, losses = adam.minimise_with_torch(loss_function, at, limit, schedule, "cpu")
+        best, losses = adam.minimise_with_torch(loss_function, at, limit, 5.0, 20, "cpu")
     else:
-        best, losses = adam.minimise(loss_function, at, limit, schedule)
+        best, losses = adam.minimise(loss_function, at, limit, 5.0, 20)
     assert len(losses) == 21
     assert losses[-1] > min(losses)
     assert loss_function(best)[0] == pytest.approx(min(losses), rel=1e-12)
@@ -158,13 +159,12 @@ def test_minimise_returns_variables_of_lowest_loss(engine):
 
 def test_minimise_with_last_returns_variables_of_last_step():
     loss_function, at = random_objective()
-    schedule = adam.Schedule(5.0, 20, 0, 20, last=True)
-    result, losses = adam.minimise(loss_function, at, np.full((2, 1, 1), 2.0), schedule)
+    result, losses = adam.minimise(loss_function, at, np.full((2, 1, 1), 2.0), 5.0, 20, last=True)
     assert loss_function(result)[0] == losses[-1] > min(losses)
 
 
 def test_fit_unbounded_weights_exceed_the_bounds(monkeypatch):
-    monkeypatch.setattr(nurbs, "STOP_TOLERANCE", 0)
+    monkeypatch.setattr(adam, "STOP_TOLERANCE", 0)
     data, clusters, _ = tile(noise=1.0)
     changes = {"learning_rate": 1.0, "iterations": 60}
     softplus = fitted(data, clusters, weights="softplus", **changes)
@@ -200,7 +200,7 @@ def test_options_that_no_engine_has_raise(changes):
 
 @pytest.mark.parametrize("engine", ["numba", "torch"])
 def test_fit_free_weights_stay_within_bounds(engine, monkeypatch):
-    monkeypatch.setattr(nurbs, "STOP_TOLERANCE", 0)
+    monkeypatch.setattr(adam, "STOP_TOLERANCE", 0)
     data, clusters, _ = tile(noise=1.0)
     surface = fitted(data, clusters, engine=engine, learning_rate=1.0, iterations=60)
     assert surface.W.max() == pytest.approx(10)

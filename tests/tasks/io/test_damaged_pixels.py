@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from rasterio.enums import Resampling
 from shapely import LineString
 
 from flexroad.catalog import Grid
@@ -24,7 +23,7 @@ def heights(path):
 
 
 def window(path):
-    return read_window(path, path.name, GRID, GRID, UTM, Resampling.average, heights=True)
+    return read_window(path, path.name, GRID, GRID, UTM, heights=True)
 
 
 def tif(folder):

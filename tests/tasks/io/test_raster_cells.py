@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 from affine import Affine
-from rasterio.enums import Resampling
 
 from flexroad.catalog import Grid
 from flexroad.tasks.io.raster import Unreadable, read_window
@@ -25,7 +24,7 @@ def made(folder, form, northward=False, cell=1.0):
 
 
 def read(path, grid):
-    return read_window(path, path.name, grid, grid, UTM, Resampling.average, heights=True)
+    return read_window(path, path.name, grid, grid, UTM, heights=True)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -78,7 +77,7 @@ def test_ascii_grid_with_a_damaged_row_is_an_error(tmp_path):
         "import sys; from pathlib import Path; from rasterio.enums import Resampling\n"
         "from flexroad.catalog import Grid; from flexroad.tasks.io.raster import Unreadable, read_window\n"
         f"path, grid = Path(sys.argv[1]), Grid({UTM!r}, {WEST}, {NORTH}, 1.0, {COLS}, {ROWS})\n"
-        f"try: read_window(path, path.name, grid, grid, {UTM!r}, Resampling.average, heights=True)\n"
+        f"try: read_window(path, path.name, grid, grid, {UTM!r}, heights=True)\n"
         "except Unreadable as error: print(error)"
     )
     ended = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, timeout=60)

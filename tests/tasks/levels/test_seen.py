@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from flexroad.catalog import Grid
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import encode
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.levels import seen
@@ -129,7 +129,7 @@ def test_tile_without_decks_has_the_bytes_of_one_without_the_option(tmp_path):
     assert with_option.road.mask.any()
     for name in ("road", "clusters", "surface"):
         one, other = getattr(with_option, name), getattr(without, name)
-        assert codec.encode(one, {}, (), "") == codec.encode(other, {}, (), "")
+        assert encode(one, {}, (), "") == encode(other, {}, (), "")
 
 
 def test_levels_see_their_own_heights(tmp_path):

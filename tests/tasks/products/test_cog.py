@@ -23,7 +23,7 @@ def plane(grid: Grid) -> np.ndarray:
 
 
 def test_encode_height_reads_back_in_place():
-    with MemoryFile(cog.encode_height(plane(GRID), GRID)) as file, file.open() as raster:
+    with MemoryFile(cog.encode(plane(GRID), GRID, cog.HEIGHT)) as file, file.open() as raster:
         assert raster.dtypes == ("float32",)
         assert np.isnan(raster.nodata)
         assert raster.crs.to_epsg() == 25832
@@ -37,13 +37,13 @@ def test_encode_height_reads_back_in_place():
 
 def test_encode_mask_reads_back():
     road = plane(GRID) > 104
-    with MemoryFile(cog.encode_mask(road, GRID)) as file, file.open() as raster:
+    with MemoryFile(cog.encode(road, GRID, cog.ROAD)) as file, file.open() as raster:
         assert raster.dtypes == ("uint8",)
         np.testing.assert_array_equal(raster.read(1), road)
 
 
 def test_encode_height_with_vertical_crs_has_compound_crs():
-    with MemoryFile(cog.encode_height(plane(GRID), GRID, "EPSG:7837")) as file, file.open() as raster:
+    with MemoryFile(cog.encode(plane(GRID), GRID, cog.HEIGHT, "EPSG:7837")) as file, file.open() as raster:
         plan, height = CRS(raster.crs.to_wkt()).sub_crs_list
         assert (plan.to_epsg(), height.to_epsg()) == (25832, 7837)
         assert raster.bounds == GRID.bounds
@@ -51,13 +51,12 @@ def test_encode_height_with_vertical_crs_has_compound_crs():
 
 @pytest.mark.parametrize("band", [cog.HEIGHT, cog.ROAD, cog.HEIGHT_SOURCE], ids=lambda band: band.name)
 def test_encoded_raster_declares_what_its_band_means(band):
-    encoded = {
-        "height": lambda: cog.encode_height(plane(GRID), GRID),
-        "road": lambda: cog.encode_mask(plane(GRID) > 104, GRID),
-        "height_source": lambda: cog.encode_height_source(
-            np.full(GRID.shape, HeightSource.DTM, np.uint8), GRID
-        ),
-    }[band.name]()
+    values = {
+        "height": plane(GRID),
+        "road": plane(GRID) > 104,
+        "height_source": np.full(GRID.shape, HeightSource.DTM, np.uint8),
+    }[band.name]
+    encoded = cog.encode(values, GRID, band)
     with MemoryFile(encoded) as file, file.open() as raster:
         assert raster.dtypes == (band.dtype,)
         assert raster.descriptions == (band.name,)
@@ -75,7 +74,7 @@ def test_encoded_raster_declares_what_its_band_means(band):
 
 
 def test_encode_height_is_cloud_optimised():
-    with MemoryFile(cog.encode_height(plane(GRID), GRID)) as file, file.open() as raster:
+    with MemoryFile(cog.encode(plane(GRID), GRID, cog.HEIGHT)) as file, file.open() as raster:
         structure = raster.tags(ns="IMAGE_STRUCTURE")
         assert (structure["LAYOUT"], structure["COMPRESSION"]) == ("COG", "DEFLATE")
         assert raster.overviews(1) == [2]
@@ -84,7 +83,7 @@ def test_encode_height_is_cloud_optimised():
 def test_encode_mask_keeps_wkt():
     wkt = CRS.from_proj4("+proj=tmerc +lat_0=50 +lon_0=7 +ellps=GRS80 +units=m").to_wkt()
     grid = Grid(wkt, 0.0, 20.0, 0.5, 40, 40)
-    with MemoryFile(cog.encode_mask(np.ones(grid.shape, bool), grid)) as file, file.open() as raster:
+    with MemoryFile(cog.encode(np.ones(grid.shape, bool), grid, cog.ROAD)) as file, file.open() as raster:
         (latitude,) = [
             p.value for p in CRS(raster.crs.to_wkt()).coordinate_operation.params if "lat" in p.name.lower()
         ]
@@ -94,18 +93,18 @@ def test_encode_mask_keeps_wkt():
 
 def test_encode_height_wrong_shape_raises():
     with pytest.raises(TaskError, match=r"\(250, 599\).*\(250, 600\)"):
-        cog.encode_height(plane(GRID)[:, 1:], GRID)
+        cog.encode(plane(GRID)[:, 1:], GRID, cog.HEIGHT)
 
 
 def test_encode_height_equal_arrays_give_equal_bytes():
-    assert cog.encode_height(plane(GRID), GRID) == cog.encode_height(plane(GRID), GRID)
+    assert cog.encode(plane(GRID), GRID, cog.HEIGHT) == cog.encode(plane(GRID), GRID, cog.HEIGHT)
 
 
 @pytest.mark.parametrize(("size", "block"), [(250, 256), (256, 256), (40, 48), (600, 512)])
 def test_encode_block_is_as_large_as_a_small_raster(size, block, tmp_path):
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, size, 30)
     file = tmp_path / "height.tif"
-    file.write_bytes(cog.encode_height(np.zeros(grid.shape), grid))
+    file.write_bytes(cog.encode(np.zeros(grid.shape), grid, cog.HEIGHT))
     assert cog_validate(file, strict=True) == (True, [], [])
     with rasterio.open(file) as raster:
         assert raster.block_shapes == [(block, block)]

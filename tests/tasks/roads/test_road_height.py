@@ -11,7 +11,6 @@ from flexroad.tasks.border import ENDS
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality import assess
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.road_height import dsm_offset, with_road_heights
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
@@ -89,7 +88,7 @@ def scanned(seed, stratum):
 
 
 def filtered(data):
-    road = RoadMask(data.grid, data.core, data.road_mask, beyond_extent(data))
+    road = RoadMask(data.grid, data.core, data.road_mask, data.beyond_extent())
     return road, planar.ecsrc(data, road, planar.Options(shoulder_m=5))
 
 

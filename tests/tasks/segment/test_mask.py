@@ -3,7 +3,6 @@ from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
 from flexroad.catalog import Grid
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.segment.mask import Options, segment
 from flexroad.tasks.types import TileData
 
@@ -62,17 +61,17 @@ def test_beyond_extent_is_void_connected_to_edge():
     expected = void.copy()
     expected[1, 1] = False  # connected to the void in the corner only diagonally
     expected[2:4, 3:5] = False
-    np.testing.assert_array_equal(beyond_extent(data(void)), expected)
+    np.testing.assert_array_equal(data(void).beyond_extent(), expected)
 
 
 def test_beyond_extent_cell_with_one_height_is_inside():
     void, dtm_void = np.zeros((6, 8), bool), np.zeros((6, 8), bool)
     void[:3] = True
     dtm_void[3:] = True
-    assert not beyond_extent(data(void, dtm_void=dtm_void)).any()
+    assert not data(void, dtm_void=dtm_void).beyond_extent().any()
     dtm_void[2] = True
     np.testing.assert_array_equal(
-        np.flatnonzero(beyond_extent(data(void, dtm_void=dtm_void)).all(axis=1)), [2]
+        np.flatnonzero(data(void, dtm_void=dtm_void).beyond_extent().all(axis=1)), [2]
     )
 
 
@@ -86,4 +85,4 @@ def test_beyond_extent_equals_flood_fill_from_edge(void):
     for _ in range(void.size):
         spread = np.pad(filled, 1)
         filled |= void & (spread[:-2, 1:-1] | spread[2:, 1:-1] | spread[1:-1, :-2] | spread[1:-1, 2:])
-    np.testing.assert_array_equal(beyond_extent(data(void)), filled)
+    np.testing.assert_array_equal(data(void).beyond_extent(), filled)

@@ -8,7 +8,7 @@ from scipy.ndimage import distance_transform_edt
 
 from flexroad.catalog.borders import border_of
 from flexroad.catalog.grid import Grid
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import decode, encode
 from flexroad.tasks import sample
 from flexroad.tasks.border import ENDS
 from flexroad.tasks.fit import smoothing_spline
@@ -126,7 +126,7 @@ def test_meshes_meet_with_steps_away_from_the_road(method):
 
 def test_edge_is_stored_without_loss():
     edge = frame_of("across the edge", TILES[0]).east
-    restored, *_ = codec.decode(codec.encode(edge, {}, (), ""), "")
+    restored, *_ = decode(encode(edge, {}, (), ""), "")
     assert np.array_equal(restored.steps, edge.steps)
     assert np.array_equal(restored.road_m, edge.road_m)
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import decode, encode
 from flexroad.tasks import sample
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.metrics.mesh_check import check
@@ -135,7 +135,7 @@ def test_hidden_road_has_no_steps():
 def test_stepped_surface_is_stored_without_loss():
     data, clusters, _ = tile(4.0)
     surface = fitted(data, clusters)
-    restored, *_ = codec.decode(codec.encode(surface, {}, (), ""), "")
+    restored, *_ = decode(encode(surface, {}, (), ""), "")
     assert type(restored) is type(surface)
     assert isinstance(restored, NurbsSurface)
     assert heights(restored).tobytes() == heights(surface).tobytes()

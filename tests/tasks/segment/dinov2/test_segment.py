@@ -20,7 +20,7 @@ from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
 from flexroad.tasks.segment.dinov2.segment import Options, files, segment
 from flexroad.tasks.types import TileData
 from flexroad.tools.train import fit_head as training
-from flexroad.tools.train.fit_head import THRESHOLDS, Labels, Line, Sample, Windows, at_cells, best_threshold
+from flexroad.tools.train.fit_head import THRESHOLDS, Sample, Windows, at_cells, best_threshold
 from tests.gpu import needs_gpu
 from tests.make_backbone import save_backbone
 
@@ -55,7 +55,7 @@ def heads(backbones, sample, tmp_path_factory) -> dict[int, Path]:
     paths = {}
     for n, folder in backbones.items():
         paths[n] = tmp_path_factory.mktemp("heads") / f"head-{n}.safetensors"
-        paths[n].write_bytes(training.train([sample], [sample], train_options(folder)).model)
+        paths[n].write_bytes(training.train([sample], [sample], train_options(folder), print)[0])
     return paths
 
 
@@ -132,17 +132,18 @@ def test_train_small_scene_reproduces_labels(heads, sample, registers):
 
 
 def test_train_twice_gives_equal_models_with_provenance(backbones, sample, tmp_path):
-    reports = []
+    lines = []
     options = train_options(backbones[0], epochs=5)
-    first = training.train(
-        [sample], [sample], options, lambda done, of, last: reports.append((done, of, last))
-    )
-    second = training.train([sample], [sample], options)
-    assert first.model == second.model
-    assert reports == [(n + 1, 5, past) for n, past in enumerate(first.history)]
-    assert first.history[-1].validation_loss < first.history[0].validation_loss
-    path = tmp_path / f"head{first.suffix}"
-    path.write_bytes(first.model)
+    model, history = training.train([sample], [sample], options, lines.append)
+    again, _ = training.train([sample], [sample], options, print)
+    assert model == again
+    assert lines == [
+        f"epoch {n} of 5: loss {loss:.4f}, validation {validation:.4f}"
+        for n, (loss, validation) in enumerate(history, 1)
+    ]
+    assert history[-1][1] < history[0][1]
+    path = tmp_path / "head.safetensors"
+    path.write_bytes(model)
     about = read_head(path).about
     assert (about.gsd_m, about.window_px, about.layers, about.classes) == (GSD, WINDOW, 3, ("road",))
     assert about.trained["train_cells"] == sample.labelled.sum()
@@ -156,7 +157,7 @@ def test_train_ignores_labels_of_unlabelled_cells(backbones, sample):
     labelled[:, 20:] = True
     options = train_options(backbones[0], epochs=2)
     right, wrong = (
-        training.train([s], [s], options).model
+        training.train([s], [s], options, print)[0]
         for s in (
             replace(sample, labelled=labelled),
             replace(sample, labelled=labelled, road=sample.road ^ ~labelled),
@@ -168,11 +169,11 @@ def test_train_ignores_labels_of_unlabelled_cells(backbones, sample):
 def test_train_stops_early_and_keeps_best_epoch(backbones, sample):
     """The labels of the validation tile are the inverse of the training labels."""
     inverse = replace(sample, road=~sample.road)
-    full = training.train([sample], [inverse], train_options(backbones[0], patience=3))
-    best = 1 + int(np.argmin([past.validation_loss for past in full.history]))
-    assert len(full.history) == best + 3 < 60
-    until = training.train([sample], [inverse], train_options(backbones[0], epochs=best))
-    np.testing.assert_array_equal(weight_of(full.model), weight_of(until.model))
+    model, history = training.train([sample], [inverse], train_options(backbones[0], patience=3), print)
+    best = 1 + int(np.argmin([validation for _, validation in history]))
+    assert len(history) == best + 3 < 60
+    until, _ = training.train([sample], [inverse], train_options(backbones[0], epochs=best), print)
+    np.testing.assert_array_equal(weight_of(model), weight_of(until))
 
 
 def weight_of(content: bytes) -> np.ndarray:
@@ -184,10 +185,10 @@ def weight_of(content: bytes) -> np.ndarray:
 def test_train_labels_of_one_class_raises(backbones, sample):
     no_road = replace(sample, road=np.zeros_like(sample.road))
     with pytest.raises(TaskError, match="no training tile has an orthophoto and labels of both road"):
-        training.train([no_road], [sample], train_options(backbones[0]))
+        training.train([no_road], [sample], train_options(backbones[0]), print)
     no_photo = replace(sample, data=replace(sample.data, dop=None))
     with pytest.raises(TaskError, match="no validation tile has an orthophoto"):
-        training.train([sample], [no_photo], train_options(backbones[0]))
+        training.train([sample], [no_photo], train_options(backbones[0]), print)
 
 
 def test_at_cells_interpolates_like_predictor(backbones, heads):
@@ -199,7 +200,7 @@ def test_at_cells_interpolates_like_predictor(backbones, heads):
     predicted = predictor(head, backbone)(windows)[0]
     centres = 2 * (np.arange(56, dtype=np.float32) + 0.5) / 56 - 1
     position = np.stack(np.meshgrid(centres, centres), axis=-1).reshape(-1, 2)
-    labels = Labels(position, np.zeros(len(position), np.float32))
+    labels = position, np.zeros(len(position), np.float32)
     tokens = backbone.tokens(windows, 3).numpy()
     line = torch.from_numpy(head.weight[0]), torch.tensor(float(head.bias[0]))
     logits, _ = at_cells(Windows(tokens, [labels], []), np.array([0]), *line)
@@ -207,16 +208,18 @@ def test_at_cells_interpolates_like_predictor(backbones, heads):
 
 
 def test_best_threshold_maximises_iou():
+    import torch
+
     rng = np.random.default_rng(2)
     tokens = rng.normal(size=(1, 8, 8, 2)).astype(np.float16)
     centres = 2 * (np.arange(8, dtype=np.float32) + 0.5) / 8 - 1
     position = np.stack(np.meshgrid(centres, centres), axis=-1).reshape(-1, 2)
-    line = Line(np.array([1.5, -1], np.float32), 0.3)
-    level = 1 / (1 + np.exp(-(tokens[0].astype(float) @ line.weight + line.bias))).ravel()
+    weight, bias = np.array([1.5, -1], np.float32), 0.3
+    level = 1 / (1 + np.exp(-(tokens[0].astype(float) @ weight + bias))).ravel()
     road = level + rng.normal(0, 0.2, 64) > 0.7
-    windows = Windows(tokens, [Labels(position, road.astype(np.float32))], [])
+    windows = Windows(tokens, [(position, road.astype(np.float32))], [])
     each = [iou(level >= threshold, road) for threshold in THRESHOLDS]
-    threshold, best = best_threshold(windows, line)
+    threshold, best = best_threshold(windows, torch.from_numpy(weight), torch.tensor(bias))
     assert threshold == THRESHOLDS[np.argmax(each)]
     assert best == pytest.approx(max(each))
 

@@ -1,8 +1,8 @@
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.roads.extent import covered
 from flexroad.tasks.types import RoadMask
+from flexroad.tools.export.step import covered
 
 CORE = Grid("EPSG:25832", 295500.0, 5629500.0, 2.0, 5, 4)
 

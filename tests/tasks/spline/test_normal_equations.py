@@ -1,4 +1,4 @@
-"""The solver of the normal equations, and its stencils, against dense matrices."""
+"""The solvers of the normal equations, and their stencils, against dense matrices."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.spline.multigrid import Multigrid
+from flexroad.tasks.spline.normal_equations import Multigrid, is_narrow, solve_banded
 from flexroad.tasks.spline.stencil import add_from_cells, at_cells, from_lines, gram, line_width, to_lines
 from flexroad.tasks.spline.surface import basis, dense, uniform_knots
 
@@ -33,7 +33,7 @@ def test_solve_equals_dense_solution(seed, p, m, n, held_share):
     stencil, matrix, *_ = made(m, n, p, (3 * m, 3 * n), seed)
     rng = np.random.default_rng(seed)
     held, right = rng.random((m, n)) < held_share, rng.normal(size=(m, n))
-    grids = Multigrid((m, n), p, held)
+    grids = Multigrid(p, held)
     stencil[:, 0, 0, p : p + m] += 1e-3
     matrix += 1e-3 * np.eye(m * n)
     solution = from_lines(grids.solve(stencil, to_lines(right, p), 1e-10, True), m, p)
@@ -54,18 +54,54 @@ def test_splines_at_cells_equal_dense_products(p):
     np.testing.assert_allclose(from_lines(sums, m, p).ravel(), design.T @ pull.ravel(), atol=1e-12)
 
 
+def system(m, n, p):
+    """Return a stencil, its dense matrix, held points and a right-hand side."""
+    stencil, matrix, *_ = made(m, n, p, (3 * m, 3 * n))
+    stencil[:, 0, 0, p : p + m] += 1e-3
+    rng = np.random.default_rng(0)
+    return stencil, matrix + 1e-3 * np.eye(m * n), rng.random((m, n)) < 0.2, rng.normal(size=(m, n))
+
+
+@pytest.mark.parametrize(("m", "n"), [(17, 31), (31, 17), (12, 12), (6, 20), (20, 6)])
+@pytest.mark.parametrize("p", [2, 3, 4])
+def test_solve_banded_equals_dense_solution(m, n, p):
+    """The free points alone; held points keep their height."""
+    stencil, matrix, held, right = system(m, n, p)
+    solution = from_lines(solve_banded(stencil, to_lines(right, p), held), m, p)
+    free, expected = ~held.ravel(), np.zeros(m * n)
+    expected[free] = np.linalg.solve(matrix[np.ix_(free, free)], right.ravel()[free])
+    np.testing.assert_allclose(solution.ravel(), expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("m", "n"), [(17, 80), (80, 17)])
+def test_solve_banded_equals_multigrid(m, n):
+    stencil, _, held, right = system(m, n, 3)
+    lines = to_lines(right, 3)
+    exact = solve_banded(stencil, lines, held)
+    close = Multigrid(3, held).solve(stencil, lines, 1e-10, True)
+    np.testing.assert_allclose(close, exact, atol=1e-4 + 1e-6 * np.abs(exact).max())
+
+
 def test_solve_with_indefinite_matrix_raises():
-    stencil = np.zeros((9, 4, 4, line_width(9, 3)))
+    stencil, held = np.zeros((9, 4, 4, line_width(9, 3))), np.zeros((9, 9), bool)
     stencil[:, 0, 0, 3:12] = -1.0
-    grids = Multigrid((9, 9), 3, None)
+    right = to_lines(np.ones((9, 9)), 3)
     with pytest.raises(TaskError, match="control point 1 of the surface is undetermined"):
-        grids.solve(stencil, to_lines(np.ones((9, 9)), 3), 1e-6, True)
+        solve_banded(stencil, right, held)
+    with pytest.raises(TaskError, match="control point 1 of the surface is undetermined"):
+        Multigrid(3, held).solve(stencil, right, 1e-6, True)
+
+
+def test_is_narrow_strips_alone():
+    assert is_narrow((17, 87), 3)
+    assert is_narrow((400, 17), 3)
+    assert not is_narrow((73, 73), 3)
 
 
 def test_solve_undetermined_points_keep_their_height():
     stencil, *_ = made(20, 20, 3, (60, 60))
     stencil[10:, :] = 0.0
-    grids = Multigrid((20, 20), 3, None)
+    grids = Multigrid(3, np.zeros((20, 20), bool))
     right = np.zeros((20, 20))
     right[:, :5] = 1.0
     solution = from_lines(grids.solve(stencil, to_lines(right, 3), 1e-8, True), 20, 3)

@@ -2,11 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexroad.catalog.grid import Grid
-from flexroad.tasks.meshing.parts import highest_first, part, texture_coordinates, with_levels
-from flexroad.tasks.metrics.mesh_distance import drape
+from flexroad.tasks.sample import with_levels
 from flexroad.tasks.types import Mesh
-from tests.crossing import DECK_M, RISE, SOUTH, WEST, Crossing
 
 VERTICES = np.array([[0, 0, 1], [10, 0, 2], [10, 10, 3], [0, 10, 4], [5, 15, 5]], float)
 FACES = np.array([[0, 1, 2], [0, 2, 3], [3, 2, 4]], np.int32)
@@ -14,18 +11,18 @@ MESH = Mesh("EPSG:25832", (295500.0, 5629250.0, 150.0), VERTICES, FACES, np.arra
 
 
 def test_part_has_the_same_triangles_and_only_their_vertices():
-    used, corners = part(MESH, MESH.road)
+    used, corners = MESH.part(MESH.road)
     np.testing.assert_array_equal(used, [0, 2, 3])
     np.testing.assert_array_equal(VERTICES[used][corners], VERTICES[FACES[MESH.road]])
 
 
 def test_part_without_faces_is_empty():
-    used, corners = part(MESH, np.zeros(3, bool))
+    used, corners = MESH.part(np.zeros(3, bool))
     assert (used.shape, corners.shape) == ((0,), (0, 3))
 
 
 def test_texture_coordinates_run_from_the_south_west():
-    uv = texture_coordinates(MESH, (295495.0, 5629250.0, 295515.0, 5629290.0))
+    uv = MESH.texture_coordinates((295495.0, 5629250.0, 295515.0, 5629290.0))
     np.testing.assert_allclose(uv, [[0.25, 0], [0.75, 0], [0.75, 0.25], [0.25, 0.25], [0.5, 0.375]])
 
 
@@ -46,11 +43,3 @@ def test_mesh_without_levels_is_that_of_level_0():
     assert with_levels({0: MESH}) is MESH
     assert MESH.numbers == (0,)
     assert MESH.at(0) is MESH
-
-
-def test_height_over_faces_of_the_highest_level_is_that_of_the_deck():
-    mesh, _ = Crossing((40.0, 30.0)).mesh()
-    grid = Grid(mesh.crs, WEST + 35, SOUTH + 32, 1.0, 10, 4)
-    top = drape(replace(mesh, faces=highest_first(mesh)), grid) + mesh.origin[2]
-    np.testing.assert_allclose(top, DECK_M + RISE * np.tile(grid.eastings - WEST, (4, 1)), atol=2e-3)
-    assert highest_first(MESH) is FACES
