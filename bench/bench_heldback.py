@@ -23,7 +23,6 @@ import argparse
 import os
 import sys
 import tempfile
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
@@ -32,11 +31,12 @@ from pathlib import Path
 import laspy
 import numpy as np
 import rasterio
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 import flexroad
+from bench.towns import ARCHIVES, PAVED, Town
 from flexroad.catalog import Catalog, Grid
-from flexroad.catalog.sources import rasters
 from flexroad.pipeline.cli.main import main as command
 from flexroad.tasks.quality.estimate import INTERVAL
 from flexroad.tasks.types import Bools, Floats
@@ -116,8 +116,6 @@ def squares(x: Floats, y: Floats, draw: int) -> tuple[Floats, Bools]:
 
 def bilinear(path: Path, x: Floats, y: Floats, nearest: bool = False) -> Floats:
     """Return the values of a raster at points."""
-    from scipy.ndimage import map_coordinates
-
     with rasterio.open(path) as raster:
         values = raster.read(1).astype(np.float64)
         columns, rows = ~raster.transform * (np.asarray(x), np.asarray(y))
@@ -204,31 +202,17 @@ def _other_ground(file: Path, x: Floats, y: Floats, z: Floats) -> Bools:
     return np.isfinite(distance)
 
 
-def town(archive: Path, crs: str, patterns: dict[str, str], folder: Path, draw: int) -> Place:
-    """Withhold cells of a town's DSM, with canopies, and DTM; truth is its DTM, and road is paved ground."""
-    zipfile.ZipFile(archive).extractall(folder)
-    root = folder / archive.stem
-    paths = {layer: next(root.glob(pattern)) for layer, pattern in patterns.items()}
-    with rasterio.open(paths["dtm"]) as raster:
-        profile = {**raster.profile, "driver": "GTiff", "dtype": "float64", "nodata": -9999.0}
-        columns, rows = np.meshgrid(np.arange(raster.width), np.arange(raster.height))
-        x, y = (
-            np.asarray(axis).reshape(rows.shape) for axis in raster.transform * (columns + 0.5, rows + 0.5)
-        )
-    layers = {}
-    for name, path in paths.items():
-        with rasterio.open(path) as raster:
-            layers[name] = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-    dtm = layers["dtm"]
-    dsm = np.fmax(layers["dsm"], dtm + np.nan_to_num(layers["canopy"]))
+def town(name: str, data: Path, folder: Path, draw: int) -> Place:
+    """Withhold cells of a town's DSM and DTM; truth is its DTM."""
+    found = Town.unpacked(name, data, folder)
+    transform = found.profile["transform"]
+    columns, rows = np.meshgrid(np.arange(found.dtm.shape[1]), np.arange(found.dtm.shape[0]))
+    x, y = (np.reshape(axis, rows.shape) for axis in transform * (columns + 0.5, rows + 0.5))
     number, out = squares(x, y, draw)
-    for name, heights in (("left_dsm.tif", dsm), ("left_dtm.tif", dtm)):
-        with rasterio.open(root / name, "w", **profile) as raster:
-            raster.write(np.where(out | np.isnan(heights), -9999.0, heights), 1)
-    files = {"dsm": "left_dsm.tif", "dtm": "left_dtm.tif", "road_mask": patterns["cover"]}
-    Catalog(rasters.index(root, files, road_values=(1,), crs=crs).tiles).write(folder / "catalog.parquet")
-    there = out & np.isfinite(dtm) & (layers["cover"] != 4)
-    truth = Truth(x[there], y[there], dtm[there], layers["cover"][there] == 1, number[there])
+    left = (np.where(out, np.nan, heights) for heights in (found.dsm, found.dtm))
+    found.catalog(*left).write(folder / "catalog.parquet")
+    there = out & np.isfinite(found.dtm) & (found.cover != 4)
+    truth = Truth(x[there], y[there], found.dtm[there], found.cover[there] == PAVED, number[there])
     return Place(folder / "catalog.parquet", {"squares": truth})
 
 
@@ -279,24 +263,8 @@ def places(data: Path | None, roads: Path) -> dict[str, Maker]:
         [data / "brighton_beach" / "model.laz"],
         ["--roads", roads / "brighton_beach.geojson"], ["--cell", 0.5, "--dop-cell", 0.25], folder, draw,
     )  # fmt: skip
-    barbican = {
-        "dsm": "dsm_barb*.tif",
-        "dtm": "dem_barb*.tif",
-        "canopy": "cdsm_barb*.tif",
-        "cover": "landcover*.tif",
-    }
-    found["Barbican"] = lambda folder, draw: town(
-        data / "umep" / "London_BNG.zip", "EPSG:27700", barbican, folder, draw
-    )
-    gothenburg = {
-        "dsm": "DSM_KR*.tif",
-        "dtm": "DEM_KR*.tif",
-        "canopy": "CDSM_KR*.asc",
-        "cover": "landcover.tif",
-    }
-    found["Gothenburg"] = lambda folder, draw: town(
-        data / "umep" / "Goteborg_SWEREF99_1200.zip", "EPSG:3007", gothenburg, folder, draw
-    )
+    for name in ARCHIVES:
+        found[name] = lambda folder, draw, name=name: town(name, data, folder, draw)
     return found
 
 
