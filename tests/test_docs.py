@@ -11,14 +11,8 @@ from tests.command_line import call
 from tests.make_backbone import save_backbone
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted(
-    [
-        ROOT / "README.md",
-        ROOT / "CONTRIBUTING.md",
-        *(ROOT / "docs").rglob("*.md"),
-        ROOT / "tests" / "faults.md",
-    ]
-)
+NAMES = ("README.md", "CONTRIBUTING.md", "tests/faults.md")
+PAGES = [*(ROOT / name for name in NAMES), *sorted((ROOT / "docs").rglob("*.md"))]
 LIVE = [page for page in PAGES if page.parent in (ROOT, ROOT / "docs")]
 NAMED_TEST = re.compile(r"`(test_\w+\.py)::(test_\w+)`")
 

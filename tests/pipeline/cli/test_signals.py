@@ -169,6 +169,7 @@ COMMANDS = {
     "lift": ("roads.osm", "run", "-o", "out.osm"),
     "export": ("run", "--format", "obj", "-o", "out"),
     "status": ("run",),
+    "run": ("--catalog", "c.parquet", "--out", "run"),
 }
 SENT = """
     import os, time
@@ -194,5 +195,5 @@ def test_interrupted_command_says_so_in_one_line_with_exit_code_130(tmp_path, co
     done = subprocess.run(
         [*words, *COMMANDS[command]], cwd=tmp_path, capture_output=True, text=True, timeout=WAIT_S * 3
     )
-    goes_on = "the same command goes on from here" if command == "export" else "repeat the command"
+    goes_on = "the same command goes on from here" if command in ("export", "run") else "repeat the command"
     assert (done.returncode, done.stderr.strip()) == (130, f"interrupted; {goes_on}")

@@ -13,6 +13,7 @@ import psutil
 import pytest
 
 import flexroad
+from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ClusterLost, ConfigError
@@ -125,7 +126,7 @@ def threads(job):
 
 
 def test_map_worker_that_joins_later_uses_one_thread(processes):
-    many = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "2")
+    many = dict.fromkeys(ONE_THREAD, "2")
     processes.scheduler()
     processes.worker("--preload", "numpy", **many)
     wait_for(processes.address, 1)
@@ -176,26 +177,6 @@ def test_map_without_workers_or_with_other_versions_raises(processes, other_nump
 def of_workers(lines):
     """What collects the lines about workers; one about the open scheduler comes first."""
     return lambda line: lines.append(line) if line.startswith("worker tcp://127.0.0.1") else None
-
-
-def test_map_worker_with_other_versions_that_joins_later_is_left_out(processes, other_numpy):
-    processes.scheduler()
-    processes.worker()
-    wait_for(processes.address, 1)
-    lines = []
-
-    def jobs():
-        yield 1
-        processes.worker(**other_numpy)
-        wait_for(processes.address, 2)
-        # A worker may be busy with its first job.
-        yield from islice(iter(lambda: 1 if not lines else None, None), 10_000)
-        yield from range(10, 30)
-
-    executor = DaskExecutor(scheduler=processes.address, notify=of_workers(lines))
-    assert sorted(executor.map(double, jobs(), lost))[-20:] == [*range(20, 60, 2)]
-    (line,) = lines
-    assert "is left out: numpy is 1.0 there and" in line
 
 
 @pytest.mark.usefixtures("impatient")

@@ -9,6 +9,7 @@ import pytest
 import rasterio
 import yaml
 from scipy import ndimage
+from tests.pipeline.cli.test_main import flexroad
 
 from flexroad.catalog import Catalog, Layer
 from flexroad.pipeline.config.loading import load_config
@@ -22,7 +23,6 @@ from flexroad.tools.train.driver import LabelledTiles, Samples, TrainOptions, tr
 from flexroad.tools.train.spatial_split import inside, split
 from tests.command_line import call
 from tests.make_backbone import save_backbone
-from tests.pipeline.cli.test_main import flexroad
 
 
 @pytest.fixture(scope="module")
