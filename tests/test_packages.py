@@ -1,4 +1,4 @@
-"""The wheel, the container file and the conda recipes have what the project needs, in its versions."""
+"""The wheel, the container file, the conda recipes and the built viewer are those of the sources."""
 
 import os
 import re
@@ -20,6 +20,7 @@ TABLES = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT = TABLES["project"]
 PINS = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().split())
 CONTAINER = (ROOT / "Containerfile").read_text()
+VIEWER = ROOT / "viewer"
 OPERATIONS = ROOT / "docs" / "operations"
 RECIPES = {
     path.parent.name: yaml.safe_load(path.read_text()) for path in OPERATIONS.glob("conda/*/recipe.yaml")
@@ -124,3 +125,30 @@ def test_container_compiles_what_a_run_of_another_user_needs(tmp_path):
     home.mkdir()
     shell(f"cd {home}; {survey}; {run}", HOME=str(home))
     assert {path: path.stat().st_mtime_ns for path in compiled.rglob("*") if path.is_file()} == kernels
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("npm") is None, reason="npm is not installed")
+def test_viewer_built_again_has_the_same_bytes(tmp_path):
+    copy = shutil.copytree(VIEWER, tmp_path / "viewer", ignore=shutil.ignore_patterns("node_modules", "dist"))
+    install = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--prefer-offline"]
+    subprocess.run(install, cwd=copy, check=True, capture_output=True)
+    subprocess.run(["node", "build.js", tmp_path / "built"], cwd=copy, check=True, capture_output=True)
+    again, built = (
+        {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+        for folder in (tmp_path / "built", VIEWER / "dist")
+    )
+    assert again == built
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_parts_of_the_viewer_pass_their_own_tests():
+    done = subprocess.run(
+        ["node", "--test", "tests/"], cwd=VIEWER, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def test_lock_file_names_no_server():
+    assert '"resolved"' not in (VIEWER / "package-lock.json").read_text()
