@@ -9,7 +9,6 @@ import pytest
 import rasterio
 import yaml
 from scipy import ndimage
-from tests.pipeline.cli.test_main import flexroad
 
 from flexroad.catalog import Catalog, Layer
 from flexroad.pipeline.config.loading import load_config
@@ -22,6 +21,7 @@ from flexroad.tools.synthetic.scenes import write_scenes
 from flexroad.tools.train.driver import LabelledTiles, TrainOptions, inside, samples, split, train
 from tests.command_line import call
 from tests.make_backbone import save_backbone
+from tests.pipeline.cli.test_run import flexroad
 
 
 @pytest.fixture(scope="module")
