@@ -121,8 +121,8 @@ def test_run_whose_creation_failed_goes_on(nightly, tmp_path, monkeypatch, name)
 
 
 def test_allow_after_the_command_names_its_place(flexroad, tmp_path):
-    said = flexroad("catalog", "check", tmp_path / "c.json", "--allow", tmp_path, expect=2)
-    assert "--allow stands before the command: flexroad --allow FOLDER COMMAND" in said
+    said = flexroad("catalog", "check", tmp_path / "c.json", "--allow", tmp_path).expected(2)
+    assert "--allow stands before the command: flexroad --allow FOLDER COMMAND" in said.err
 
 
 def test_clean_dry_run_lists_files_that_clean_deletes(nightly, survey, tmp_path):
