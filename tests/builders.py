@@ -1,17 +1,23 @@
 """Small objects of the program for tests: grids, tiles, masks, clusters, surfaces and finished runs."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
 
 from flexroad.catalog import Catalog, Grid
+from flexroad.catalog.borders import border_of
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.border import ENDS
+from flexroad.tasks.fit import smoothing_spline
+from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
@@ -94,3 +100,25 @@ def copy_run(made: Run, survey: Path, folder: Path) -> Run:
     ids = {tile.id for tile in made.catalog.tiles}
     tiles = [tile for tile in Catalog.read(own / "catalog.parquet").tiles if tile.id in ids]
     return Run.create(folder / "run", made.config, Catalog(tuple(tiles)))
+
+
+def given_heights(heights: np.ndarray, grid: Grid) -> Any:
+    """Return a surface with these heights at the cells of a grid."""
+    return SimpleNamespace(bounds=grid.hull, lattice=lambda eastings, northings: heights)
+
+
+def make_frame(
+    part: Callable[[Grid], tuple[TileData, RoadMask, RoadClusters]],
+    tile: Grid,
+    around_m: float,
+    options: smoothing_spline.Options,
+) -> Frame:
+    """Fit the corners and edges of a tile, as in a run. ``part`` returns what a grid has."""
+    parts: list[Any] = []
+    for number, border in enumerate(border_of(tile, around_m)):
+        if number < 4:
+            parts.append(smoothing_spline.corner(*part(border.grid), border, options))
+        else:
+            ends = [parts[end] for end in ENDS[number - 4]]
+            parts.append(smoothing_spline.edge(*part(border.grid), border, ends, options))
+    return Frame(*parts)
