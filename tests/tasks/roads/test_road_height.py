@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Grid
-from flexroad.catalog.borders import border_of
-from flexroad.tasks.border import ENDS
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality import assess
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.road_height import dsm_offset, with_road_heights
-from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 from flexroad.tools.prepare.points.to_rasters import Options as Rastering
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from flexroad.tools.synthetic.scene import scan
+from tests.builders import make_frame
 from tests.make_clouds import rasterise
 
 GRID = Grid("EPSG:25832", 500000, 5600300, 1.0, 300, 300)
@@ -47,11 +45,8 @@ def test_dsm_offset_is_local_median_on_open_road():
     assert np.abs(offset - 0.02)[:, :100][road[:, :100]].max() < 0.01
     assert np.abs(offset - 0.08)[:, 200:][road[:, 200:]].max() < 0.01
     assert np.isfinite(offset).all()
-
-
-def test_dsm_offset_without_open_road_is_zero():
-    data, clusters = flat(np.zeros(GRID.shape, bool), 0.05)
-    assert not dsm_offset(data, clusters.mask).any()
+    # Without open road it is 0.
+    assert not dsm_offset(data, np.zeros_like(road)).any()
 
 
 def test_dsm_offset_of_part_equals_that_of_whole_inside():
@@ -95,30 +90,21 @@ def filtered(data):
 
 def part_of(data, grid):
     cut = data.grid.window(grid)
-    layer = None if data.road_height is None else data.road_height[cut]
-    return replace(
-        data,
-        grid=grid,
-        core=grid,
-        dsm=data.dsm[cut],
-        dtm=data.dtm[cut],
-        road_mask=data.road_mask[cut],
-        road_height=layer,
-    )
+    names = ("dsm", "dtm", "road_mask", "road_height")
+    layers = {name: None if (layer := getattr(data, name)) is None else layer[cut] for name in names}
+    return replace(data, grid=grid, core=grid, **layers)
 
 
 def surface_of(data):
     """Fit the corners, the edges and the tile, as in a run."""
-    parts, options = [], smoothing_spline.Options()
-    for number, border in enumerate(border_of(CORE, AROUND_M)):
-        around = part_of(data, border.grid)
-        road, clusters = filtered(around)
-        if number < 4:
-            parts.append(smoothing_spline.corner(around, road, clusters, border, options))
-        else:
-            ends = [parts[end] for end in ENDS[number - 4]]
-            parts.append(smoothing_spline.edge(around, road, clusters, border, ends, options))
-    return smoothing_spline.fit(data, filtered(data)[1], options, Frame(*parts))
+
+    def around(grid):
+        part = part_of(data, grid)
+        return part, *filtered(part)
+
+    options = smoothing_spline.Options()
+    frame = make_frame(around, CORE, AROUND_M, options)
+    return smoothing_spline.fit(data, filtered(data)[1], options, frame)
 
 
 @pytest.mark.slow
