@@ -1,11 +1,16 @@
+"""Parts of meshes by class and level, and normals at their vertices."""
+
 from dataclasses import replace
 
 import numpy as np
+import trimesh
 
-from flexroad.catalog.grid import Grid
+from flexroad.tasks.meshing.normals import vertex_normals
 from flexroad.tasks.meshing.parts import highest_first, part, texture_coordinates, with_levels
+from flexroad.tasks.meshing.triangulate import delaunay
 from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.types import Mesh
+from tests.builders import make_grid
 from tests.crossing import DECK_M, RISE, SOUTH, WEST, Crossing
 
 VERTICES = np.array([[0, 0, 1], [10, 0, 2], [10, 10, 3], [0, 10, 4], [5, 15, 5]], float)
@@ -17,9 +22,6 @@ def test_part_has_the_same_triangles_and_only_their_vertices():
     used, corners = part(MESH, MESH.road)
     np.testing.assert_array_equal(used, [0, 2, 3])
     np.testing.assert_array_equal(VERTICES[used][corners], VERTICES[FACES[MESH.road]])
-
-
-def test_part_without_faces_is_empty():
     used, corners = part(MESH, np.zeros(3, bool))
     assert (used.shape, corners.shape) == ((0,), (0, 3))
 
@@ -40,9 +42,7 @@ def test_meshes_of_levels_as_one_can_be_taken_apart():
             own.vertices[own.faces] + own.origin, mesh.vertices[mesh.faces] + mesh.origin
         )
         np.testing.assert_array_equal(own.road, mesh.road)
-
-
-def test_mesh_without_levels_is_that_of_level_0():
+    # A mesh without levels is level 0.
     assert with_levels({0: MESH}) is MESH
     assert MESH.numbers == (0,)
     assert MESH.at(0) is MESH
@@ -50,7 +50,21 @@ def test_mesh_without_levels_is_that_of_level_0():
 
 def test_height_over_faces_of_the_highest_level_is_that_of_the_deck():
     mesh, _ = Crossing((40.0, 30.0)).mesh()
-    grid = Grid(mesh.crs, WEST + 35, SOUTH + 32, 1.0, 10, 4)
+    grid = make_grid(10, 4, west=WEST + 35, north=SOUTH + 32)
     top = drape(replace(mesh, faces=highest_first(mesh)), grid) + mesh.origin[2]
     np.testing.assert_allclose(top, DECK_M + RISE * np.tile(grid.eastings - WEST, (4, 1)), atol=2e-3)
     assert highest_first(MESH) is FACES
+
+
+def test_normals_equal_those_of_trimesh():
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0, 10, (300, 3))
+    faces = delaunay(points)
+    truth = trimesh.Trimesh(points, faces, process=False).vertex_normals
+    np.testing.assert_allclose(vertex_normals(points, faces), truth, atol=1e-9)
+
+
+def test_vertex_of_lines_only_looks_up():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 5, 5]])
+    normals = vertex_normals(points, np.array([[0, 1, 2]], np.int32))
+    np.testing.assert_array_equal(normals, np.tile([0.0, 0.0, 1.0], (4, 1)))
