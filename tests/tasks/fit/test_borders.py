@@ -29,12 +29,15 @@ FILTER = planar.Options(shoulder_m=5)
 OPTIONS = smoothing_spline.Options()
 ALL = Grid("EPSG:25832", 500000, 5600500, 1.0, 500, 500)
 """Two by two tiles of 250 m."""
+WORLD = ALL.buffered(AROUND_M)
+EAST, NORTH = np.meshgrid(WORLD.eastings - 500250, WORLD.northings - 5600250)
+"""Places of the cells of a world from its middle (m)."""
 NORTH_WEST, SOUTH_WEST = (Grid("EPSG:25832", 500000, north, 1.0, 250, 250) for north in (5600500, 5600250))
 
 
 @cache
 def made_world(stratum):
-    scene = make_scene(ALL.buffered(AROUND_M), 3, stratum)
+    scene = make_scene(WORLD, 3, stratum)
     return TileData(
         "world", scene.grid, ALL, scene.dsm, scene.dtm, scene.road_mask, scene.reference, scene.reference_road
     )
@@ -105,12 +108,9 @@ def at_cells(control):
     return (along @ control @ along.T)[::-1]
 
 
-def with_void(world, radius):
-    """Return the world without heights around the corner in its middle, and the cells of the void."""
-    east, north = np.meshgrid(world.grid.eastings - 500250, world.grid.northings - 5600250)
-    void = np.hypot(east, north) < radius
-    dsm, dtm = (np.where(void, np.nan, heights) for heights in (world.dsm, world.dtm))
-    return replace(world, dsm=dsm, dtm=dtm), void[world.grid.window(ALL)]
+def without(world, void, *layers):
+    """Return the world without the heights of some cells."""
+    return replace(world, **{name: np.where(void, np.nan, getattr(world, name)) for name in layers})
 
 
 def away_from_one_fit(world, monkeypatch):
@@ -133,8 +133,9 @@ def test_tiles_equal_one_fit_of_all(monkeypatch, stratum):
 @pytest.mark.slow
 @pytest.mark.parametrize("stratum", ["urban", "rural"])
 def test_void_on_corner_is_bridged_as_by_one_fit_of_all(monkeypatch, stratum):
-    world, void = with_void(made_world(stratum), radius=70)
-    off = away_from_one_fit(world, monkeypatch)
+    world, void = made_world(stratum), np.hypot(EAST, NORTH) < 70
+    off = away_from_one_fit(without(world, void, "dsm", "dtm"), monkeypatch)
+    void = void[world.grid.window(ALL)]
     assert off[void].max() < 0.010
     assert off[~void].mean() < 0.5e-3
 
@@ -180,14 +181,12 @@ def test_change_beyond_reach_leaves_border_unchanged():
 
 def viaduct(height_m=8.0):
     """A deck over a valley, 300 m long and across the border between two tiles; the DTM has the valley."""
-    grid = ALL.buffered(AROUND_M)
-    east, north = np.meshgrid(grid.eastings - 500250, grid.northings - 5600125)
-    road = np.abs(north) < 6
-    valley = height_m * np.clip((150 - np.abs(east)) / 40, 0, 1)
+    road = np.abs(NORTH + 125) < 6
+    valley = height_m * np.clip((150 - np.abs(EAST)) / 40, 0, 1)
     rng = np.random.default_rng(0)
-    dtm = 200 - valley + rng.normal(0, 0.02, grid.shape)
-    dsm = np.where(road, 200 + rng.normal(0, 0.02, grid.shape), dtm)
-    return TileData("viaduct", grid, ALL, dsm, dtm, road)
+    dtm = 200 - valley + rng.normal(0, 0.02, EAST.shape)
+    dsm = np.where(road, 200 + rng.normal(0, 0.02, EAST.shape), dtm)
+    return TileData("viaduct", WORLD, ALL, dsm, dtm, road)
 
 
 def test_viaduct_across_border_is_kept():
@@ -200,13 +199,9 @@ def test_viaduct_across_border_is_kept():
 
 def with_random_voids(world, seed):
     """Return the world with round voids of 2 to 60 m radius, in the DTM or in both models."""
-    rng = np.random.default_rng(seed)
-    east, north = np.meshgrid(world.grid.eastings - 500000, world.grid.northings - 5600000)
-    void = np.zeros(world.grid.shape, bool)
-    for x, y, radius in rng.uniform((0, 0, 2), (500, 500, 60), (12, 3)):
-        void |= np.hypot(east - x, north - y) < radius
-    dtm = np.where(void, np.nan, world.dtm)
-    return replace(world, dtm=dtm, dsm=np.where(void, np.nan, world.dsm) if seed % 2 else world.dsm)
+    circles = np.random.default_rng(seed).uniform((-250, -250, 2), (250, 250, 60), (12, 3))
+    void = np.any([np.hypot(EAST - x, NORTH - y) < radius for x, y, radius in circles], axis=0)
+    return without(world, void, "dtm", *["dsm"] * (seed % 2))
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -248,7 +243,7 @@ def test_part_with_dtm_checked_near_border_equals_that_of_complete_filter(monkey
 
 def test_border_without_ground_is_left_free():
     world = made_world("rural")
-    nothing = replace(world, dsm=np.full_like(world.dsm, np.nan), dtm=np.full_like(world.dtm, np.nan))
+    nothing = without(world, True, "dsm", "dtm")
     frame = frame_of(nothing, SOUTH_WEST)
     assert np.isnan(frame.control((73, 73))).all()
     assert not frame.south.inside.any()
@@ -257,25 +252,20 @@ def test_border_without_ground_is_left_free():
     np.testing.assert_array_equal(free.A, alone.A)
 
 
-def without_heights_around_middle(world, half_m, layers):
-    east, north = np.meshgrid(world.grid.eastings - 500250, world.grid.northings - 5600250)
-    void = np.maximum(np.abs(east), np.abs(north)) < half_m
-    lost = {name: np.where(void, np.nan, getattr(world, name)) for name in layers}
-    return replace(world, road_mask=world.road_mask & ~void, **lost)
-
-
 def test_corner_with_little_ground_is_fitted():
     """The corner must not be left to each tile."""
     world = made_world("rural")
-    road = world.road_mask
+    away, road = np.maximum(np.abs(EAST), np.abs(NORTH)), world.road_mask
     without_road = replace(world, road_mask=np.zeros_like(road))
-    road_alone = replace(world, dtm=np.full_like(world.dtm, np.nan), road_mask=np.ones_like(road))
+    road_alone = replace(without(world, True, "dtm"), road_mask=np.ones_like(road))
     # Three intervals of 27.8 m would end before the ground, which begins 97 m away.
-    far, wide = without_heights_around_middle(world, 97, ("dsm", "dtm")), {"spacing_m": 30.0}
+    far = replace(without(world, away < 97, "dsm", "dtm"), road_mask=road & (away >= 97))
+    wide = {"spacing_m": 30.0}
     for given, changes in ((without_road, {}), (road_alone, {}), (far, wide)):
         assert np.isfinite(north_east_corner(given, OPTIONS.model_copy(update=changes))).all()
     # Tiles bridge ground that has only a DSM.
-    control = north_east_corner(without_heights_around_middle(world, 120, ("dtm",)))
+    dsm_alone = replace(without(world, away < 120, "dtm"), road_mask=road & (away >= 120))
+    control = north_east_corner(dsm_alone)
     middle = world.grid.cells(np.array([500250.0]), np.array([5600250.0]))
     np.testing.assert_allclose(control, world.dsm[middle][0], atol=5)
 

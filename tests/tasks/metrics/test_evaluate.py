@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,17 +38,23 @@ def on_lattice(grid: Grid, height_at, bounds=None, step=1.0) -> Mesh:
     return Mesh(grid.crs, origin, vertices, faces, np.zeros(len(faces), bool))
 
 
-class Level:
-    """A surface at 160 m."""
+def surface(height_at):
+    """Return a surface with these heights at eastings and northings."""
 
-    def lattice(self, eastings, northings):
-        return np.full((len(northings), len(eastings)), 160.0)
+    def lattice(eastings, northings):
+        heights = height_at(eastings[None, :], northings[:, None])
+        return np.broadcast_to(heights, (len(northings), len(eastings)))
+
+    return SimpleNamespace(lattice=lattice)
+
+
+LEVEL = surface(lambda x, y: 160.0)
 
 
 def figures(mesh, grid, truth, is_road=None, options=None, **layers) -> Metrics:
     is_road = np.zeros(grid.shape, bool) if is_road is None else is_road
     data = make_tile(truth, grid=grid, **layers)
-    return evaluate(mesh, data, make_mask(is_road), Level(), options or Options())
+    return evaluate(mesh, data, make_mask(is_road), LEVEL, options or Options())
 
 
 def centres(grid: Grid):
@@ -160,7 +167,7 @@ def test_evaluate_ignores_halo():
     is_road[grid.window(core)] = western_half(core)
     mesh = on_lattice(core, tilt(0.0), bounds=core.bounds)
     inputs = TileData("t", grid, core, truth, truth), RoadMask(grid, core, is_road, np.zeros_like(is_road))
-    metrics = evaluate(mesh, *inputs, Level(), Options(nearest=True))
+    metrics = evaluate(mesh, *inputs, LEVEL, Options(nearest=True))
     assert (metrics.l2_road_m, metrics.nearest_road_m) == pytest.approx((1, 1))
     assert (metrics.completeness, metrics.road_fraction) == (1, 0.5)
 
@@ -330,7 +337,7 @@ def test_evaluate_truth_dsm_measures_distance_from_the_dsm_where_it_has_a_height
     data = make_tile(truth + 0.5, truth, reference=truth - 1)
     data.dsm[:, :10] = np.nan
     by_dsm, by_reference = (
-        evaluate(mesh, data, make_mask(western_half(grid)), Level(), Options(truth=truth))
+        evaluate(mesh, data, make_mask(western_half(grid)), LEVEL, Options(truth=truth))
         for truth in ("dsm", "reference")
     )
     assert (by_dsm.l2_road_m, by_dsm.road_fraction) == pytest.approx((0.5, 10 / 30))
@@ -353,22 +360,9 @@ WEST = np.arange(20) < 10
 ROAD = np.tile(WEST, (20, 1))
 
 
-class Above:
-    """A surface above the mesh by the distances of its cells, ``(20, 20)``, m."""
-
-    def __init__(self, distances):
-        self.distances = distances
-
-    def lattice(self, eastings, northings):
-        row, col = CORE.cells(eastings[None, :], northings[:, None])
-        return 160.0 + self.distances[row, col]
-
-
-class Bowl:
-    """A surface bent along the easting."""
-
-    def lattice(self, eastings, northings):
-        return np.broadcast_to(160 + 0.08 * (eastings - 295500.5) ** 2, (len(northings), len(eastings)))
+def above(distances):
+    """Return a surface above the mesh by the distances of its cells, ``(20, 20)``, m."""
+    return surface(lambda x, y: 160.0 + distances[CORE.cells(x, y)])
 
 
 def strip(x, z, mask=ROAD) -> tuple[Mesh, RoadMask]:
@@ -388,22 +382,23 @@ def test_distances_are_percentile_and_maximum_of_each_class():
     distances[3, 4], distances[5, 15] = -0.5, 4.9
     mesh, road = strip([0, 20], [10.0, 10.0])
     expected = dict(zip(FIGURES, (0.02, 0.5, 0.3, 4.9), strict=True))
-    assert mesh_distances(mesh, Above(distances), road) == pytest.approx(expected)
+    assert mesh_distances(mesh, above(distances), road) == pytest.approx(expected)
 
 
 def test_mesh_with_vertices_at_centres_of_cells_has_the_distance_between_them():
     x = np.arange(20) + 0.5
     mesh, road = strip(x, 10 + 0.08 * np.arange(20) ** 2)
     expected = 0.08 * 0.25 * 0.75
-    assert list(mesh_distances(mesh, Bowl(), road).values()) == pytest.approx(4 * [expected])
+    bowl = surface(lambda x, y: 160 + 0.08 * (x - 295500.5) ** 2)
+    assert list(mesh_distances(mesh, bowl, road).values()) == pytest.approx(4 * [expected])
 
 
 def test_places_without_mesh_do_not_count():
     distances = np.where(np.arange(20) < 12, 0.1, 7.0) * np.ones((20, 1))
     mesh, road = strip([0, 12], [10.0, 10.0])
-    assert list(mesh_distances(mesh, Above(distances), road).values()) == pytest.approx(4 * [0.1])
+    assert list(mesh_distances(mesh, above(distances), road).values()) == pytest.approx(4 * [0.1])
     mesh, road = strip([0, 9], [10.0, 10.0])
-    p95, largest = list(mesh_distances(mesh, Above(distances), road).values())[2:]
+    p95, largest = list(mesh_distances(mesh, above(distances), road).values())[2:]
     assert math.isnan(p95)
     assert math.isnan(largest)
 
@@ -418,10 +413,10 @@ def level():
 def test_steps_of_the_surface_count(level):
     steps, rim = np.zeros((20, 20), np.float32), np.zeros((2, 20), np.float32)
     steps[:, 14:16] = 0.75
-    surface = SteppedSurface(**vars(level), steps=steps, cells=CORE, south_north=rim, west_east=rim)
+    stepped = SteppedSurface(**vars(level), steps=steps, cells=CORE, south_north=rim, west_east=rim)
     mesh, road = strip([0, 20], [10.0, 10.0])
     expected = dict(zip(FIGURES, (0, 0, 0.75, 0.75), strict=True))
-    assert mesh_distances(mesh, surface, road) == pytest.approx(expected, abs=1e-9)
+    assert mesh_distances(mesh, stepped, road) == pytest.approx(expected, abs=1e-9)
 
 
 def test_surface_whose_plan_moves_has_no_distance(level):
