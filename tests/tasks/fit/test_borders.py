@@ -1,7 +1,7 @@
 """Surfaces of tiles from shared corners and edges, against one fit of all tiles together."""
 
 from dataclasses import fields, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -15,14 +15,13 @@ from flexroad.tasks.border import BorderStages
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality.estimate import heights_fitted
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.segment import mask
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import basis_matrix, uniform_knots
-from flexroad.tasks.types import RoadMask, TileData
+from flexroad.tasks.types import TileData
 from flexroad.tools.synthetic import make_scene
 from tests import exact_fit
-from tests.builders import make_frame
+from tests.builders import filtered, make_frame
 
 AROUND_M = 100
 FILTER = planar.Options(shoulder_m=5)
@@ -43,40 +42,23 @@ def made_world(stratum):
     )
 
 
-def part(world, grid, core):
-    window = world.grid.window(grid)
-    dsm, dtm, road = (values[window] for values in (world.dsm, world.dtm, world.road_mask))
-    return TileData("part", grid, core, dsm, dtm, road)
-
-
-def filtered(data):
-    road = RoadMask(data.grid, data.core, data.road_mask, beyond_extent(data))
-    return road, planar.ecsrc(data, road, FILTER)
-
-
-def border_inputs(world, grid):
-    """Return what the part of a border is fitted to."""
-    data = part(world, grid, grid)
-    return data, *filtered(data)
-
-
 def frame_of(world, tile, options=OPTIONS):
-    return make_frame(lambda grid: border_inputs(world, grid), tile, AROUND_M, options)
+    return make_frame(partial(filtered, world), tile, AROUND_M, options)
 
 
 def north_east_corner(world, options=OPTIONS):
     """Return the control points of the corner in the middle of the world."""
     border = border_of(SOUTH_WEST, AROUND_M)[3]
-    return smoothing_spline.corner(*border_inputs(world, border.grid), border, options).control
+    return smoothing_spline.corner(*filtered(world, border.grid), border, options).control
 
 
 def fit_tiles(world, halo_m=50, options=OPTIONS):
     """Return the surfaces of the four tiles by (column, row), each fitted with the ground around it alone."""
     surfaces = {}
     for _, tile in ALL.tiles(250):
-        data = part(world, tile.buffered(halo_m), tile)
+        data, _, clusters = filtered(world, tile.buffered(halo_m), tile)
         key = round(tile.west - ALL.west) // 250, round(tile.south - ALL.south) // 250
-        surfaces[key] = smoothing_spline.fit(data, filtered(data)[1], options, frame_of(world, tile))
+        surfaces[key] = smoothing_spline.fit(data, clusters, options, frame_of(world, tile))
     return surfaces
 
 
@@ -90,14 +72,14 @@ def joined(surfaces):
 
 def fit_together(world, monkeypatch):
     """Return the control heights of one precise fit of the complete world, on the same lattice."""
-    data = world
+    data, _, clusters = filtered(world, WORLD, ALL)
     monkeypatch.setattr(smoothing_spline, "BORDER_TOLERANCE", 1e-8)
     lattice = smoothing_spline._lattice((250, 250), 1.0, OPTIONS)
     (n, m), (k, j) = lattice.intervals, lattice.lines_within(AROUND_M)
     u, v = (-k, 2 * n + k), (-j, 2 * m + j)
     free = np.full((2 * m + 2 * j + 3, 2 * n + 2 * k + 3), np.nan)
     start = AROUND_M + 500, AROUND_M
-    control = smoothing_spline._fitted(data, filtered(data)[1], lattice, start, u, v, free, OPTIONS)[1]
+    control = smoothing_spline._fitted(data, clusters, lattice, start, u, v, free, OPTIONS)[1]
     return control[j : j + 2 * m + 3, k : k + 2 * n + 3]
 
 
@@ -144,10 +126,10 @@ def test_void_on_corner_is_bridged_as_by_one_fit_of_all(monkeypatch, stratum):
 @pytest.mark.parametrize("stratum", ["urban", "rural"])
 def test_tile_within_borders_equals_literal_fit(monkeypatch, stratum):
     world, tile = made_world(stratum), NORTH_WEST
-    data = part(world, tile.buffered(50), tile)
+    data, _, clusters = filtered(world, tile.buffered(50), tile)
 
     def heights():
-        surface = smoothing_spline.fit(data, filtered(data)[1], OPTIONS, frame_of(world, tile))
+        surface = smoothing_spline.fit(data, clusters, OPTIONS, frame_of(world, tile))
         return surface.lattice(tile.eastings, tile.northings)
 
     ours = heights()
@@ -210,8 +192,7 @@ def test_reach_equals_distance_to_farthest_ground(seed):
     lattice = smoothing_spline._lattice((250, 250), 1.0, OPTIONS)
     reaches = set()
     for border in border_of(NORTH_WEST, AROUND_M):
-        data = part(world, border.grid, border.grid)
-        clusters = filtered(data)[1]
+        data, _, clusters = filtered(world, border.grid)
         missing = np.isnan(heights_fitted(data, clusters))
         away = border.along(scipy.ndimage.distance_transform_edt(missing)).max()
         enough = [lines for lines in (7, 14, 28) if lines * 250 / 70 >= 15 + away]
@@ -247,8 +228,8 @@ def test_border_without_ground_is_left_free():
     frame = frame_of(nothing, SOUTH_WEST)
     assert np.isnan(frame.control((73, 73))).all()
     assert not frame.south.inside.any()
-    data = part(world, SOUTH_WEST, SOUTH_WEST)
-    alone, free = (smoothing_spline.fit(data, filtered(data)[1], OPTIONS, f) for f in (None, frame))
+    data, _, clusters = filtered(world, SOUTH_WEST)
+    alone, free = (smoothing_spline.fit(data, clusters, OPTIONS, f) for f in (None, frame))
     np.testing.assert_array_equal(free.A, alone.A)
 
 
@@ -277,8 +258,8 @@ def test_borders_of_other_degrees_meet(degree):
     options = OPTIONS.model_copy(update={"degree": degree, "spacing_m": 6.0})
     surfaces = []
     for tile in (SOUTH_WEST, replace(SOUTH_WEST, west=500250)):
-        data, frame = part(world, tile, tile), frame_of(world, tile, options)
-        surfaces.append(smoothing_spline.fit(data, filtered(data)[1], options, frame))
+        data, _, clusters = filtered(world, tile)
+        surfaces.append(smoothing_spline.fit(data, clusters, options, frame_of(world, tile, options)))
     x, y = np.full(100, 500250.0), np.linspace(5600000, 5600250, 100)
     np.testing.assert_array_equal(surfaces[0].height(x, y), surfaces[1].height(x, y))
     np.testing.assert_array_equal(surfaces[0].normal(x, y), surfaces[1].normal(x, y))

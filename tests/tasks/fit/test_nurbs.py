@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from flexroad.tasks.fit import nurbs, plane
 from flexroad.tasks.spline import adam
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import clamped_space
-from tests.builders import NORTH, WEST, make_clusters, make_grid, make_tile
+from tests.builders import NORTH, WEST, make_clusters, make_grid, make_street
 from tests.gpu import needs_gpu
 
 
@@ -22,15 +23,7 @@ def wave(e, s):
     return 160 + 0.02 * e + 1.5 * np.sin(e / 30) * np.cos(s / 35)
 
 
-def tile(ground=wave, shape=(100, 100), noise=0.0):
-    """Return the data and the road of a tile, and its true heights by metres to the east and to the south."""
-    height, width = shape
-    truth = ground(*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
-    rng = np.random.default_rng(0)
-    dsm, dtm = (truth + rng.normal(0, noise, truth.shape) for _ in range(2))
-    road = np.zeros(truth.shape, bool)
-    road[height // 2 - 4 : height // 2 + 4] = True
-    return make_tile(dsm, dtm), make_clusters(road), truth
+tile = partial(make_street, wave)
 
 
 def options(**changes):
@@ -182,7 +175,7 @@ def test_fit_free_weights_stay_within_bounds(engine, monkeypatch):
 
 def test_fit_exact_start_is_kept():
     for slope, reg in ((0, 0.01), (0.02, 0)):
-        data, clusters, truth = tile(lambda e, s, slope=slope: 163 + slope * e + slope / 2 * s)
+        data, clusters, truth = make_street(lambda e, s, slope=slope: 163 + slope * e + slope / 2 * s)
         surface = fitted(data, clusters, lambda_reg=reg)
         np.testing.assert_allclose(on_cells(surface, data), truth, atol=1e-8)
         expected = np.array([-slope, slope / 2, 1]) / math.hypot(slope, slope / 2, 1)

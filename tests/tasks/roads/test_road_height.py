@@ -1,21 +1,20 @@
 """Heights that roads are fitted to, and the fit on synthetic scans with a scanner's noise."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from flexroad.catalog import Grid
-from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality import assess
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.road_height import dsm_offset, with_road_heights
-from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import RoadClusters, TileData
 from flexroad.tools.prepare.points.to_rasters import Options as Rastering
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from flexroad.tools.synthetic.scene import scan
-from tests.builders import make_frame
+from tests.builders import filtered, make_frame
 from tests.make_clouds import rasterise
 
 GRID = Grid("EPSG:25832", 500000, 5600300, 1.0, 300, 300)
@@ -83,28 +82,11 @@ def scanned(seed, stratum):
     return scene, data, rasters.top.height
 
 
-def filtered(data):
-    road = RoadMask(data.grid, data.core, data.road_mask, beyond_extent(data))
-    return road, planar.ecsrc(data, road, planar.Options(shoulder_m=5))
-
-
-def part_of(data, grid):
-    cut = data.grid.window(grid)
-    names = ("dsm", "dtm", "road_mask", "road_height")
-    layers = {name: None if (layer := getattr(data, name)) is None else layer[cut] for name in names}
-    return replace(data, grid=grid, core=grid, **layers)
-
-
 def surface_of(data):
     """Fit the corners, the edges and the tile, as in a run."""
-
-    def around(grid):
-        part = part_of(data, grid)
-        return part, *filtered(part)
-
     options = smoothing_spline.Options()
-    frame = make_frame(around, CORE, AROUND_M, options)
-    return smoothing_spline.fit(data, filtered(data)[1], options, frame)
+    frame = make_frame(partial(filtered, data), CORE, AROUND_M, options)
+    return smoothing_spline.fit(data, filtered(data, GRID, CORE)[2], options, frame)
 
 
 @pytest.mark.slow
@@ -112,7 +94,7 @@ def surface_of(data):
 def test_road_of_noisy_scan_is_unbiased_with_layer_and_offset_and_not_with_dsm(seed, stratum):
     scene, data, layer = scanned(seed, stratum)
     core = GRID.window(CORE)
-    kept = filtered(data)[1].mask[core] & scene.reference_road[core]
+    kept = filtered(data, GRID, CORE)[2].mask[core] & scene.reference_road[core]
     truth = scene.reference[core]
     rim = np.ones(CORE.shape, bool)
     rim[8:-8, 8:-8] = False
@@ -135,7 +117,7 @@ def test_road_of_noisy_scan_is_unbiased_with_layer_and_offset_and_not_with_dsm(s
 def test_assess_compares_with_the_heights_that_the_road_was_fitted_to():
     _, data, layer = scanned(3, "urban")
     for chosen, excess in ((data, 0.0), (replace(data, road_height=layer), 1.6 * NOISE_M)):
-        road, clusters = filtered(chosen)
+        _, road, clusters = filtered(chosen, GRID, CORE)
         surface = smoothing_spline.fit(chosen, clusters, smoothing_spline.Options())
         quality = assess.assess(chosen, road, clusters, surface, assess.Options())
         assert abs(quality.residual_median_m) < 0.004

@@ -1,6 +1,7 @@
 """The convex solver against exact optima; its parts against dense matrices and known integrals."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from flexroad.tasks.spline.space import clamped_space
 from flexroad.tasks.spline.stencil import from_lines, multiply, to_lines
 from flexroad.tasks.spline.surface import basis_matrix, dense
 from flexroad.tasks.spline.thin_plate import bending_energy
-from tests.builders import NORTH, WEST, make_clusters, make_grid, make_tile
+from tests.builders import NORTH, WEST, make_clusters, make_grid, make_street
 
 UNIFORM_L1 = {"lambda_terrain": 1.0, "huber_m": 0.0, "bending_m3": 100.0}
 """Options of an L1 loss with equal weights for road and terrain."""
@@ -122,13 +123,7 @@ def test_irls_huber_near_newton_reaches_same_minimum_in_few_steps(huber_m, more,
     assert (np.diff(fast) <= 0).all()
 
 
-def tile(ground, noise=0.0, size=90):
-    truth = ground(*np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5))
-    rng = np.random.default_rng(0)
-    dsm, dtm = (truth + rng.normal(0, noise, truth.shape) for _ in range(2))
-    road = np.zeros(truth.shape, bool)
-    road[size // 2 - 5 : size // 2 + 5] = True
-    return make_tile(dsm, dtm), make_clusters(road), truth
+tile = partial(make_street, shape=(90, 90))
 
 
 def fitted(data, clusters, **changes):
@@ -201,7 +196,7 @@ def test_fit_without_road_or_terrain_follows_other_data():
 def test_fit_any_input_has_no_pole_and_bounded_weights(method, options, seed, road, missing, scale):
     """Any mask and DSM: the surface stays within its control heights and near the data."""
     rng = np.random.default_rng(seed)
-    data, clusters, _ = tile(lambda e, s: 160 + 0 * e, size=40)
+    data, clusters, _ = tile(lambda e, s: 160 + 0 * e, shape=(40, 40))
     heights = np.clip(10**scale * rng.standard_t(2, (2, 40, 40)), -3000, 3000)
     heights[rng.random(heights.shape) < missing] = np.nan
     clusters.labels[:] = np.kron(rng.random((5, 5)) < road, np.ones((8, 8)))
