@@ -61,8 +61,9 @@ def fails(tile, options=None):
 
 
 @pytest.fixture
-def dtm(tmp_path):
-    return write(tmp_path / "dtm.tif", relief(seed=9), **NORTH)
+def models(tmp_path):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    write(tmp_path / "dtm.tif", relief(seed=9), **NORTH)
 
 
 def test_load_coinciding_cells_are_copied(tmp_path):
@@ -77,7 +78,7 @@ def test_load_coinciding_cells_are_copied(tmp_path):
     assert data.road_mask is data.reference is data.reference_road is None
 
 
-def test_load_offset_below_tolerance_is_copied(tmp_path, dtm):
+def test_load_offset_below_tolerance_is_copied(tmp_path, models):
     dsm = relief()
     write(tmp_path / "dsm.tif", dsm, GRID.west + 0.009, GRID.north - 0.009, cell=1.00000001)
     data = load(tile(tmp_path), Options())
@@ -101,7 +102,7 @@ def test_load_any_position_puts_cells_in_place(tmp_path_factory, row, col, size)
         np.testing.assert_array_equal(load(tile(root), Options(min_valid=0)).dsm, want)
 
 
-def test_load_overlapping_files_use_first_value(tmp_path, dtm):
+def test_load_overlapping_files_use_first_value(tmp_path, models):
     left, right = relief(20, 12), relief(20, 12, seed=1)
     left[4, 9] = np.nan
     write(tmp_path / "a.tif", left, **NORTH)
@@ -140,7 +141,7 @@ def test_load_opens_only_files_that_reach_the_grid(tmp_path):
     assert len(load(tile_with_files, Options(halo_m=6)).notes) == 2
 
 
-def test_load_other_formats_give_same_heights(tmp_path, dtm):
+def test_load_other_formats_give_same_heights(tmp_path, models):
     dsm = relief().round(2)
     write_xyz(tmp_path / "down.xyz", dsm, **NORTH)
     write_xyz(tmp_path / "up.xyz", dsm, **NORTH, northward=True)
@@ -175,7 +176,7 @@ def test_load_offset_or_swapped_models_give_one_note(tmp_path, rows, above, note
     [(cell, 20, 20, f"its cells are {cell:g} m, the tile's 1 m") for cell in (0.25, 0.5, 2.0)]
     + [(1.0, 9.91, 10.31, "its lattice is off by (0.09, 0.31) m")],
 )
-def test_load_other_lattice_is_resampled_with_note(tmp_path, dtm, cell, west, north, note):
+def test_load_other_lattice_is_resampled_with_note(tmp_path, models, cell, west, north, note):
     n = round(60 / cell)
     other = Grid(UTM, GRID.west - west, GRID.north + north, cell, n, n)
     write(tmp_path / "dsm.tif", plane(other), other.west, other.north, cell=cell)
@@ -184,7 +185,7 @@ def test_load_other_lattice_is_resampled_with_note(tmp_path, dtm, cell, west, no
     assert data.notes[0] == f"dsm resampled: {note}"
 
 
-def test_load_resampling_ignores_cells_without_value(tmp_path, dtm):
+def test_load_resampling_ignores_cells_without_value(tmp_path, models):
     """Bilinear weights without those of voids, normalised to one; voids keep their size."""
     source = relief(24, 24)
     source[8:11, 9] = np.nan
@@ -204,8 +205,7 @@ def test_load_resampling_ignores_cells_without_value(tmp_path, dtm):
     )
 
 
-def test_load_mask_is_resampled_to_nearest(tmp_path, dtm):
-    write(tmp_path / "dsm.tif", relief(), **NORTH)
+def test_load_mask_is_resampled_to_nearest(tmp_path, models):
     fine = np.repeat(np.repeat(np.array([[1, 3], [2, 1]], np.uint8), 20, 0), 20, 1)
     write(tmp_path / "mask.tif", fine, GRID.west + 0.1, GRID.north, cell=0.5)
     data = load(tile(tmp_path, road_mask="mask.tif", values=(2,)), Options())
@@ -216,7 +216,7 @@ def test_load_mask_is_resampled_to_nearest(tmp_path, dtm):
 
 
 @pytest.mark.parametrize("nodata", [-9999.0, -3.4028234663852886e38, float("nan"), 0.0])
-def test_load_declared_nodata_is_nan_without_note(tmp_path, dtm, nodata):
+def test_load_declared_nodata_is_nan_without_note(tmp_path, models, nodata):
     dsm = relief().astype(np.float32)
     dsm[3, 4] = nodata
     write(tmp_path / "dsm.tif", dsm, **NORTH, nodata=nodata)
@@ -225,7 +225,7 @@ def test_load_declared_nodata_is_nan_without_note(tmp_path, dtm, nodata):
     assert data.notes == ()
 
 
-def test_load_invalid_heights_are_nan_with_note(tmp_path, dtm):
+def test_load_invalid_heights_are_nan_with_note(tmp_path, models):
     dsm = relief()
     dsm[0, :6] = [np.inf, -np.inf, 1e30, -9999, 9001, np.nan]
     dsm[1, :2] = [-499, 8999]
@@ -259,8 +259,7 @@ def test_load_heights_become_metres(tmp_path, metres, offset, crs, form):
     np.testing.assert_array_equal(data.dtm, data.dsm)
 
 
-def test_load_masks_use_road_values_and_the_reference_is_read(tmp_path, dtm):
-    write(tmp_path / "dsm.tif", relief(), **NORTH)
+def test_load_masks_use_road_values_and_the_reference_is_read(tmp_path, models):
     classes = np.random.default_rng(3).integers(0, 4, (20, 20)).astype(np.uint8)
     write(tmp_path / "mask.tif", classes, **NORTH, nodata=3)
     masks = {"road_mask": "mask.tif", "reference_road": "mask.tif"}
@@ -274,8 +273,7 @@ def test_load_masks_use_road_values_and_the_reference_is_read(tmp_path, dtm):
     assert nonzero.road_mask.dtype == np.bool_
 
 
-def test_load_mask_without_georeference_needs_tile_size(tmp_path, dtm):
-    write(tmp_path / "dsm.tif", relief(), **NORTH)
+def test_load_mask_without_georeference_needs_tile_size(tmp_path, models):
     mask = np.tri(20, dtype=np.uint8)
     for name, values in {"same.tif": mask, "other.tif": mask[:19]}.items():
         with warnings.catch_warnings():
@@ -290,9 +288,8 @@ def test_load_mask_without_georeference_needs_tile_size(tmp_path, dtm):
     assert file == str(tmp_path / "other.tif")
 
 
-def test_load_missing_layer_fails(tmp_path, dtm):
+def test_load_missing_layer_fails(tmp_path, models):
     assert fails(tile(tmp_path, dsm=None))[0].startswith("the tile has no dsm; give its files")
-    write(tmp_path / "dsm.tif", relief(), **NORTH)
     assert "with --dtm" in fails(tile(tmp_path, dtm=None))[0]
     message, _ = fails(tile(tmp_path), Options(road_height="layer"))
     assert message == "the tile has no road_height; give its files to `flexroad catalog` with --road-height"
@@ -303,7 +300,7 @@ def test_task_error_can_be_pickled():
     assert (str(copy), copy.file, copy.layer) == ("no dsm", "a.tif", "dsm")
 
 
-def test_load_file_outside_tile_fails(tmp_path, dtm):
+def test_load_file_outside_tile_fails(tmp_path, models):
     write(tmp_path / "dsm.tif", relief(), GRID.west + 500, GRID.north)
     message, file = fails(tile(tmp_path))
     assert message.startswith("no dsm file overlaps the tile (295500 5629460 295520 5629480): dsm.tif")
@@ -317,9 +314,8 @@ def other_crs(tmp_path):
     return write(tmp_path / "other.tif", relief(40, 40), east, north, crs="EPSG:25833")
 
 
-def test_load_layer_in_other_crs_fails_and_is_left_out_of_a_border(tmp_path, dtm, other_crs):
+def test_load_layer_in_other_crs_fails_and_is_left_out_of_a_border(tmp_path, models, other_crs):
     """It fails the tile that it lies on, not those around."""
-    write(tmp_path / "dsm.tif", relief(), **NORTH)
     message, file = fails(tile(tmp_path, dtm="other.tif"))
     assert message == (
         "dtm other.tif is in EPSG:25833, the tile in EPSG:25832; reproject it, "
@@ -334,7 +330,7 @@ def test_load_layer_in_other_crs_fails_and_is_left_out_of_a_border(tmp_path, dtm
     np.testing.assert_array_equal(data.dtm, relief(seed=9))
 
 
-def test_load_file_in_local_crs_fails(tmp_path, dtm):
+def test_load_file_in_local_crs_fails(tmp_path, models):
     """A site's own coordinates cannot be transformed."""
     site = 'LOCAL_CS["my site",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
     path = write(tmp_path / "dsm.tif", relief(), **NORTH, crs=site)
@@ -343,14 +339,14 @@ def test_load_file_in_local_crs_fails(tmp_path, dtm):
     assert "dsm dsm.tif cannot be read: 'utf-8' codec can't decode" in fails(tile(tmp_path))[0]
 
 
-def test_load_mixed_units_fail(tmp_path, dtm):
+def test_load_mixed_units_fail(tmp_path, models):
     write(tmp_path / "dsm.tif", relief(), **NORTH, unit="ft")
     message, file = fails(tile(tmp_path))
     assert message.startswith("dsm dsm.tif has heights in ft, dtm dtm.tif in metre; ")
     assert file == str(tmp_path / "dtm.tif")
 
 
-def test_load_too_few_heights_fails(tmp_path, dtm):
+def test_load_too_few_heights_fails(tmp_path, models):
     dsm = np.full((20, 20), np.nan)
     write(tmp_path / "dsm.tif", dsm, **NORTH)
     assert "dsm dsm.tif has only nodata on this tile" in fails(tile(tmp_path))[0]
@@ -423,7 +419,7 @@ def test_load_fine_mask_takes_most_frequent_class(tmp_path):
     np.testing.assert_array_equal(resample_to(patch, grid, Resampling.nearest), classes[::8, ::8])
 
 
-def test_load_tile_of_too_many_cells_fails_before_reading(tmp_path, dtm):
+def test_load_tile_of_too_many_cells_fails_before_reading(tmp_path, models):
     huge = Grid(UTM, 295500.0, 5629480.0, 1.0, 30_000, 30_000)
     with pytest.raises(TaskError, match=r"30000 x 30000 cells with its halo, more than 25,000,000; catalog"):
         load(tile(tmp_path, grid=huge), Options())
@@ -433,8 +429,7 @@ def test_load_tile_of_too_many_cells_fails_before_reading(tmp_path, dtm):
     ("chosen", "has_layer", "is_read"),
     [("dsm", True, False), ("auto", True, True), ("auto", False, False), ("layer", True, True)],
 )
-def test_load_road_height_is_read_as_asked(tmp_path, dtm, chosen, has_layer, is_read):
-    write(tmp_path / "dsm.tif", relief(), **NORTH)
+def test_load_road_height_is_read_as_asked(tmp_path, models, chosen, has_layer, is_read):
     heights = relief(seed=2)
     write(tmp_path / "road_height.tif", heights, **NORTH)
     place = tile(tmp_path, road_height="road_height.tif" if has_layer else None)
