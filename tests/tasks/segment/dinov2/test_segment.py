@@ -52,13 +52,11 @@ def train_options(folder: Path, **options) -> training.Options:
 
 
 @pytest.fixture(scope="session")
-def heads(backbones, sample, tmp_path_factory) -> dict[int, Path]:
-    """Heads trained on the sample tile, by number of registers."""
-    paths = {}
-    for n, folder in backbones.items():
-        paths[n] = tmp_path_factory.mktemp("heads") / f"head-{n}.safetensors"
-        paths[n].write_bytes(training.train([sample], [sample], train_options(folder)).model)
-    return paths
+def model(backbones, sample, tmp_path_factory) -> Path:
+    """A head trained on the sample tile."""
+    path = tmp_path_factory.mktemp("heads") / "head.safetensors"
+    path.write_bytes(training.train([sample], [sample], train_options(backbones[0])).model)
+    return path
 
 
 def segmented(data: TileData, model: Path, **options):
@@ -96,17 +94,16 @@ def test_tokens_belong_to_patches(backbones, registers):
     assert int(change.argmax()) == 3 * 1 + 2
 
 
-def test_half_precision_changes_result_slightly(backbones, heads, sample):
-    whole, half = (segmented(sample.data, heads[0], device="cpu", half=half) for half in (False, True))
+def test_half_precision_changes_result_slightly(backbones, model, sample):
+    whole, half = (segmented(sample.data, model, device="cpu", half=half) for half in (False, True))
     difference = np.abs(whole.probability - half.probability)
     assert 0 < difference.max() < 0.2
     assert difference.mean() < 0.01
     assert iou(whole.mask, half.mask) > 0.97
 
 
-@pytest.mark.parametrize("registers", [0, 4])
-def test_train_small_scene_reproduces_labels(heads, sample, registers):
-    road = segmented(sample.data, heads[registers])
+def test_train_small_scene_reproduces_labels(model, sample):
+    road = segmented(sample.data, model)
     assert iou(road.mask, sample.road) > 0.75
     # A mask that is road everywhere has this fraction as IoU.
     assert sample.road.mean() < 0.25
@@ -153,11 +150,11 @@ def test_train_stops_early_and_keeps_best_epoch_and_needs_labels(backbones, samp
         training.train([sample], [no_photo], train_options(backbones[0]))
 
 
-def test_at_cells_interpolates_like_predictor(backbones, heads):
+def test_at_cells_interpolates_like_predictor(backbones, model):
     """The loss uses the same logit at a pixel's centre as the prediction."""
     import torch
 
-    backbone, head = load_backbone(str(backbones[0]), "cpu"), read_head(heads[0])
+    backbone, head = load_backbone(str(backbones[0]), "cpu"), read_head(model)
     windows = np.random.default_rng(1).normal(size=(1, 3, 56, 56)).astype(np.float32)
     predicted = predictor(head, backbone)(windows)[0]
     centres = 2 * (np.arange(56, dtype=np.float32) + 0.5) / 56 - 1
@@ -184,18 +181,18 @@ def test_best_threshold_maximises_iou():
     assert best == pytest.approx(max(each))
 
 
-def test_segment_does_not_depend_on_tiling(heads, sample):
+def test_segment_does_not_depend_on_tiling(model, sample):
     data, grid = sample.data, sample.data.grid
     smaller = Grid(grid.crs, grid.west + 20, grid.north - 17, 1.0, 35, 31)
     window = grid.window(smaller)
     part = replace(data, grid=smaller, core=smaller, dsm=data.dsm[window], dtm=data.dtm[window])
-    whole, piece = segmented(data, heads[0]), segmented(part, heads[0])
+    whole, piece = segmented(data, model), segmented(part, model)
     np.testing.assert_allclose(piece.probability, whole.probability[window], atol=2e-5)
     assert np.mean(piece.mask == whole.mask[window]) > 0.999
 
 
-def test_segment_threshold_changes_mask_only(heads, sample):
-    strict, lax = (segmented(sample.data, with_threshold(heads[0], t)) for t in (0.9, 0.1))
+def test_segment_threshold_changes_mask_only(model, sample):
+    strict, lax = (segmented(sample.data, with_threshold(model, t)) for t in (0.9, 0.1))
     np.testing.assert_array_equal(strict.probability, lax.probability)
     assert not np.any(strict.mask & ~lax.mask)
     assert strict.mask.sum() < lax.mask.sum()
@@ -203,7 +200,7 @@ def test_segment_threshold_changes_mask_only(heads, sample):
     assert np.mean(lax.mask == (lax.probability >= 0.1)) > 0.9
 
 
-def test_segment_cells_without_photo_are_no_road(heads, sample):
+def test_segment_cells_without_photo_are_no_road(model, sample):
     data, grid = sample.data, sample.data.grid
     wide = grid.buffered(30)
     rows, cols = wide.window(grid)
@@ -213,7 +210,7 @@ def test_segment_cells_without_photo_are_no_road(heads, sample):
     photo = read_photo(own, grid.buffered(10))
     assert not photo.known.all()
     np.testing.assert_array_equal(normalised(photo)[:, ~photo.known], 0)
-    road = segmented(replace(data, grid=wide, core=grid, dop=own, **around), with_threshold(heads[0], 0.01))
+    road = segmented(replace(data, grid=wide, core=grid, dop=own, **around), with_threshold(model, 0.01))
     beyond = np.ones(wide.shape, bool)
     beyond[rows, cols] = False
     assert not road.mask[beyond].any()
@@ -221,29 +218,29 @@ def test_segment_cells_without_photo_are_no_road(heads, sample):
     assert road.notes[0] == f"dop: {beyond.mean():.1%} of the cells have no orthophoto and count as no road"
 
 
-def test_segment_shifted_photo_adds_note(heads, sample, monkeypatch):
+def test_segment_shifted_photo_adds_note(model, sample, monkeypatch):
     """Its measurement is tested in tests/tasks/roads/test_coregistration.py; this tile is too small."""
-    assert segmented(sample.data, heads[0]).notes == ()
+    assert segmented(sample.data, model).notes == ()
     monkeypatch.setattr(coregistration, "note", lambda data, photo: f"{data.tile_id}: {photo.grid.cell:g} m")
-    (note,) = segmented(sample.data, heads[0]).notes
-    assert note == f"{sample.data.tile_id}: {read_head(heads[0]).about.gsd_m:g} m"
+    (note,) = segmented(sample.data, model).notes
+    assert note == f"{sample.data.tile_id}: {read_head(model).about.gsd_m:g} m"
 
 
-def test_segment_no_road_gives_empty_mask_and_note(heads, sample):
-    head = read_head(heads[0])
-    blind = heads[0].with_name("blind.safetensors")
+def test_segment_no_road_gives_empty_mask_and_note(model, sample):
+    head = read_head(model)
+    blind = model.with_name("blind.safetensors")
     blind.write_bytes(Head(head.weight * 0, head.bias * 0 - 1, head.about).encode())
     road = segmented(sample.data, blind)
     assert not road.mask.any()
     assert "no road on this tile: probabilities reach 0.27, the threshold" in road.notes[-1]
 
 
-def test_segment_broken_head_names_file_and_remedy(backbones, heads, sample, tmp_path):
+def test_segment_broken_head_names_file_and_remedy(backbones, model, sample, tmp_path):
     with pytest.raises(TaskError, match="no orthophoto .* give --dop to") as caught:
-        segmented(replace(sample.data, dop=None), heads[0])
+        segmented(replace(sample.data, dop=None), model)
     assert caught.value.layer == "dop"
     broken = tmp_path / "broken.safetensors"
-    broken.write_bytes(heads[0].read_bytes()[:-100])
+    broken.write_bytes(model.read_bytes()[:-100])
     text = tmp_path / "text.safetensors"
     text.write_text("<html>404 Not Found</html>")
     no_head = tmp_path / "other.safetensors"
@@ -256,20 +253,20 @@ def test_segment_broken_head_names_file_and_remedy(backbones, heads, sample, tmp
         assert caught.value.file == str(path)
 
 
-def test_segment_other_backbone_raises(backbones, heads, sample, tmp_path):
+def test_segment_other_backbone_raises(backbones, model, sample, tmp_path):
     other = save_backbone(tmp_path / "other", seed=1, hidden_size=96)
     with pytest.raises(TaskError, match=r"head was trained on .*tiny-0, not on .*other \(weights"):
-        segmented(sample.data, heads[0], backbone=str(other))
+        segmented(sample.data, model, backbone=str(other))
     with pytest.raises(TaskError, match="model_type dinov2 not dinov2_with_registers, registers 0 not 4"):
-        segmented(sample.data, heads[0], backbone=str(backbones[4]))
-    head = read_head(heads[0])
+        segmented(sample.data, model, backbone=str(backbones[4]))
+    head = read_head(model)
     deeper = Head(head.weight, head.bias, head.about.model_copy(update={"layers": 4}))
     with pytest.raises(TaskError, match="uses 4 layers, the backbone has 3"):
         check(deeper, load_backbone(str(backbones[0])))
 
 
 def test_segment_moved_or_downloaded_backbone_gives_same_result(
-    backbones, heads, sample, tmp_path, monkeypatch
+    backbones, model, sample, tmp_path, monkeypatch
 ):
     """The cache of downloads has the folder layout of `hf download`."""
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
@@ -278,13 +275,13 @@ def test_segment_moved_or_downloaded_backbone_gives_same_result(
     snapshot = shutil.copytree(backbones[0], home / "snapshots" / commit)
     (home / "refs").mkdir()
     (home / "refs" / "main").write_text(commit)
-    expected = segmented(sample.data, heads[0]).probability
+    expected = segmented(sample.data, model).probability
     for name in ("facebook/dinov2-tiny", str(snapshot)):
-        found = segmented(sample.data, heads[0], backbone=name).probability
+        found = segmented(sample.data, model, backbone=name).probability
         np.testing.assert_array_equal(found, expected)
-    moved = Options(model=heads[0], backbone=str(snapshot))
-    assert files(moved) == (heads[0], snapshot / "config.json", snapshot / "model.safetensors")
-    assert files(Options(model=heads[0], backbone="facebook/dinov2-small")) == (heads[0],)
+    moved = Options(model=model, backbone=str(snapshot))
+    assert files(moved) == (model, snapshot / "config.json", snapshot / "model.safetensors")
+    assert files(Options(model=model, backbone="facebook/dinov2-small")) == (model,)
 
 
 def test_load_backbone_missing_weights_names_remedy(backbones, tmp_path, monkeypatch):
@@ -322,14 +319,14 @@ def test_load_backbone_damaged_weights_raises_one_line(backbones, tmp_path):
 
 
 @pytest.mark.parametrize("module", ["transformers", "safetensors"])
-def test_segment_without_extra_names_package(heads, sample, monkeypatch, module):
+def test_segment_without_extra_names_package(model, sample, monkeypatch, module):
     load_backbone.cache_clear()
     for name in [name for name in sys.modules if name.split(".")[0] == module]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr({"transformers": backbone, "safetensors": head}[module], module, lazy(module))
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(TaskError, match=rf'needs {module}: pip install "flexroad\[dinov2\]"'):
-        segmented(sample.data, heads[0])
+        segmented(sample.data, model)
 
 
 def test_tokens_full_gpu_raises(backbones, monkeypatch):
