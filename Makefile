@@ -47,7 +47,7 @@ TRUE_SURVEY := $(REPRODUCED)/survey/catalog_true.parquet
 LITERAL_SURVEY := $(if $(GEROD_ROOT),$(SURVEY),runs/synthetic-$(LITERAL_TILES)-$(SEED)/survey/catalog.parquet)
 RESULTS ?= $(REPRODUCED)/results
 # The published dataset lies elsewhere than its catalog; an archive is unpacked beside itself.
-ABLATE = $(BIN)/flexroad run $(if $(GEROD_ROOT),--allow $(GEROD_ROOT:.zip=)) --store $(REPRODUCED)/store
+ABLATE = $(BIN)/flexroad $(if $(GEROD_ROOT),--allow $(GEROD_ROOT:.zip=)) run --store $(REPRODUCED)/store
 # DSC3D cannot be had as rasters: five synthetic scenes stand in for it, by the paper's reference and by the truth.
 STANDIN := runs/standin-$(SEED)
 SCENES := $(STANDIN)/scenes/catalog.parquet
@@ -64,7 +64,7 @@ reproduce: $(SURVEY) $(SCENES) $(LITERAL_SURVEY) ## The paper's tables and figur
 	$(BIN)/flexroad figures $(REPRODUCED)/segmented -o $(RESULTS)
 
 # Made once: rasters written anew have new times, and all that hangs on them would be computed again.
-MESHED := $(addprefix tools/synthetic/,command.py dsc3d.py photogrammetry.py)
+MESHED := $(addprefix tools/synthetic/,command.py dsc3d.py)
 MADE := $(filter-out $(MESHED),$(wildcard tools/synthetic/*.py))
 runs/synthetic-%-$(SEED)/survey/catalog.parquet: $(MADE) | $(STAMP)
 	$(BIN)/flexroad catalog synthetic --preset gerod -o $(@D) --tiles $* --seed $(SEED)
@@ -86,10 +86,22 @@ rerun: $(STAMP) ## Bring tiles of a run up to date: make rerun RUN=... [TILE=...
 # Each process has one thread, so that two of them use two cores. A file's tests share fixtures, so they stay together.
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
-test: $(STAMP) ## Run the tests but for the slow ones: minutes
-	$(PYTEST) -m "not slow"
+TESTED = $(if $(AREA),$(or $(shell find tests -type d -name '$(AREA)'),$(error no folder of tests has the name $(AREA))))
+# Both test processes would compile the same functions: two small runs compile them first, side by side.
+COMPILED := $(VENV)/.compiled
+COMPILING := $(VENV)/compiling
+$(COMPILED): $(STAMP) $(wildcard tasks/*.py tasks/*/*.py)
+	rm -rf $(COMPILING)
+	$(BIN)/flexroad catalog synthetic --tiles 1 --tile-size 120 --decks -o $(COMPILING)/survey > $(VENV)/compiled.log
+	printf '%s\n' paper production_vector | xargs -P 2 -I {} $(BIN)/flexroad run --executor serial \
+	  --config {} --catalog $(COMPILING)/survey/catalog.parquet --out $(COMPILING)/{} >> $(VENV)/compiled.log
+	rm -rf $(COMPILING)
+	touch $@
 
-test-all: $(STAMP) ## Run all tests
+test: $(STAMP) $(if $(AREA),,$(COMPILED)) ## Run the tests but for the slow ones: minutes; or those of one folder: make test AREA=lift
+	$(PYTEST) -m "not slow" $(TESTED)
+
+test-all: $(STAMP) $(COMPILED) ## Run all tests
 	$(PYTEST)
 
 soak: export FLEXROAD_VALIDATORS := $(VALIDATORS)

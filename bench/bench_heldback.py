@@ -149,7 +149,7 @@ def scanned(
     others: Path | None = None,
 ) -> Place:
     """Withhold points of a scan and prepare it without them."""
-    call("prepare", "points", *files, *options, *roads, "-o", folder / "whole", "--workers", 1)
+    call("prepare", *files, *options, *roads, "-o", folder / "whole", "--workers", 1)
     clouds = [laspy.read(file) for file in files]
     x, y, z = (np.concatenate([np.asarray(cloud[a]) for cloud in clouds]) * unit for a in "xyz")
     kind = np.concatenate([np.asarray(cloud.classification) for cloud in clouds])
@@ -164,7 +164,7 @@ def scanned(
         (folder / "points").mkdir(exist_ok=True)
         left.write(folder / "points" / file.name)
     kept_files = [folder / "points" / file.name for file in files]
-    call("prepare", "points", *kept_files, *options, *roads, "-o", folder / "left", "--workers", 1)
+    call("prepare", *kept_files, *options, *roads, "-o", folder / "left", "--workers", 1)
     dtm, mask = folder / "whole" / "dtm.tif", folder / "whole" / "road_mask.tif"
     has_classes = (kind == GROUND).mean() > 0.01
     ground = np.isin(kind, (GROUND, DECK)) if has_classes else np.abs(bilinear(dtm, x, y) - z) < NEAR_M
@@ -268,7 +268,7 @@ def places(data: Path | None, roads: Path) -> dict[str, Maker]:
     drawn = data / "autzen" / "roads" / "autzen_north_roads.gpkg"
     found["Autzen north"] = lambda folder, draw: scanned(
         [data / "autzen" / "autzen_north.laz"],
-        ["--roads", drawn, "--roads-layer", "road_polygons", "--roads-where", where],
+        ["--roads", f"{drawn}|layername=road_polygons", "--roads-where", where],
         ["--crs", "EPSG:2994"], folder, draw, FOOT_M, data / "autzen" / "autzen-thin.las",
     )  # fmt: skip
     found["IGN"] = lambda folder, draw: scanned(
@@ -305,8 +305,8 @@ def run(place: Place, config: str, options: Sequence[str], folder: Path) -> flex
     file = folder.with_suffix(".yaml")
     file.write_text(f"extends: {config}\nvariants: {{flexroad: {{}}}}\n")
     chosen = [word for option in options for word in ("--set", option)]
-    call("run", "--config", file, *chosen, "--executor", "serial",
-         "--catalog", place.catalog, "--out", folder, "--allow", place.catalog.anchor)  # fmt: skip
+    call("--allow", place.catalog.anchor, "run", "--config", file, *chosen, "--executor", "serial",
+         "--catalog", place.catalog, "--out", folder)  # fmt: skip
     return flexroad.open_run(folder, allow=[place.catalog.anchor])
 
 
@@ -349,7 +349,7 @@ def estimates(folder: Path, place: Place, truth: Truth) -> Floats:
     for tile in select(str(folder), allow=[str(place.catalog.anchor)]).finished():
         west, south, east, north = tile.tile.grid.bounds
         inside = (truth.x >= west) & (truth.x < east) & (truth.y > south) & (truth.y <= north)
-        error, _ = tile.cell_errors
+        error, _ = tile.level_errors(0)
         road = tile.road.mask[tile.road.grid.window(tile.road.core)]
         cells = tile.tile.grid.cells(truth.x[inside], truth.y[inside])
         estimate[inside] = np.where(road, error, np.nan)[cells]

@@ -36,7 +36,7 @@ from flexroad.pipeline.execute.executor import Probe
 from flexroad.pipeline.graph.graph import Node
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.store.codec import HEADER
+from flexroad.pipeline.store.artefacts import HEADER
 from flexroad.pipeline.store.database import NAME as DATABASE
 from flexroad.pipeline.store.records import DONE, from_item, load_checked
 from flexroad.pipeline.worker.tile import TileJob, TileResult, marker_stat

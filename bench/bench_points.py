@@ -1,4 +1,4 @@
-"""``prepare points`` beside the decoding of its file, with classes and with the slope filter, and by workers.
+"""``prepare`` of points beside the decoding of its file: with classes, with the slope filter, by workers.
 
 CPU seconds of complete commands: the lowest of some rounds, with those of their worker processes. A synthetic
 scan always; with FLEXROAD_REAL_DATA also the north of Autzen, whose ground the slope filter then classifies.
@@ -132,7 +132,7 @@ def compare(
 def prepare(file: Path, out: Path, method: str, workers: int = 1, root: Path = HERE) -> Cost:
     """Run the command from one file into a new folder."""
     shutil.rmtree(out, ignore_errors=True)
-    words = f"prepare points {file} -o {out} --ground {method} --workers {workers} --date 2020-01-01"
+    words = f"prepare {file} -o {out} --ground {method} --workers {workers} --date 2020-01-01"
     return run([COMMAND, *words.split()], root)
 
 

@@ -205,8 +205,8 @@ ROADS = "class = 'road' AND certainty <> 'low' AND visible_in IS NOT 'rgb'"
 def autzen(folder: Path, scratch: Path) -> None:
     """Compare on the roads of an unclassified scan, at ground points of another classification."""
     out = scratch / "autzen"
-    words = ["prepare", "points", folder / "autzen_north.laz", "--crs", "EPSG:2994", "-o", out]
-    words += ["--roads", folder / "roads" / "autzen_north_roads.gpkg", "--roads-layer", "road_polygons"]
+    words = ["prepare", folder / "autzen_north.laz", "--crs", "EPSG:2994", "-o", out]
+    words += ["--roads", f"{folder / 'roads' / 'autzen_north_roads.gpkg'}|layername=road_polygons"]
     call([*map(str, words), "--roads-where", ROADS])
     cloud = laspy.read(folder / "autzen-thin.las")
     ground = np.asarray(cloud.classification) == 2

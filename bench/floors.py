@@ -142,9 +142,9 @@ def counted_fits() -> Iterator[list[FitSize]]:
     convex, descent = smoothing_spline.minimise, adam.minimise
 
     def by_steps(loss: Any, start: Any, *rest: Any, **options: Any) -> Any:
-        solution = convex(loss, start, *rest, **options)
-        fits.append(FitSize(loss.objective.target.shape, start.shape, len(solution.losses) - 1, 1))
-        return solution
+        best, losses = convex(loss, start, *rest, **options)
+        fits.append(FitSize(loss.objective.target.shape, start.shape, len(losses) - 1, 1))
+        return best, losses
 
     def by_adam(loss: Any, start: Any, *rest: Any, **options: Any) -> Any:
         best, losses = descent(loss, start, *rest, **options)

@@ -17,8 +17,8 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.guard.open_vector import ERRORS, in_its_encoding, vector_name
 from flexroad.catalog.guard.source_files import InputRejected
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.scan.vectors import layers, listed
-from flexroad.catalog.text import count, reason
+from flexroad.catalog.scan.vectors import file_and_layer, one_layer
+from flexroad.catalog.text import reason
 
 pyogrio = lazy("pyogrio")
 
@@ -39,23 +39,17 @@ class Area:
     """Polygons of shapely in the CRS, ``(n,)``."""
 
     @classmethod
-    def read(cls, path: Path, layer: str | None = None) -> Area:
+    def read(cls, given: Path | str) -> Area:
         """Read the polygons of a vector file.
 
-        - `path`: GeoPackage, GeoJSON, FlatGeobuf or Shapefile.
+        - `given`: GeoPackage, GeoJSON, FlatGeobuf or Shapefile; with a layer as in `file_and_layer`.
         """
+        path, layer = file_and_layer(given)
         try:
             name = vector_name(path)
-            found = layers(path)
-            if layer is None and len(found) > 1:
-                raise CatalogError(
-                    f"--area {path} has {count(len(found), 'layer')}: {listed(found)}; "
-                    "name one with --area-layer"
-                )
-            if layer is not None and layer not in found:
-                raise CatalogError(f"--area {path} has no layer {layer!r}; it has {listed(found) or 'none'}")
+            layer = one_layer(f"--area {path}", path, layer)
             read = partial(pyogrio.read_dataframe, name, layer=layer, columns=[])
-            table = in_its_encoding(read)[0] if found else None
+            table = in_its_encoding(read)[0] if layer else None
         except InputRejected as error:
             raise CatalogError(f"--area {path} {error}") from error
         except ERRORS as error:

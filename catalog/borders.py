@@ -83,7 +83,6 @@ class Border:
 def border_of(tile: Grid, reach_m: float) -> tuple[Border, ...]:
     """Return the border of a tile, in the order of `places_of`.
 
-    - `tile`: the tile, without halo.
     - `reach_m`: distance from the corner or edge up to which its grid reaches (m).
     """
     size = tile.width, tile.height

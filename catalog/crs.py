@@ -56,6 +56,12 @@ def plan_unit(text: str) -> Unit:
     return axis.unit_name, axis.unit_conversion_factor
 
 
+def plan_units(text: str) -> str:
+    """Return the name of the unit of eastings and northings in the plural, for messages."""
+    unit = plan_unit(text)[0]
+    return unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
+
+
 def height_unit(text: str) -> Unit | None:
     """Return the unit of heights, or None if the CRS has no height axis."""
     plan, height = _parts(text)
@@ -153,7 +159,6 @@ def utm_of(degrees: Bounds) -> str:
 def metric_twin(text: str, easting: float, northing: float) -> str:
     """Return the same projection in metres: its code in the EPSG register if it has one, else WKT.
 
-    - `text`: a projected CRS in any unit.
     - `easting`, `northing`: any point of the data, in units of ``text``; only CRSs of the register that are
       valid at this point are considered.
     """

@@ -60,7 +60,6 @@ def angle_fault(crs: str, bounds: Bounds) -> str | None:
 def require_scale(title: str, crs: str, bounds: Bounds, remedy: str) -> None:
     """Check that a metre of a CRS is one on the ground, within `MAX_SCALE_ERROR`.
 
-    - `title`: what is in the CRS, for the message.
     - `crs`: a CRS in metres; one that is not projected is not checked.
     - `bounds`: those of the data, in the CRS; the scale at their centre counts.
     - `remedy`: what to do, for the message; ``{zone}`` is replaced by the code of the UTM zone.

@@ -80,7 +80,7 @@ def rasters_of_points(source: Path, corner: tuple[float, float]) -> tuple[dict[s
     off = max(np.abs(axis - np.round(axis)).max() for axis in (col, row))
     if not np.isfinite(cell) or off > TOLERANCE or shape[0] * shape[1] > MAX_CELLS:
         raise CatalogError(
-            f"{source.name}: its points lie on no lattice; make rasters of them (`flexroad prepare points`)"
+            f"{source.name}: its points lie on no lattice; make rasters of them (`flexroad prepare`)"
         )
     rasters = {name: np.full(shape, np.nan) for name in values}
     for name, raster in rasters.items():

@@ -143,8 +143,6 @@ def table_bytes(items: Iterable[Item], schema: Any, skipped: Sequence[Item] = ()
     """Return a table of items as GeoParquet 1.1, as stac-geoparquet writes it.
 
     To import that takes an eighth of a run with nothing to do, and its conversion is many times slower.
-
-    - `skipped`: entries of skipped files, which its metadata have.
     """
     outlines = pyproj.CRS.from_epsg(4326).to_json_dict()
     column = {"encoding": "WKB", "geometry_types": [], "crs": outlines, "edges": "planar"}

@@ -10,31 +10,29 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import posixpath
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from itertools import compress
 from pathlib import Path
 from typing import Any
 
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
-
 from flexroad.catalog import geoparquet, ids
 from flexroad.catalog.area import Area
-from flexroad.catalog.crs import short
+from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.entries import TileReader
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.geoparquet import SKIPPED, Item, Unreadable
 from flexroad.catalog.grid import Bounds, Grid, overlap, union
 from flexroad.catalog.skipped import Skipped, from_fields, to_fields
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
+from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location, resolved
 from flexroad.catalog.text import edges, printable, some
 from flexroad.catalog.tile import LAYERS, Layer, Tile
-from flexroad.catalog.trust import AllowedFolders
+from flexroad.catalog.trust import ADDRESS, AllowedFolders, full_name
 
 STAC_VERSION = "1.1.0"
 MAX_BYTES = 2**30
@@ -229,14 +227,6 @@ def _not_a_catalog(path: Location, reason: str) -> CatalogError:
     return CatalogError(f"{path} is not a FlexRoad catalog: {reason}; make one with `flexroad catalog`")
 
 
-@lru_cache(maxsize=16)
-def _to_wgs84(crs: str) -> Transformer:
-    try:
-        return Transformer.from_crs(CRS.from_user_input(crs), "EPSG:4326", always_xy=True)
-    except CRSError as error:
-        raise CatalogError(f"unknown CRS {crs[:60]!r}: {error}") from error
-
-
 def item(tile: Tile, root: str = "") -> Item:
     """Return the tile as a STAC item.
 
@@ -272,7 +262,7 @@ def datetime_text(time: datetime) -> str:
 def _outline(grid: Grid) -> Item:
     """Return geometry and bbox in degrees; no bbox if the grid lies where they are not defined."""
     west, south, east, north = grid.bounds
-    to_wgs84 = _to_wgs84(grid.crs)
+    to_wgs84 = transformer(grid.crs, "EPSG:4326")
     ring = [(west, south), (east, south), (east, north), (west, north), (west, south)]
     corners = [list(to_wgs84.transform(*corner)) for corner in ring]
     xs, ys = [c[0] for c in corners], [c[1] for c in corners]
@@ -345,3 +335,51 @@ def _full_item() -> Item:
     whole = item(Tile("", grid, layers, "", datetime(2000, 1, 1, tzinfo=UTC)))
     whole["properties"] |= {"proj:wkt2": "", "flexroad:fault": ""}
     return whole
+
+
+MAX_FOLDERS = 4
+"""Largest number of folders suggested with --allow; if there are more, parent folders are suggested."""
+TOPS = ("/", "s3:/", "s3:")
+
+
+def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
+    """Raise an error if a tile names a file that may not be read.
+
+    `Tile.paths` raises the same error, but only when the file is needed.
+
+    - `layers`: the layers that will be read; other layers are not checked.
+    """
+    for tile, layer in _chosen(catalog, layers):
+        for name in (full_name(tile.root, file) for file in layer.files):
+            if tile.allowed and not tile.allowed.permits(name):
+                folders = needed(catalog, tile.allowed, layers)
+                raise tile.allowed.refusal(f"tile {tile.id}: {layer.name}", name, folders)
+
+
+def needed(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
+    """Return the folders that must be allowed besides those of ``allowed`` to read layers of a catalog."""
+    names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
+    # Addresses cannot be allowed.
+    outside = (name for name in names if not ADDRESS.match(name) and not allowed.permits(name))
+    folders = _outermost(posixpath.dirname(resolved(name)) for name in outside)
+    while len(folders) > MAX_FOLDERS:
+        parents = _outermost(map(posixpath.dirname, folders))
+        if not parents.isdisjoint(TOPS):
+            break
+        folders = parents
+    return tuple(sorted(folders))
+
+
+def _chosen(catalog: Catalog, layers: Collection[str]) -> Iterator[tuple[Tile, Layer]]:
+    for tile in catalog.tiles:
+        yield from ((tile, layer) for layer in tile.all_layers if layer.name in layers)
+
+
+def _outermost(folders: Iterable[str]) -> set[str]:
+    """Return the folders that lie in none of the others."""
+    outermost: list[str] = []
+    # Sorting puts a folder before its subfolders.
+    for folder in sorted(set(folders), key=lambda folder: folder.rstrip("/") + "/"):
+        if not outermost or not folder.startswith(outermost[-1].rstrip("/") + "/"):
+            outermost.append(folder)
+    return set(outermost)

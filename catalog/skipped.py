@@ -52,9 +52,7 @@ def lost(before: Sequence[Tile], tiles: Collection[str], skipped: Sequence[Skipp
     """
     gone: dict[str, list[str]] = defaultdict(list)
     for tile in (tile for tile in before if tile.id not in tiles):
-        dsm = tile.layer("dsm")
-        on_tile = dsm.reaching(tile.grid.bounds) if dsm else None
-        for file in on_tile.files if on_tile else ():
+        for file in (file for dsm in tile.layers_on(("dsm",)) for file in dsm.files):
             gone[_full_name(tile.root, file)].append(tile.id)
     return tuple(replace(one, tiles=tuple(_tiles(one, gone))) for one in skipped)
 

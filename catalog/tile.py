@@ -173,6 +173,11 @@ class Tile:
         """Return the named layer, or None if none covers the tile."""
         return next((layer for layer in self.layers if layer.name == name), None)
 
+    def layers_on(self, names: Collection[str]) -> list[Layer]:
+        """Return the layers of these names with only those files that reach the tile itself."""
+        found = (layer.reaching(self.grid.bounds) for layer in self.layers if layer.name in names)
+        return [layer for layer in found if layer]
+
     def paths(self, layer: Layer) -> tuple[Location, ...]:
         """Return the locations of the layer's files.
 

@@ -153,7 +153,6 @@ def cut(
     - `tile_size_m`: edge of a tile (m); tiles lie on multiples of it in the DSM's CRS.
     - `min_cover`: tiles with a DSM height in less than this share (0 to 1) of their cells are left out, as
       `load.min_valid` would fail on them. 0 keeps all that files touch, and reads no heights.
-    - `conversion`: whether and where to files in other CRSs are reprojected.
     """
     dsm = layer_files["dsm"]
     grid_crs = Counter(file.crs for file in dsm).most_common(1)[0][0]

@@ -16,6 +16,7 @@ from flexroad.catalog.crs import (
     is_projected,
     metric_twin,
     plan_unit,
+    plan_units,
     same,
     short,
     transformer,
@@ -74,7 +75,7 @@ class MetricTransform:
             twin = utm_of((longitude, latitude, longitude, latitude))
         if to_crs and not (is_projected(to_crs) and plan_unit(to_crs)[1] == 1):
             remedy = "give a projected CRS in metres, such as EPSG:25832"
-            raise CatalogError(f"--to-crs {to_crs} is in {_units(to_crs)}; {remedy}")
+            raise CatalogError(f"--to-crs {to_crs} is in {plan_units(to_crs)}; {remedy}")
         target = in_plan(to_crs) if to_crs else twin
         exact = is_projected(source) and same(target, twin)
         return cls(source, target, plan_unit(source)[1] if exact else None, height_m, notes)
@@ -139,7 +140,7 @@ def _heights(source: str, unit: str | None) -> tuple[float, tuple[str, ...]]:
     implied = _implied(source)
     if is_geographic(source) or implied == 1:
         return implied, ()
-    unit = _units(source)
+    unit = plan_units(source)
     return implied, (f"heights are assumed to be in {unit}, like x and y; if not, use --height-unit metre",)
 
 
@@ -149,12 +150,6 @@ def _implied(crs: str) -> float:
     if declared:
         return declared[1]
     return 1.0 if is_geographic(crs) else plan_unit(crs)[1]
-
-
-def _units(crs: str) -> str:
-    """Return the horizontal unit, in the plural."""
-    unit = plan_unit(crs)[0]
-    return unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
 
 
 def _equal(a: float, b: float) -> bool:

@@ -72,7 +72,8 @@ class AllowedFolders:
         )
         file = name if name == target else f"{name}, by a link {target}"
         return CatalogError(
-            f"{subject} names {file}, outside the catalog's folder {self.home}; to allow it, add {options}"
+            f"{subject} names {file}, outside the catalog's folder {self.home}; to allow it, begin with "
+            f"flexroad {options}"
         )
 
 

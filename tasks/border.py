@@ -23,7 +23,6 @@ from flexroad.tasks.load import READS, load_border
 from flexroad.tasks.load import Options as LoadOptions
 from flexroad.tasks.options import Options, stage_function, stage_module
 from flexroad.tasks.roads.dtm_validity import Slices
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
@@ -114,7 +113,7 @@ class BorderStages:
             road: RoadMask = stage_function("segment", self.segment)(data, self.segment)
         except LayerMissing:
             nowhere = np.zeros(data.grid.shape, np.bool_)
-            road = RoadMask(data.grid, data.core, nowhere, beyond_extent(data))
+            road = RoadMask(data.grid, data.core, nowhere, data.beyond_extent())
         return road
 
 

@@ -69,8 +69,4 @@ def compiled(
       instructions. The order is fixed when the function is compiled: equal arguments give equal bits in every
       call.
     """
-
-    def decorate(function: Callable[P, R]) -> Compiled[P, R]:
-        return Compiled(function, error_model, fused)
-
-    return decorate
+    return lambda function: Compiled(function, error_model, fused)

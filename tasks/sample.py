@@ -16,7 +16,7 @@ outline, and meets level 0 on its abutments (`tasks.meshing.abutment_lines`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -28,9 +28,9 @@ from flexroad.catalog.grid import Bounds
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.meshing.abutment_lines import (
-    JoinedGround,
     LevelOutline,
     level_outline,
+    with_abutments,
     without_abutments,
 )
 from flexroad.tasks.meshing.lines import (
@@ -39,18 +39,18 @@ from flexroad.tasks.meshing.lines import (
     axis,
     divided,
     ends_at_border,
+    middles,
     parts_of,
     points_and_segments,
     without_duplicates,
 )
-from flexroad.tasks.meshing.parts import middles, with_levels
-from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
+from flexroad.tasks.meshing.road_outline import road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, breaklines, survey_limit
 from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
-from flexroad.tasks.spline.frame import Frame
-from flexroad.tasks.spline.mesh_border import (
+from flexroad.tasks.spline.frame import (
     NUDGE,
     SAME_M,
+    Frame,
     border_heights,
     border_points,
     joined,
@@ -203,6 +203,32 @@ def _levels(
     return with_levels(meshes)
 
 
+def with_levels(meshes: Mapping[int, Mesh]) -> Mesh:
+    """Return the meshes of several levels of a tile as one; they share no vertex.
+
+    - `meshes`: by number of the level; level 0 is the first.
+    """
+    first, *others = meshes.values()
+    if not others:
+        return first
+    east, north, _ = first.origin
+    datum = min(mesh.origin[2] for mesh in meshes.values())
+    counts = [len(mesh.vertices) for mesh in meshes.values()]
+    starts = np.cumsum([0, *counts[:-1]], dtype=np.int32)
+    return Mesh(
+        crs=first.crs,
+        origin=(east, north, datum),
+        vertices=np.concatenate(
+            [mesh.vertices + np.array([0.0, 0.0, mesh.origin[2] - datum]) for mesh in meshes.values()]
+        ),
+        faces=np.concatenate(
+            [mesh.faces + start for mesh, start in zip(meshes.values(), starts, strict=True)]
+        ),
+        road=np.concatenate([mesh.road for mesh in meshes.values()]),
+        level=np.repeat(np.array([*meshes], np.int8), [len(mesh.faces) for mesh in meshes.values()]),
+    )
+
+
 def _other_level(
     surface: Surface,
     outline: LevelOutline,
@@ -251,30 +277,33 @@ def _dynamic(
     """
     fine = _lattice(surface, road, mask, local, options.road_m)
     coarse = _lattice(surface, road, ~mask, local, options.terrain_m)
-    limit, outline = _limit(road, local, frame), None
+    limit, roads = _limit(road, local, frame), None
     lines = [] if limit is None else [_divided(limit.lines, road, mask, options)]
     breaks = None
     if isinstance(surface, SteppedSurface) and options.breaklines:
         edges, breaks = breaklines(surface, local)
         lines.append(without_abutments(_divided(edges, road, mask, options), others))
     if road.areas is not None and options.mask == "raw":
-        outline = road_outline(road.areas, local, options.road_m)
-        lines.append(without_abutments(outline.lines, others))
-        fine = fine[outline.contains(fine)]
+        roads, edges_of_roads = road_outline(road.areas, local, options.road_m)
+        lines.append(without_abutments(edges_of_roads, others))
+        fine = fine[shapely.contains_xy(roads, fine[:, 0], fine[:, 1])]
     lines += [part for other in others for part in (other.abutments, other.feet)]
     free = np.concatenate([fine, coarse])
-    joined = JoinedGround(surface, road.core.origin, others) if others else None
     if frame:
         free = free[~on_border(free, local)]
-    border = _border((joined or surface).height, road, local, options, frame, lines)
+
+    def height(easting: Floats, northing: Floats) -> Floats:
+        z = surface.height(easting, northing)
+        return with_abutments(z, easting, northing, surface, others, road.core.origin)
+
+    border = _border(height, road, local, options, frame, lines)
     free = free[apart_from(free, lines, options.road_m / 2)]
     if limit:
         free = free[limit.covers(free)]
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
     place = (plan + road.core.origin).T
     z = breaks(plan) if breaks else surface.height(*place)
-    if joined:
-        z = joined.on_abutments(place[0], place[1], z)
+    z = with_abutments(z, place[0], place[1], surface, others, road.core.origin)
     if isinstance(surface, MovingNurbs):
         free, border = (_in_space(part, surface, road.core.origin) for part in (free, border))
     points, number = without_duplicates(np.concatenate([free, border, np.column_stack([plan, z])]))
@@ -285,7 +314,7 @@ def _dynamic(
     faces = constrained(points, number[len(free) + len(border) + segments], lattices)
     if limit:
         faces = faces[limit.covers(middles(points, faces))]
-    return _mesh(points, faces, road, mask, outline)
+    return _mesh(points, faces, road, mask, roads)
 
 
 def _in_space(points: Floats, surface: MovingNurbs, origin: tuple[float, float]) -> Floats:
@@ -361,9 +390,12 @@ def _border(
 
 
 def _mesh(
-    points: Floats, faces: Faces, road: RoadMask, mask: Bools, outline: RoadOutline | None = None
+    points: Floats, faces: Faces, road: RoadMask, mask: Bools, roads: shapely.MultiPolygon | None = None
 ) -> Mesh:
-    """Return the mesh of the faces that have heights, without unused vertices."""
+    """Return the mesh of the faces that have heights, without unused vertices.
+
+    - `roads`: areas that class the faces, in place of the cells of ``mask``.
+    """
     east, north = road.core.origin
     known = np.isfinite(points[:, 2])
     faces = faces if known.all() else faces[known[faces].all(axis=1)]
@@ -376,5 +408,9 @@ def _mesh(
     vertices = points[used]
     datum = float(np.floor(vertices[:, 2].min()))
     vertices[:, 2] -= datum
-    is_road = outline.contains(places) if outline else mask[road.grid.cells(*(places + road.core.origin).T)]
+    is_road = (
+        mask[road.grid.cells(*(places + road.core.origin).T)]
+        if roads is None
+        else shapely.contains_xy(roads, *places.T)
+    )
     return Mesh(road.core.crs, (east, north, datum), vertices, number[faces], is_road)

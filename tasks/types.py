@@ -12,7 +12,10 @@ import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location
+
+scipy = lazy("scipy")
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -83,6 +86,23 @@ class TileData:
     def lacks_road(self, mask: Bools) -> bool:
         """Return whether no cell of the tile's core is road in a mask, ``(H, W)``."""
         return not mask[self.grid.window(self.core)].any()
+
+    def beyond_extent(self) -> Bools:
+        """Return the cells beyond the survey, ``(H, W)``.
+
+        These are the cells with neither DSM nor DTM in a void (4-connected) that touches the grid's edge. A
+        void inside, as in water or deep shade, is not beyond the survey: meshes bridge it.
+        """
+        void = np.isnan(self.dsm) & np.isnan(self.dtm)
+        if not any(side.any() for side in (void[0], void[-1], void[:, 0], void[:, -1])):
+            return np.zeros(void.shape, np.bool_)
+        labels, count = scipy.ndimage.label(void)
+        beyond = np.zeros(count + 1, np.bool_)
+        for side in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+            beyond[side] = True
+        beyond[0] = False
+        outside: Bools = beyond[labels]
+        return outside
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,14 +325,27 @@ class Mesh:
         if self.level is None:
             return self
         chosen = self.level == number
-        used, faces = np.unique(self.faces[chosen], return_inverse=True)
-        return replace(
-            self,
-            vertices=self.vertices[used],
-            faces=faces.reshape(-1, 3).astype(np.int32),
-            road=self.road[chosen],
-            level=None,
-        )
+        used, faces = self.part(chosen)
+        return replace(self, vertices=self.vertices[used], faces=faces, road=self.road[chosen], level=None)
+
+    def part(self, faces: Bools) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+        """Return the vertices that some faces, ``(F,)``, use, ascending, and these faces in their numbers."""
+        chosen = self.faces[faces]
+        is_used = np.zeros(len(self.vertices), np.bool_)
+        is_used[chosen] = True
+        number = np.cumsum(is_used, dtype=np.int32) - np.int32(1)
+        return np.flatnonzero(is_used), number[chosen]
+
+    def texture_coordinates(self, bounds: Bounds) -> Floats:
+        """Return the places of the vertices in an image seen from above, ``(V, 2)``.
+
+        They are 0 to 1 from west to east, and from south to north.
+
+        - `bounds`: west, south, east and north of the image's outer edges (m).
+        """
+        west, south, east, north = bounds
+        place = self.vertices[:, :2] + self.origin[:2]
+        return np.asarray((place - (west, south)) / (east - west, north - south), np.float64)
 
 
 @dataclass(frozen=True)

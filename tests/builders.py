@@ -18,7 +18,6 @@ from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.border import ENDS
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
@@ -134,7 +133,7 @@ def filtered(
     layers = {name: getattr(world, name) for name in ("dsm", "dtm", "road_mask", "road_height")}
     part = {name: layer[cut] for name, layer in layers.items() if layer is not None}
     data = TileData("part", grid, core or grid, **part, offset_dsm=world.offset_dsm)
-    road = RoadMask(grid, data.core, data.road_mask, beyond_extent(data))
+    road = RoadMask(grid, data.core, data.road_mask, data.beyond_extent())
     return data, road, planar.ecsrc(data, road, planar.Options(shoulder_m=5))
 
 

@@ -11,8 +11,16 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.tables import metrics_frame
-from flexroad.tools.report.content import Content
-from flexroad.tools.report.steps import CHECK, COLUMNS, EdgeSteps
+from flexroad.tools.report.content import (
+    MAIN,
+    MESH_COLUMNS,
+    MESHES,
+    STEPS,
+    WORST_ESTIMATES,
+    WORST_ROADS,
+    Content,
+)
+from flexroad.tools.report.steps import CHECK
 
 SIDE_M = 250
 
@@ -68,7 +76,6 @@ def made_content(run, rows, states=None) -> Content:
     states = {tile.id: by_row.get(tile.id, "pending") for tile in run.catalog.tiles} | (states or {})
     number = list(states.values()).count
     done = frame[frame.status == "done"]
-    empty = pd.DataFrame()
     return Content(
         title=f"FlexRoad: invented over {len(states)} tiles",
         state="",
@@ -84,21 +91,25 @@ def made_content(run, rows, states=None) -> Content:
         rows=frame,
         variant="flexroad",
         reference="Made figures.",
-        main=pd.DataFrame(
-            {"method": ["flexroad"], "tiles": [len(done)], "L2 road (m)": [done.l2_road_m.mean()]}
-        ),
-        median=empty,
-        further=empty,
-        strata=empty,
-        worst=pd.DataFrame({"tile": done.nlargest(10, "l2_road_m").tile_id}),
-        quality=empty,
-        worst_estimates=pd.DataFrame({"tile": done.nlargest(10, "error_estimate_m").tile_id}),
-        meshes=pd.DataFrame(columns=["method", "meshes", "faces", "meshes with faults", "result"]),
-        steps=EdgeSteps(pd.DataFrame(columns=CHECK), pd.DataFrame(columns=COLUMNS), ""),
-        failures=pd.DataFrame(
-            [(row["tile_id"], row["error"]) for row in rows if row["status"] == "failed"],
-            columns=["tile", "error"],
-        ),
+        tables={
+            MAIN: (
+                pd.DataFrame(
+                    {"method": ["flexroad"], "tiles": [len(done)], "L2 road (m)": [done.l2_road_m.mean()]}
+                ),
+                "",
+            ),
+            WORST_ROADS: (pd.DataFrame({"tile": done.nlargest(10, "l2_road_m").tile_id}), ""),
+            WORST_ESTIMATES: (pd.DataFrame({"tile": done.nlargest(10, "error_estimate_m").tile_id}), ""),
+            MESHES: (pd.DataFrame(columns=MESH_COLUMNS), ""),
+            STEPS: (pd.DataFrame(columns=CHECK), ""),
+            "Failures": (
+                pd.DataFrame(
+                    [(row["tile_id"], row["error"]) for row in rows if row["status"] == "failed"],
+                    columns=["tile", "error"],
+                ),
+                "",
+            ),
+        },
         versions={"flexroad": "0"},
         config="made: true\n",
         tiles=tuple(done.tile_id),

@@ -19,7 +19,6 @@ from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.segment import vector
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, RoadMask, Source, Surface, TileData
-from flexroad.tools.synthetic.centrelines import CentreLine
 from flexroad.tools.synthetic.crossings import (
     CROSS_M,
     MAIN_M,
@@ -28,6 +27,7 @@ from flexroad.tools.synthetic.crossings import (
     Crossings,
     make_crossings,
 )
+from flexroad.tools.synthetic.scene import CentreLine
 from flexroad.tools.synthetic.scenes import _write_lines
 
 AROUND_M, HALO_M = 100.0, 50.0

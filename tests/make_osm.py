@@ -13,7 +13,7 @@ import pyproj
 import shapely
 
 from flexroad.catalog import Grid
-from flexroad.tools.synthetic.centrelines import CentreLine, centre_lines
+from flexroad.tools.synthetic.scene import CentreLine, centre_lines
 
 SEED, SIZE_M = 5, 600
 TOWN = Grid("EPSG:25832", 500_000.0, 5_600_600.0, 1.0, SIZE_M, SIZE_M)

@@ -8,8 +8,7 @@ import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.models import Export
+from flexroad.pipeline.config.models import Cluster, Export
 from flexroad.pipeline.config.stages import DEFAULTS, HOMES, methods
 
 PAGE = Path(__file__).parents[1] / "docs" / "options.md"

@@ -83,7 +83,8 @@ def test_reproduce_synthetic_scenes_run_with_both_references(tmp_path, words):
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_make_test_omits_slow_tests_and_test_all_does_not(tmp_path):
-    for target, selection in (("test", ["-m", '"not', 'slow"']), ("test-all", [])):
+    selected = ["-m", '"not', 'slow"']
+    for target, selection in (("test", selected), ("test-all", [])):
         (words,) = commands(tmp_path / target, program="python", target=target)
         assert words == [
             "-m",
@@ -95,6 +96,13 @@ def test_make_test_omits_slow_tests_and_test_all_does_not(tmp_path):
             "--no-loadscope-reorder",
             *selection,
         ]
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_test_of_an_area_runs_its_folders(tmp_path):
+    (tmp_path / "tests" / "tools" / "lift").mkdir(parents=True)
+    (words,) = commands(tmp_path, "AREA=lift", program="python", target="test")
+    assert words[-1] == "tests/tools/lift"
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")

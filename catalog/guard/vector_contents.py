@@ -69,11 +69,7 @@ def quoted(name: str) -> str:
 
 
 def require_sound_contents(path: Path, state: FileStat) -> None:
-    """Raise an error if an SQLite file may need endless time or memory, or hides features.
-
-    - `path`: a file that has all changes.
-    - `state`: its state, by which the answer is kept.
-    """
+    """Raise an error if an SQLite file may need endless time or memory, or hides features."""
     if fault := _fault(path, state):
         raise InputRejected(fault)
 
@@ -188,7 +184,6 @@ BOXES = np.dtype(
 def has_complete_index(file: str, info: Mapping[str, Any]) -> bool:
     """Return whether each feature of a layer is in its index, within its box there.
 
-    - `info`: what pyogrio knows of the layer.
     - result: also False of a view, whose index is the table's, and of a Shapefile: its index is not read
       here.
     """

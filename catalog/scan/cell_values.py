@@ -16,8 +16,7 @@ from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.guard.open_raster import ERRORS, kept_raster, open_raster
-from flexroad.catalog.scan.rasters import georeference_fault, heights_fault, quiet
-from flexroad.catalog.scan.valid_cells import read_valid
+from flexroad.catalog.scan.rasters import georeference_fault, heights_fault, quiet, read_valid
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import some
 
@@ -88,8 +87,6 @@ def mask_notes(root: Path, layer: str, names: Sequence[str], road_values: Sequen
     """Return a note if the values of a mask do not fit those that mean road; empty if they may.
 
     Parts of some files are read, so that the time does not depend on the size of the survey.
-
-    - `road_values`: values that mean road; empty: every value but 0 and nodata.
     """
     step = -(-len(names) // MOST_MASKS)
     values, has_nodata, read = set[float](), False, list[str]()

@@ -17,6 +17,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.guard import las_header
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.scan.inputs import files_of
 from flexroad.catalog.text import access_reason, one_line
 
 laspy = lazy("laspy")
@@ -24,7 +25,6 @@ laspy = lazy("laspy")
 T = TypeVar("T")
 Floats = NDArray[np.float64]
 
-SUFFIXES = (".las", ".laz")
 NOISE = (7, 18)
 """Classes of low and high noise (ASPRS LAS 1.4)."""
 CHUNK = 1_000_000
@@ -84,16 +84,7 @@ class Chunk:
 
 def find(inputs: Collection[Path]) -> tuple[Path, ...]:
     """Return the clouds among files and folders, each once, ordered by path."""
-    clouds: dict[Path, Path] = {}
-    for path in inputs:
-        files = [path]
-        if path.is_dir():
-            files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
-        elif not path.exists():
-            raise CatalogError(f"{path} does not exist; give LAS or LAZ files, or folders of them")
-        if not files:
-            raise CatalogError(f"no LAS or LAZ file in {path}; give the files, or the folder they lie in")
-        clouds.update({file.resolve(): file for file in files})
+    clouds = {file.resolve(): file for file in files_of(inputs, "points")}
     return tuple(clouds[path] for path in sorted(clouds))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
@@ -18,19 +19,20 @@ from pathlib import Path, PurePath
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 import rasterio
 from affine import Affine
-from rasterio.enums import ColorInterp
+from numpy.typing import NDArray
+from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import NotGeoreferencedWarning
 
-from flexroad.catalog.crs import bounds_in, height_unit, in_plan, plan_unit, short, utm_of
+from flexroad.catalog.crs import bounds_in, height_unit, in_plan, plan_unit, plan_units, short, utm_of
 from flexroad.catalog.crs_checks import angle_fault, crs_of, require_scale
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.gdal_options import CHOSEN, DEFAULTS
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
 from flexroad.catalog.guard.source_files import InputRejected
-from flexroad.catalog.scan.valid_cells import color_kinds
 from flexroad.catalog.skipped import Skipped, lines
 from flexroad.catalog.storage.settings import gdal_options
 from flexroad.catalog.text import access_reason, some
@@ -333,8 +335,8 @@ def require_metric(file: RasterFile, option: str = "") -> None:
     if unit in ("metre", "meter") and metres == 1.0:
         require_scale(file.name, file.crs, file.bounds, remedy)
         return
-    units = unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
     zone = utm_of(bounds_in("EPSG:4326", file.crs, file.bounds))
+    units = plan_units(file.crs)
     raise CatalogError(
         f"{file.name} is in {short(file.crs)}, whose unit is {units}; {remedy.format(zone=zone)}"
     )
@@ -372,3 +374,35 @@ def heights_fault(dataset: Any) -> str | None:
     if dataset.dtypes[0].startswith("complex"):
         return f"has complex numbers ({dataset.dtypes[0]}), no heights; give a raster of heights"
     return None
+
+
+def color_kinds(dataset: Any) -> tuple[ColorInterp, ...]:
+    """Return the kind of each band of an open raster, such as grey or alpha."""
+    # The call raises the last error of GDAL, which may be about a tag that does not matter, and so clears it.
+    with contextlib.suppress(Exception):
+        _ = dataset.colorinterp
+    return tuple(dataset.colorinterp)
+
+
+def alpha_band(dataset: Any) -> int | None:
+    """Return the number of an open raster's alpha band that GDAL does not take for a mask, None without one.
+
+    GDAL takes one of uint8 or uint16 alone, and only if the file has no other mask and no nodata value.
+    """
+    kinds = color_kinds(dataset)
+    if ColorInterp.alpha not in kinds[1:] or MaskFlags.alpha in dataset.mask_flag_enums[0]:
+        return None
+    return int(kinds.index(ColorInterp.alpha, 1)) + 1
+
+
+def read_valid(dataset: Any, **how: Any) -> Any:
+    """Return the first band of an open raster as a masked array; cells without a value are masked."""
+    values = dataset.read(1, masked=True, **how)
+    alpha = alpha_band(dataset)
+    return values if alpha is None else np.ma.masked_where(transparent(dataset, alpha, **how), values)
+
+
+def transparent(dataset: Any, alpha: int, **how: Any) -> NDArray[np.bool_]:
+    """Return the cells without a value by an alpha band; NaN means transparent, too."""
+    opaque: NDArray[np.bool_] = dataset.read(alpha, **how) > 0
+    return ~opaque

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -27,6 +28,7 @@ from flexroad.catalog.tile import REACH_M, RECENT, Layer, Tile
 
 pyogrio = lazy("pyogrio")
 
+LAYER_NAME = "|layername="
 MARGIN_M = 1.0
 """Extents are larger than the features' bounds by this much (m): those of a straight road are empty."""
 EVERYWHERE: Bounds = (-1e9, -1e9, 1e9, 1e9)
@@ -49,15 +51,20 @@ class VectorFile:
     """The layer of the roads, if it was chosen."""
 
 
-def find(
-    root: Path, given: str, crs: str | None, sublayer: str | None = None
-) -> tuple[list[VectorFile], list[Skipped]]:
+def file_and_layer(given: Path | str) -> tuple[Path, str | None]:
+    """Split ``FILE|layername=NAME``, as QGIS writes it; the layer is None if no one is named."""
+    file, named, layer = str(given).partition(LAYER_NAME)
+    return Path(file), layer if named else None
+
+
+def find(root: Path, given: str, crs: str | None) -> tuple[list[VectorFile], list[Skipped]]:
     """Open vector files; return the usable ones, and the others.
 
-    - `given`: a file, or a glob pattern relative to ``root``.
+    - `given`: a file, or a glob pattern relative to ``root``; with a layer as in `file_and_layer`.
     """
     root = root.resolve()
-    paths, unlisted = ([Path(given)], []) if Path(given).is_file() else matching(root, "roads", given)
+    file, sublayer = file_and_layer(given)
+    paths, unlisted = ([file], []) if file.is_file() else matching(root, "roads", str(file))
     files, errors = list[VectorFile](), dict[Path, CatalogError]()
     for path in paths:
         try:
@@ -87,6 +94,24 @@ def listed(found: Mapping[str, str]) -> str:
     return ", ".join(f"{name} ({about})" for name, about in found.items())
 
 
+def several(subject: str, path: Path, found: Mapping[str, str]) -> CatalogError:
+    """Return the error that none of the layers of a file is named; ``subject`` begins its message."""
+    example = shlex.quote(f"{path}{LAYER_NAME}{next(iter(found))}")
+    return CatalogError(
+        f"{subject} has {count(len(found), 'layer')}: {listed(found)}; name one, such as {example}"
+    )
+
+
+def one_layer(subject: str, path: Path, layer: str | None) -> str | None:
+    """Return the layer to read: the named one, else the only one, or None if the file has no layer."""
+    found = layers(path)
+    if layer is None and len(found) > 1:
+        raise several(subject, path, found)
+    if layer is not None and layer not in found:
+        raise CatalogError(f"{subject} has no layer {layer!r}; it has {listed(found) or 'none'}")
+    return layer or next(iter(found), None)
+
+
 def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFile:
     """Open one vector file; see `find`."""
     try:
@@ -108,9 +133,7 @@ def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFi
     if found and not names:
         raise CatalogError(f"--roads {path} has no layer {sublayer!r}; it has {listed(found)}")
     if len(names) > 1 and not no_bounds:
-        raise CatalogError(
-            f"--roads {path} has {count(len(names), 'layer')}: {listed(found)}; name one with --roads-layer"
-        )
+        raise several(f"--roads {path}", path, found)
     if not infos:
         raise CatalogError(f"--roads {path} is not a vector file: it has no layer with geometries")
     systems = [_system(path, info, crs) for info in infos]

@@ -82,7 +82,6 @@ def index(
     min_cover: float = MIN_COVER,
     derived: Path | None = None,
     roads: str | None = None,
-    roads_layer: str | None = None,
     reproject: bool = False,
 ) -> TilingResult:
     """Cut the downloads below a folder into tiles; of files of the same ground the newest is used first.
@@ -105,9 +104,8 @@ def index(
         Folder for rasters of the bridge points (class 17) of the point clouds; together with the terrain
         model they are the paper's extended DTM. If None, the clouds are not read, and a note is added.
     roads : str, optional
-        Vector files of roads: a file, or a glob pattern relative to ``root``.
-    roads_layer : str, optional
-        Layer of the vector files, if they have several.
+        Vector files of roads: a file, or a glob pattern relative to ``root``; and ``|layername=NAME`` if they
+        have several layers.
     reproject : bool
         Warp a mask in another CRS when it is read.
 
@@ -156,7 +154,7 @@ def index(
     )
     indexed = indexed.after(notes, skipped)
     if roads is not None:
-        vectors, unusable = find(root, roads, CRS, roads_layer)
+        vectors, unusable = find(root, roads, CRS)
         tiles, far = with_roads(indexed.tiles, vectors, CRS)
         indexed = replace(indexed, tiles=tiles, skipped=(*indexed.skipped, *unusable, *far))
     if lacking := [tile.id for tile in indexed.tiles if tile.layer("dtm") is None]:

@@ -25,7 +25,6 @@ def index(
     date: datetime | None = None,
     crs: str | None = None,
     min_cover: float = MIN_COVER,
-    roads_layer: str | None = None,
     conversion: Conversion = NO_CONVERSION,
 ) -> TilingResult:
     """Cut the area that the DSM files cover into tiles.
@@ -37,7 +36,7 @@ def index(
     patterns : Mapping[str, str]
         Layer name (see `catalog.LAYERS`) to glob pattern; ``dsm`` is required. A pattern is relative to
         ``root``; absolute, or with ``..``, it names files outside. ``roads`` (vector files) may also be the
-        path of a file.
+        path of a file, and end with ``|layername=NAME`` if the files have several layers.
     road_values : tuple of int
         Cell values that mean road in the masks; empty: every value but 0 and nodata.
     tile_size_m : float
@@ -48,8 +47,6 @@ def index(
         CRS of files without one.
     min_cover : float
         Tiles with a DSM height in less than this share (0 to 1) of their cells are left out.
-    roads_layer : str, optional
-        Layer of the vector files, if they have several.
     conversion : Conversion
         Whether and where to files in other CRSs are reprojected.
 
@@ -91,6 +88,6 @@ def index(
     indexed = indexed.after(notes, skipped)
     if "roads" not in patterns:
         return indexed
-    roads, unusable = find(root, patterns["roads"], crs, roads_layer)
+    roads, unusable = find(root, patterns["roads"], crs)
     tiles, far = with_roads(indexed.tiles, roads, crs)
     return replace(indexed, tiles=tiles, skipped=(*indexed.skipped, *unusable, *far))

@@ -14,10 +14,14 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flexroad.catalog.storage.outputs import atomic_path
-from flexroad.catalog.storage.paths import FileStat, Location, entries_of, read, stat, write
+from flexroad.catalog.storage.paths import FileStat, Location, entries_of, read, write
 from flexroad.catalog.storage.scratch import ScratchFolder
+
+if TYPE_CHECKING:
+    from upath import UPath
 
 
 class ListedFiles:
@@ -56,29 +60,24 @@ class ListedFiles:
 
 @dataclass(frozen=True)
 class StatCache:
-    """Sizes and versions of files, read once each; in a bucket, with one list request per folder.
+    """Sizes and versions of files in buckets, with one list request per folder.
 
     Create one per pass over a catalog: ``stat_of = StatCache(); stat_of(path)`` returns the same as
     ``stat(path)``. Later changes of a file are not noticed.
     """
 
-    _files: dict[Location, FileStat | None] = field(default_factory=dict)
     _listed: ListedFiles = field(default_factory=ListedFiles)
     _folders: set[str] = field(default_factory=set)
     """Folders of buckets that were listed."""
 
-    def __call__(self, where: Location) -> FileStat | None:
+    def __call__(self, where: UPath) -> FileStat | None:
         """Return a file's size and version, or None if it does not exist."""
-        if not isinstance(where, Path):
-            # UPath's `parent` and `name` would take as long as all the rest.
-            folder, _, name = where.path.rpartition("/")
-            if folder not in self._folders:
-                self._listed.add((folder, name, file) for name, file in entries_of(where.parent))
-                self._folders.add(folder)
-            return self._listed.get(folder, name)
-        if where not in self._files:
-            self._files[where] = stat(where)
-        return self._files[where]
+        # UPath's `parent` and `name` would take as long as all the rest.
+        folder, _, name = where.path.rpartition("/")
+        if folder not in self._folders:
+            self._listed.add((folder, name, file) for name, file in entries_of(where.parent))
+            self._folders.add(folder)
+        return self._listed.get(folder, name)
 
 
 PUT_S = 60.0

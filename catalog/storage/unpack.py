@@ -27,8 +27,6 @@ def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Pa
 
     A folder that is there is complete: it gets its name when all files are in it.
 
-    - `sha256`: checksum of the published file.
-    - `progress`: shows how far the checksum and the unpacking are.
     - `notify`: takes a line that says how much is unpacked where, or that the folder is there.
     """
     target = archive.with_suffix("")

@@ -20,8 +20,7 @@ from flexroad.catalog.storage.buckets import StatCache
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.tile import HEIGHTS
-from flexroad.pipeline.check.heights import height_findings
-from flexroad.pipeline.check.trial import Finding, trials
+from flexroad.pipeline.check.trial import Finding, height_findings, trials
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.layers import lacking, without_photo
 from flexroad.tasks import load
@@ -41,8 +40,6 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
     tile, and a DSM that covers less of a tile than `load.min_valid`. Every raster is opened once, and the DSM
     is read. Some tiles, with those of doubtful files first, are read as the run would (`trials`), and their
     DSM and DTM are compared (`height_findings`).
-
-    - `layers`: the layers whose files are looked up.
     """
     unusable = [tile for tile in tiles if tile.fault]
     for tile in unusable[:MAX_SHOWN]:
@@ -96,10 +93,8 @@ def _missing(
     """Name the files that are missing or cannot be read, each with the number of tiles that it lies on."""
     on_file: dict[Location, set[str]] = defaultdict(set)
     for tile in tiles if absent else ():
-        for layer in (layer for layer in tile.all_layers if layer.name in layers):
-            on_tile = layer.reaching(tile.grid.bounds)
-            for path in tile.paths(on_tile) if on_tile else ():
-                on_file[path].add(tile.id)
+        for path in (path for layer in tile.layers_on(layers) for path in tile.paths(layer)):
+            on_file[path].add(tile.id)
     by_reason: dict[str, list[Location]] = defaultdict(list)
     for path, reason in absent.items():
         by_reason[reason].append(path)
@@ -115,16 +110,17 @@ def _missing(
 
 def _no_access(path: Location, stat: StatCache) -> str | None:
     """Return why a file is not there, or is not given to this user; None if it is."""
-    if isinstance(path, Path):
-        try:
-            head(path)
-        except FileNotFoundError:
-            return MISSING
-        except InputRejected:
-            return NO_FILE
-        except OSError as error:
-            return access_reason(error) or str(error)
-    return MISSING if stat(path) is None else None
+    if not isinstance(path, Path):
+        return MISSING if stat(path) is None else None
+    try:
+        head(path)
+    except FileNotFoundError:
+        return MISSING
+    except InputRejected:
+        return NO_FILE
+    except OSError as error:
+        return access_reason(error) or str(error)
+    return None
 
 
 @dataclass(frozen=True)
@@ -160,18 +156,11 @@ def _unfit(tiles: Sequence[Tile], config: Config) -> tuple[dict[str, list[str]],
     return by_reason, doubtful
 
 
-def _on_tile(tile: Tile, names: Collection[str]) -> Iterator[tuple[Layer, tuple[Location, ...]]]:
-    """Yield the rasters of some layers that lie on a tile."""
-    for layer in tile.layers:
-        if layer.name in names and (on_tile := layer.reaching(tile.grid.bounds)):
-            yield on_tile, tile.paths(on_tile)
-
-
 def _headers(tile: Tile, known: dict[tuple[Location, str | None], _Header]) -> list[tuple[Layer, _Header]]:
     """Return the headers of the rasters on a tile; ``known`` has those read before."""
     found = []
-    for layer, paths in _on_tile(tile, load.READS):
-        for path in paths:
+    for layer in tile.layers_on(load.READS):
+        for path in tile.paths(layer):
             key = path, layer.crs
             if key not in known:
                 known[key] = _header(path, layer)
@@ -203,5 +192,5 @@ def _header(path: Location, layer: Layer) -> _Header:
 
 def _share(tile: Tile) -> float | None:
     """Return the share of a tile's cells that has a height in the DSM (0 to 1), None if it is not known."""
-    dsm = next(_on_tile(tile, ("dsm",)), None)
-    return height_share(tile.grid, dsm[1], dsm[0].crs) if dsm else None
+    dsm = next(iter(tile.layers_on(("dsm",))), None)
+    return height_share(tile.grid, tile.paths(dsm), dsm.crs) if dsm else None

@@ -12,12 +12,13 @@ import typer
 from rich.console import Console
 
 from flexroad.catalog import Catalog, CatalogError, layouts
-from flexroad.catalog.allowlist import needed
+from flexroad.catalog.index import needed
 from flexroad.catalog.sources import nrw, rasters, templates
 from flexroad.catalog.storage.unpack import unpack
 from flexroad.catalog.text import count
 from flexroad.catalog.tile import MIN_COVER
 from flexroad.catalog.tiling import Conversion, TilingResult
+from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, LazyGroup, group
 from flexroad.pipeline.cli.stdio import echo
@@ -25,7 +26,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, MIN_COVER_HELP, OUTPUTS, TILES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.layers import fitting_config
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
 from flexroad.pipeline.run.record import check_inputs
 
 TOOLS = {
@@ -60,8 +61,12 @@ RoadMask = Annotated[str | None, _files("Files of the road mask or land cover.")
 RoadValue = Annotated[
     list[int] | None, _files("Values of the mask that mean road; default: all except 0.", "N")
 ]
-Roads = Annotated[str | None, _files("Vector files of roads: a file, or a pattern relative to ROOT.")]
-RoadsLayer = Annotated[str | None, _files("Layer of the roads, if --roads has several.", "NAME")]
+Roads = Annotated[
+    str | None,
+    _files(
+        "Vector files of roads: a file, or a pattern relative to ROOT; FILE|layername=NAME for one layer."
+    ),
+]
 Crs = Annotated[str | None, _files("CRS of files without one: EPSG:25832.", "CRS")]
 Reproject = Annotated[
     bool, options.under(INPUTS, "Warp rasters in another CRS or in feet when they are read.", "--reproject")
@@ -94,7 +99,6 @@ def catalog_rasters(
     road_mask: RoadMask = None,
     road_value: RoadValue = None,
     roads: Roads = None,
-    roads_layer: RoadsLayer = None,
     reference: Annotated[str | None, _files("Reference heights, for the evaluation.")] = None,
     reference_road: Annotated[str | None, _files("Reference road mask, for the evaluation.")] = None,
     crs: Crs = None,
@@ -131,7 +135,6 @@ def catalog_rasters(
         date=date,
         crs=crs,
         min_cover=min_cover,
-        roads_layer=roads_layer,
         conversion=Conversion(reproject, to_crs, height_unit),
     )
     _write_catalog(result, output, strict)
@@ -147,7 +150,6 @@ def catalog_nrw(
     road_mask: RoadMask = None,
     road_value: RoadValue = None,
     roads: Roads = None,
-    roads_layer: RoadsLayer = None,
     tile_size: TileSize = 250,
     min_cover: MinCover = MIN_COVER,
     date: Date = None,
@@ -167,7 +169,6 @@ def catalog_nrw(
         min_cover=min_cover,
         derived=output.parent / f"{output.stem}_bridges",
         roads=roads,
-        roads_layer=roads_layer,
         reproject=reproject,
     )
     _write_catalog(result, output, strict)
@@ -188,7 +189,7 @@ def catalog_gerod(
     """
     dataset = load_config(layout).dataset
     if root.suffix.lower() == ".zip" and not root.is_dir():
-        root = unpack(root, layouts.SHA256, StepProgress(Console(stderr=True)), _note)
+        root = unpack(root, layouts.SHA256, step_progress(Console(stderr=True)), _note)
     if templates.by_name(dataset) and root.is_dir():
         found, _ = layouts.find(root)
         for line in layouts.table(found) if found else ():
@@ -265,9 +266,9 @@ def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] 
         return f"before a run: {error}"
     # Many catalogs are called catalog.parquet: their folder tells them apart.
     title = path.stem if path.stem != "catalog" else path.absolute().parent.name or "run"
-    words = ["flexroad", "run", "--config", name, *(word for change in changes for word in ("--set", change))]
-    words += ["--catalog", str(path), "--out", f"runs/{title}"]
-    # Of all layers, so that the same options suit `catalog check` and `train`.
-    for folder in needed(catalog, path.parent):
-        words += ["--allow", folder]
-    return f"next: {shlex.join(words)}"
+    # Of all layers, so that the same folders suit `catalog check` and `train`.
+    allow = [
+        word for folder in needed(catalog, AllowedFolders.of(path.parent)) for word in ("--allow", folder)
+    ]
+    words = [*allow, "run", "--config", name, *(word for change in changes for word in ("--set", change))]
+    return f"next: {shlex.join(['flexroad', *words, '--catalog', str(path), '--out', f'runs/{title}'])}"

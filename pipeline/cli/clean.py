@@ -16,21 +16,20 @@ from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.cleanup import MEANING, delete, exclusive, find_garbage
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.record import Run, check_links
-from flexroad.pipeline.run.store_users import runs_using, unregister
+from flexroad.pipeline.run.record import Run, check_links, runs_using, unregister
 
 app = group()
 
 
 @app.command(cls=Command)
 def clean(
+    ctx: typer.Context,
     path: options.Run,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the files, delete nothing.")] = False,
     forget: Annotated[
         list[str] | None,
         typer.Option(metavar="RUN", help="Another run of the same store that no longer exists; repeatable."),
     ] = None,
-    allow: options.Allow = None,
 ) -> None:
     """Delete files that no run needs.
 
@@ -43,7 +42,7 @@ def clean(
     location, forgotten = parse_location(path), [absolute(parse_location(text)) for text in forget or ()]
     check_links(location)
     with run_lock(location, say):
-        run = Run.open(location, allow or ())
+        run = Run.open(location, options.allowed(ctx))
         users = {str(user) for user in runs_using(run.store)}
         for user in forgotten:
             if str(user) not in users:
@@ -52,7 +51,7 @@ def clean(
                     f"--forget {user}: no run of the store {run.store}; its runs are: {choices}"
                 )
         files, sizes = Counter[str](), Counter[str]()
-        with exclusive(run, forgotten, say, allow or ()) as runs:
+        with exclusive(run, forgotten, say, options.allowed(ctx)) as runs:
             garbage = find_garbage(runs)
             for file in garbage if dry_run else delete(garbage):
                 files[file.kind] += 1

@@ -73,6 +73,8 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the words of a command line."""
+        if "--allow" in args:
+            ctx.fail("--allow stands before the command: flexroad --allow FOLDER COMMAND ...")
         return super().parse_args(ctx, self._repeated(args))
 
     def format_options(self, ctx: Any, formatter: Any) -> None:

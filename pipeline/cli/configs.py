@@ -11,9 +11,8 @@ import yaml
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo, echo_document
-from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.loading import USUAL, load_config, shipped
-from flexroad.pipeline.config.models import ROOT, Export, stage_models
+from flexroad.pipeline.config.models import ROOT, Cluster, Export, stage_models
 from flexroad.pipeline.config.stages import methods
 from flexroad.tasks.options import Options
 

@@ -109,13 +109,24 @@ def _reason(error: Exception) -> str | None:
     return None
 
 
-@app.callback(invoke_without_command=True)
-def _root(
-    version: Annotated[bool, typer.Option("--version", help="Show the version and stop.")] = False,
-) -> None:
-    if version:
+def _show_version(wanted: bool) -> None:
+    if wanted:
         echo(importlib.metadata.version("flexroad"))
         raise typer.Exit
+
+
+@app.callback()
+def _root(
+    allow: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FOLDER|URL", help="Allow source files in this folder, too; repeatable."),
+    ] = None,
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version and stop.", callback=_show_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Take the options of all commands: `options.allowed` reads them."""
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -22,10 +22,6 @@ def under(heading: str, help: str, *names: str, **more: Any) -> Any:
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run, or its address (s3://...).")]
 OutputFolder = Annotated[Path, under(OUTPUTS, "Output folder.", "-o", "--output", metavar="FOLDER")]
 CatalogFile = Annotated[Path, typer.Argument(metavar="CATALOG", help="Catalog of tiles.")]
-Allow = Annotated[
-    list[str] | None,
-    under(INPUTS, "Allow source files in this folder, too; repeatable.", metavar="FOLDER|URL"),
-]
 TileIds = Annotated[
     list[str] | None, under(TILES, "Only these tiles: --tile ID ID ...", "--tile", metavar="ID")
 ]
@@ -35,9 +31,13 @@ Box = Annotated[
 ]
 Area = Annotated[
     Path | None,
-    under(TILES, "Only tiles that touch the polygons of this file, in any CRS.", "--area", metavar="FILE"),
+    under(
+        TILES,
+        "Only tiles that touch the polygons of this file, in any CRS; FILE|layername=NAME for one layer.",
+        "--area",
+        metavar="FILE",
+    ),
 ]
-AreaLayer = Annotated[str | None, under(TILES, "Layer of --area, if it has several.", metavar="NAME")]
 Workers = Annotated[int | None, under(WORK, "Worker processes; default: one per core.", min=1, metavar="N")]
 MostWorkers = Annotated[
     int | None,
@@ -45,14 +45,6 @@ MostWorkers = Annotated[
 ]
 Parallel = Annotated[
     int, under(WORK, "Worker processes; default: this process alone.", "--workers", min=1, metavar="N")
-]
-Executor = Annotated[
-    Literal["auto", "dask", "serial"],
-    under(
-        WORK,
-        "auto: worker processes if they save more time than their start takes; dask: always; serial: never.",
-        "--executor",
-    ),
 ]
 Dashboard = Annotated[bool, under(WORK, "Serve Dask's dashboard and print its address.", "--dashboard")]
 Verify = Annotated[
@@ -76,6 +68,11 @@ WorkerSettings = Annotated[
         rich_help_panel=WORK,
     ),
 ]
+
+
+def allowed(ctx: typer.Context) -> list[str]:
+    """Return the folders of the program's option ``--allow``."""
+    return ctx.find_root().params["allow"] or []
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:

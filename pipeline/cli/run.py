@@ -17,8 +17,8 @@ from rich.console import Console
 from flexroad.catalog.area import Area
 from flexroad.catalog.storage.paths import parse_location
 from flexroad.catalog.text import count
-from flexroad.pipeline.check.heights import road_is_off, road_step
 from flexroad.pipeline.check.reasons import why_pending
+from flexroad.pipeline.check.trial import road_is_off, road_step
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.dry_run import plan
@@ -29,7 +29,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES, WORK
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.dask import check_address
-from flexroad.pipeline.run.api import Prepared, Selection, Workers, created, process, reopened
+from flexroad.pipeline.run.api import EXECUTORS, Prepared, Selection, Workers, created, process, reopened
 from flexroad.pipeline.run.collection import write_states
 from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.lock import describe_owner, exit_reason, owner
@@ -47,23 +47,24 @@ SHOWN = 5
 """Tiles to look at that ``status`` names; summary.json has all."""
 
 
-def _address(value: str | None) -> str | None:
-    """Return the address of a scheduler; a wrong one is refused before the catalog is read."""
-    if value is not None:
+def _known(value: str) -> str:
+    """Return the value of ``--executor``; a wrong one is refused before the catalog is read."""
+    if value not in EXECUTORS:
         try:
             check_address(value)
         except ConfigError as error:
-            raise typer.BadParameter(str(error)) from error
+            raise typer.BadParameter(f"{error}, or {', '.join(EXECUTORS)}") from error
     return value
 
 
-Scheduler = Annotated[
-    str | None,
+Executor = Annotated[
+    str,
     options.under(
         WORK,
-        "A running Dask scheduler: tcp://host:8786, tls://host:8786.",
-        metavar="ADDRESS",
-        callback=_address,
+        "auto: worker processes if they save more time than their start takes; dask: always; serial: never; "
+        "tcp://host:8786 or tls://host:8786: a running Dask scheduler.",
+        metavar="auto|dask|serial|ADDRESS",
+        callback=_known,
     ),
 ]
 REPAIR = "repair what was skipped, repeat the `flexroad catalog` command, then `flexroad run`"
@@ -75,6 +76,7 @@ StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "as
 @app.command(cls=Command)
 @ignore_write_errors()
 def run(
+    ctx: typer.Context,
     catalog: Annotated[Path, options.under(INPUTS, "Catalog of tiles.", metavar="CATALOG")],
     out: Annotated[
         Path, options.under(OUTPUTS, "Folder of the run; an existing run is resumed.", metavar="RUN")
@@ -86,7 +88,6 @@ def run(
         ),
     ] = "production",
     settings: options.Settings = None,
-    allow: options.Allow = None,
     checksum: Annotated[
         bool, options.under(INPUTS, "Detect changed sources by content, not by size and time.", "--checksum")
     ] = False,
@@ -98,10 +99,8 @@ def run(
     tile: options.TileIds = None,
     bbox: options.Box = None,
     area: options.Area = None,
-    area_layer: options.AreaLayer = None,
-    executor: options.Executor = "auto",
+    executor: Executor = "auto",
     workers: options.MostWorkers = None,
-    scheduler: Scheduler = None,
     dashboard: options.Dashboard = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print why each tile would be computed, and what would fail.")
@@ -118,13 +117,13 @@ def run(
     root = parse_location(store) if store else None
     if dry_run:
         chosen = load_config(config, settings or ())
-        selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
-        tiles, selected = selection.of(path, source, allow or (), chosen)
+        selection = Selection(tile or (), bbox, Area.read(area) if area else None)
+        tiles, selected = selection.of(path, source, options.allowed(ctx), chosen)
         planned = Run.planned(path, chosen, tiles, root, checksum)
         raise typer.Exit(plan(planned, selected.tiles, echo, workers, verbose))
     with _interruptible() as shown:
         chosen = load_config(config, settings or ())
-        selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
+        selection = Selection(tile or (), bbox, Area.read(area) if area else None)
         with created(
             path,
             source,
@@ -132,8 +131,8 @@ def run(
             selection,
             store=root,
             checksum=checksum,
-            allow=allow or (),
-            workers=Workers(executor, workers, scheduler, dashboard),
+            allow=options.allowed(ctx),
+            workers=Workers(executor, workers, dashboard),
             observer=shown,
         ) as prepared:
             _process(prepared, verify, shown)
@@ -143,6 +142,7 @@ def run(
 @app.command(cls=Command)
 @ignore_write_errors()
 def rerun(
+    ctx: typer.Context,
     path: options.Run,
     tile: Annotated[
         list[str] | None, options.under(TILES, "These tiles: --tile ID ID ...", metavar="ID")
@@ -155,9 +155,7 @@ def rerun(
         ),
     ] = None,
     settings: options.WorkerSettings = None,
-    allow: options.Allow = None,
-    executor: options.Executor = "auto",
-    scheduler: Scheduler = None,
+    executor: Executor = "auto",
 ) -> None:
     """Bring tiles of a run up to date again.
 
@@ -172,8 +170,8 @@ def rerun(
             failed=failed,
             from_stage=from_stage,
             settings=settings or (),
-            allow=allow or (),
-            workers=Workers(executor, scheduler=scheduler),
+            allow=options.allowed(ctx),
+            workers=Workers(executor),
             observer=shown,
         ) as prepared,
     ):
@@ -319,15 +317,15 @@ def _exit(shown: Shown) -> None:
 
 @app.command(cls=Command)
 def status(
+    ctx: typer.Context,
     path: options.Run,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
     geojson: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a map of the tile states, for QGIS.")
     ] = None,
-    allow: options.Allow = None,
 ) -> None:
     """Show the state of a run and the failures of its tiles."""
-    opened = Run.open(parse_location(path), allow or ())
+    opened = Run.open(parse_location(path), options.allowed(ctx))
     if geojson is not None:
         write_states(opened, parse_location(geojson))
         echo(str(geojson))

@@ -26,11 +26,7 @@ MAX_REASON = 200
 
 
 def parse(data: bytes, name: str) -> tuple[Any, dict[str, int]]:
-    """Return the content of a YAML file, and the line of each key of its outermost mapping, from 1.
-
-    - `data`: the file's bytes, in UTF-8.
-    - `name`: the file's name, for messages.
-    """
+    """Return the content of a YAML file, and the line of each key of its outermost mapping, from 1."""
     if len(data) > MAX_BYTES:
         raise ConfigError(f"{name}: {len(data)} bytes; a configuration has at most {MAX_BYTES}")
     try:

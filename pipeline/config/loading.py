@@ -15,8 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config import document
-from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.models import ROOT, TAG, Config, Export, stage_models
+from flexroad.pipeline.config.models import ROOT, TAG, Cluster, Config, Export, stage_models
 from flexroad.pipeline.config.settings import applied, merge, parsed, texts
 from flexroad.pipeline.config.stages import DEFAULTS
 from flexroad.pipeline.errors import ConfigError
@@ -48,16 +47,13 @@ def shipped() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def load_config(
-    name: str | Path, settings: Sequence[str] | Mapping[str, Any] = (), base: str = USUAL
-) -> Config:
+def load_config(name: str | Path, settings: Sequence[str] | Mapping[str, Any] = ()) -> Config:
     """Read a configuration by shipped name or by file name.
 
     - `settings`: options that replace those of the file: ``["fit.spacing_m=5"]`` or ``{"fit": {"spacing_m":
       5}}``. They are a part of the configuration's name, so that no result looks like one of the file alone.
-    - `base`: what a file without ``extends`` extends.
     """
-    config = compose(_raw(name, base), str(name))
+    config = compose(_raw(name), str(name))
     if not settings:
         return config
     given = texts(settings)
@@ -116,11 +112,11 @@ def read_mapping(data: bytes, name: str) -> dict[str, Any]:
     return _mapping_of(document.parse(data, name)[0], name)
 
 
-def _raw(name: str | Path, base: str) -> dict[str, Any]:
+def _raw(name: str | Path) -> dict[str, Any]:
     """Return the file's mapping merged over its parents."""
     path = _existing(name)
     layers, seen = [_read(path)], [path]
-    while (parent := layers[-1].pop("extends", base)) != ROOT:
+    while (parent := layers[-1].pop("extends", USUAL)) != ROOT:
         path = _parent(parent, path)
         if path.resolve() in (file.resolve() for file in seen):
             raise ConfigError(f"{path}: extends: the file extends itself; name another file or {USUAL}")

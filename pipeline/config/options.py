@@ -7,9 +7,9 @@ from typing import Any
 
 INPUTS, OUTPUTS, TILES = "Inputs", "Outputs", "Tiles"
 METHOD, VALIDATION = "Method", "Split into training and validation"
-GROUND, RASTERS, RECONSTRUCTION = "Ground", "Rasters", "Reconstruction"
+POINTS, MESH, PHOTOS, RASTERS = "Points", "Mesh", "Photos", "Rasters"
 WORK = "Parallel work"
-HEADINGS = (INPUTS, METHOD, VALIDATION, RECONSTRUCTION, GROUND, RASTERS, TILES, OUTPUTS, WORK)
+HEADINGS = (INPUTS, METHOD, VALIDATION, POINTS, MESH, PHOTOS, RASTERS, TILES, OUTPUTS, WORK)
 """In the order of a help page."""
 MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
 

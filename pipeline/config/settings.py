@@ -83,7 +83,6 @@ def merge(base: Any, override: Any, tag: str | None, where: str) -> dict[str, An
 
     - `base`, `override`: options, or the method alone.
     - `tag`: the option that a single word sets, such as ``method``; None if there is none.
-    - `where`: the place in the configuration, for messages.
     """
     options, changes = tagged(base, tag, where), tagged(override, tag, where)
     if tag in changes and tag in options and changes[tag] != options[tag]:

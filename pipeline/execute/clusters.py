@@ -20,15 +20,14 @@ from distributed.security import Security
 from distributed.utils import silence_logging_cmgr
 
 from flexroad.catalog.storage.scratch import ScratchFolder
-from flexroad.catalog.text import Notify
+from flexroad.catalog.text import Notify, one_line
 from flexroad.pipeline import OF_WORKERS
-from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.models import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.slurm import slurm
 from flexroad.pipeline.execute.start import (
     available_bytes,
     certificates,
-    one_line,
     opened,
     settings,
     start_workers,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog.text import Notify, without_credentials
-from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.models import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.executor import Executor, J, Lost, Probe, R
 

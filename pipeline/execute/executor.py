@@ -174,8 +174,6 @@ class AdaptiveExecutor(Executor):
     """Runs jobs in this process until workers pay for their start; the rest on workers.
 
     - `workers`: largest number of worker processes; by default one per core.
-    - `parallel`: runs the jobs on the workers.
-    - `notify`: prints each decision, one line.
     """
 
     def __init__(self, workers: int | None, parallel: Executor, notify: Notify) -> None:

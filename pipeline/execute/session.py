@@ -59,60 +59,48 @@ class InFlight(Generic[J]):
     submitted: float = field(default_factory=time.monotonic)
 
 
+@dataclass(eq=False)
 class Session(Generic[J, R]):
-    """Submits jobs over one connection and collects their results.
+    """Submits jobs over one connection and collects their results."""
 
-    - `client`: has a `WorkerCheck` on every worker and a `retry_blocker` on the scheduler.
-    - `name`: the scheduler's name in messages.
-    - `check`: name of the `WorkerCheck`; part of the task keys, so that they are unique to this session.
-    - `jobs`: taken as there is room.
-    - `worker_lost_timeout_s`, `tile_timeout_s`: how long to wait for a worker when there is none, and longest
-      time of a job (s).
-    - `probe`: that of the `WorkerCheck`.
-    """
+    client: Client
+    """It has a `WorkerCheck` on every worker and a `retry_blocker` on the scheduler."""
+    name: str
+    """The scheduler's name in messages."""
+    check: str
+    """Name of the `WorkerCheck`; part of the task keys, so that they are unique to this session."""
+    function: Callable[[J], R]
+    jobs: Iterator[J]
+    """They are taken as there is room."""
+    lost: Callable[[J, str], R]
+    worker_lost_timeout_s: float
+    """How long to wait for a worker when there is none (s)."""
+    limit_s: float
+    """Longest time of a job (s)."""
+    notify: Notify
+    probe: Probe | None = None
+    """That of the `WorkerCheck`."""
+    quarantined: deque[J] = field(default_factory=deque)
+    """Jobs that were assigned to a worker that died."""
+    suspects: deque[J] = field(default_factory=deque)
+    """Quarantined jobs whose worker died again for an unknown reason."""
+    returned: deque[J] = field(default_factory=deque)
+    """Jobs that a worker could not take."""
+    done: int = 0
+    """Number of results."""
+    died: set[str] = field(default_factory=set)
+    """Addresses of workers that died before there was a result."""
+    in_flight: dict[Future, InFlight[J]] = field(default_factory=dict)
+    completed: queue.SimpleQueue[Future] = field(default_factory=queue.SimpleQueue)
+    numbers: Iterator[int] = field(default_factory=partial(count, 1))
+    workers: dict[str, int] = field(default_factory=dict)
+    """Number of threads by worker address, at ``checked_at``."""
+    checked_at: float = 0.0
+    without_worker_s: float | None = None
+    """Time for which checks found no workers (s); None if there are workers."""
 
-    def __init__(
-        self,
-        client: Client,
-        name: str,
-        check: str,
-        function: Callable[[J], R],
-        jobs: Iterator[J],
-        lost: Callable[[J, str], R],
-        worker_lost_timeout_s: float,
-        tile_timeout_s: float,
-        notify: Notify,
-        probe: Probe | None = None,
-    ) -> None:
-        self.client = client
-        self.name = name
-        self.check = check
-        self.function = function
-        self.jobs = jobs
-        self.quarantined: deque[J] = deque()
-        """Jobs that were assigned to a worker that died."""
-        self.suspects: deque[J] = deque()
-        """Quarantined jobs whose worker died again for an unknown reason."""
-        self.lost = lost
-        self.worker_lost_timeout_s = worker_lost_timeout_s
-        self.limit_s = tile_timeout_s
-        self.notify = notify
-        self.admission = Admission(probe, notify)
-        self.returned: deque[J] = deque()
-        """Jobs that a worker could not take."""
-        self.done = 0
-        """Number of results."""
-        self.died: set[str] = set()
-        """Addresses of workers that died before there was a result."""
-        self.in_flight: dict[Future, InFlight[J]] = {}
-        self.completed: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        self.numbers = count(1)
-        self.run_task = task_function()
-        self.workers: dict[str, int] = {}
-        """Number of threads by worker address, at ``checked_at``."""
-        self.checked_at = 0.0
-        self.without_worker_s: float | None = None
-        """Time for which checks found no workers (s); None if there are workers."""
+    def __post_init__(self) -> None:
+        self.admission, self.run_task = Admission(self.probe, self.notify), task_function()
 
     def results(self) -> Iterator[R]:
         """Yield results as jobs finish, until nothing is left to do."""

@@ -22,7 +22,7 @@ from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
 from flexroad.catalog.text import Notify, count
-from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
+from flexroad.pipeline.config.models import DEFAULT_MEMORY_BYTES, Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.start import (
     certificates,

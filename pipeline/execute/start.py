@@ -17,7 +17,7 @@ from distributed.security import Security
 from distributed.system import MEMORY_LIMIT
 
 from flexroad.pipeline import OF_WORKERS
-from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.models import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.memory import MOUNT, OWN, group_limits
 
@@ -148,8 +148,3 @@ def start_workers(opened: Any, number: int) -> None:
 async def _started(opened: Any) -> None:
     # An interrupt cancels the wait alone: Dask could not close a cluster whose start was cancelled.
     await asyncio.shield(opened._correct_state())
-
-
-def one_line(error: Exception) -> str:
-    """Return the message of an error in one line."""
-    return " ".join(str(error).split()) or repr(error)

@@ -27,11 +27,10 @@ from distributed import Client, SchedulerPlugin, WorkerPlugin, get_worker
 from distributed.protocol.pickle import dumps, loads
 from threadpoolctl import threadpool_limits
 
-from flexroad.catalog.text import Notify
+from flexroad.catalog.text import Notify, one_line
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.executor import J, Probe, R
-from flexroad.pipeline.execute.start import one_line
 
 PICKLING = ("python", "dask", "distributed", "cloudpickle")
 """Packages whose versions must be equal for processes to exchange objects; also on the scheduler."""
@@ -49,11 +48,7 @@ _thread = local()
 
 
 class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
-    """Limits a worker to one thread; before its first job, compares versions and takes the client's probe.
-
-    - `versions`: those of the client, from `versions`.
-    - `probe`: check of what the jobs need.
-    """
+    """Limits a worker to one thread; before its first job, compares versions and takes the client's probe."""
 
     def __init__(self, versions: Mapping[str, str], probe: Probe | None = None) -> None:
         self.versions = dict(versions)

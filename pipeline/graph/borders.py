@@ -8,7 +8,7 @@ result.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -98,7 +98,11 @@ def check_tiles(config: Config, catalog: Catalog) -> None:
         return
     size_m = max(grid.cell * max(grid.shape) for grid in (tile.grid for tile in tiles))
     _check_acting(joined, size_m)
-    _check_spacing(joined, {tile.grid.cell for tile in tiles})
+    for fit, cell in itertools.product(joined, {tile.grid.cell for tile in tiles}):
+        try:
+            check_spacing(fit.spacing_m, cell)
+        except TaskError as error:
+            raise ConfigError(str(error)) from error
     if len({_lattice(tile.grid) for tile in tiles}) <= 1:
         return
     lattices = [_lattice(tile.grid) for tile in tiles]
@@ -124,14 +128,6 @@ def _check_acting(fits: Sequence[Options], tile_m: float) -> None:
                 f"fit.degree times fit.spacing_m is {acting_m:g} m: control points would act farther than "
                 f"the {REACH_M:g} m up to which catalogs list files; lower fit.spacing_m"
             )
-
-
-def _check_spacing(fits: Sequence[Any], cells: Iterable[float]) -> None:
-    for fit, cell in itertools.product(fits, cells):
-        try:
-            check_spacing(fit.spacing_m, cell)
-        except TaskError as error:
-            raise ConfigError(str(error)) from error
 
 
 def _lattice(grid: Grid) -> tuple[object, ...]:

@@ -20,13 +20,13 @@ that follow from it (`TileGraph.renamed`): they are used again only while the fi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog import Layer, Tile
+from flexroad.catalog import Tile
 from flexroad.catalog.guard.source_files import source_stat
 from flexroad.catalog.storage.paths import FileStat, Location
 from flexroad.pipeline.config.models import Chain, Config, Export
@@ -42,7 +42,7 @@ from flexroad.pipeline.graph.sources import (
     to_json,
 )
 from flexroad.tasks.border import ENDS, BorderTask
-from flexroad.tasks.options import Options, stage_function, stage_module
+from flexroad.tasks.options import Options, stage_module
 from flexroad.tasks.products import cog, glb, npz, ply
 
 ITEM_VERSION = 3
@@ -69,11 +69,6 @@ class Node:
     """Its computation if it is a corner or edge; ``options`` are then those of the fit."""
     refit: Options | None = None
     """The options of the fit if `assess` withholds a part of the road from a second one."""
-
-    @property
-    def function(self) -> Callable[..., Any]:
-        """The function that computes the node."""
-        return stage_function(self.stage, self.options)
 
 
 @dataclass(frozen=True)
@@ -149,11 +144,6 @@ class TileGraph:
         )
         return next(names, path)
 
-    @property
-    def product_sources(self) -> tuple[Layer, ...]:
-        """The source layers that its products are made of, with the files that reach the tile."""
-        return _product_sources(self.tile, self.export)
-
     def chain(self, variant: str) -> list[Node]:
         """Return the variant's nodes in the paper's order."""
         return [self.nodes[self.variants[variant][stage]] for stage in STAGE_NAMES]
@@ -211,7 +201,12 @@ class Pattern:
                 if key not in steps or step.stored:
                     steps[key] = step
             variants[variant] = by_stage
-        exported = to_json([product_options(config.export), product_versions(config.export)])
+        options = config.export.model_dump(mode="json")
+        if not config.export.texture:
+            # Without a texture, products do not depend on its options.
+            options = {name: value for name, value in options.items() if not name.startswith(PHOTO)}
+        versions = {"item": ITEM_VERSION} | {name: FORMATS[name].VERSION for name in config.export.formats}
+        exported = to_json([options, versions])
         halo_m = max(chain["load"].halo_m for chain in config.chains.values())
         return cls(tuple(steps[key] for key in numbers), variants, config.export, exported, halo_m)
 
@@ -226,7 +221,6 @@ class Pattern:
         """Return the graph of one tile.
 
         - `checksum`: hash the bytes of the source files instead of size and time.
-        - `stat_file`: returns size and version of a source file, None if it does not exist.
         - `recorded`: `TileGraph.sources` of an earlier graph, used for files that no longer exist.
         """
         own = tile.within(tile.grid.buffered(self.halo_m).bounds)
@@ -269,32 +263,13 @@ class Pattern:
             [[variant, names["evaluate"], names["assess"]] for variant, names in variants.items()],
             [variants[variant]["sample"] for variant in self.export.variants],
         ]
-        layers = [sources.text(layer) for layer in _product_sources(tile, self.export)]
+        layers = [sources.text(layer) for layer in tile.layers_on(product_layers(self.export))]
         return hashed(f"{','.join([to_json(requested)[:-1], *layers, self.exported])}]")
-
-
-def product_versions(export: Export) -> dict[str, int]:
-    """Return the versions of the item and of the exported formats."""
-    return {"item": ITEM_VERSION} | {name: FORMATS[name].VERSION for name in export.formats}
-
-
-def product_options(export: Export) -> dict[str, Any]:
-    """Return the options that the products depend on: without a texture not those of the texture."""
-    options: dict[str, Any] = export.model_dump(mode="json")
-    if export.texture:
-        return options
-    return {name: value for name, value in options.items() if not name.startswith(PHOTO)}
 
 
 def product_layers(export: Export) -> tuple[str, ...]:
     """Return the names of the source layers that the products are made of."""
     return ("dop",) if export.texture else ()
-
-
-def _product_sources(tile: Tile, export: Export) -> tuple[Layer, ...]:
-    layers = (tile.layer(name) for name in product_layers(export))
-    reaching = (layer.reaching(tile.grid.bounds) for layer in layers if layer)
-    return tuple(layer for layer in reaching if layer)
 
 
 def _step(stage: str, chain: Chain, inputs: tuple[int, ...], keep_mesh: bool) -> Step:
@@ -364,6 +339,5 @@ def own_files_missing(graph: TileGraph) -> list[str]:
     tile, reads = graph.around, graph.reads
     read = [layer for layer in tile.all_layers if layer.name in reads]
     listed = {str(path) for layer in read for path in tile.paths(layer)}
-    on_tile = (layer.reaching(tile.grid.bounds) for layer in tile.layers if layer.name in reads)
-    own = {str(path) for layer in on_tile if layer for path in tile.paths(layer)}
+    own = {str(path) for layer in tile.layers_on(reads) for path in tile.paths(layer)}
     return [path for path in missing if path in own or path not in listed]

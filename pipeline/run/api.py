@@ -2,7 +2,7 @@
 
 ::
 
-    with created(path, catalog, config) as prepared:     # or reopened(path)
+    with created(path, catalog, config, selection, workers=workers) as prepared:     # or reopened(path)
         summary = process(prepared)
 """
 
@@ -14,12 +14,12 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from flexroad.catalog import Bounds, Catalog, Tile
-from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.area import Area
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.index import check_allowed
 from flexroad.catalog.skipped import Skipped, lost
 from flexroad.catalog.storage.outputs import made_folder
 from flexroad.catalog.storage.paths import Location, exists
@@ -37,11 +37,11 @@ from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_folder, check_links
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.run.status import Folders, open_database, recorded
+from flexroad.pipeline.run.status import open_database, recorded, tile_files
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import FAILED
 
-Kind = Literal["auto", "serial", "dask"]
+EXECUTORS = ("auto", "serial", "dask")
 SECTION = "cluster"
 
 
@@ -49,17 +49,13 @@ SECTION = "cluster"
 class Workers:
     """Where tiles are processed."""
 
-    executor: Kind = "auto"
-    """auto: worker processes if they pay; serial: this process; dask: workers."""
+    executor: str = "auto"
+    """auto: worker processes if they pay; serial: this process; dask: workers; else the address of a running
+    Dask scheduler, whose workers are used."""
     number: int | None = None
     """Most worker processes; None: as the configuration says."""
-    scheduler: str | None = None
-    """Address of a running Dask scheduler, whose workers are used; None: workers are started."""
     dashboard: bool = False
     """Whether Dask's dashboard is served."""
-
-
-AUTO = Workers()
 
 
 @dataclass(frozen=True)
@@ -93,9 +89,6 @@ class Selection:
         return replace(taken, skipped=_with_lost(path, whole)), selected
 
 
-ALL = Selection()
-
-
 @dataclass(frozen=True)
 class Prepared:
     """A run that this process may write, until the block that gave it ends."""
@@ -114,19 +107,17 @@ def created(
     path: Location,
     catalog: Location,
     config: Config,
-    selection: Selection = ALL,
+    selection: Selection,
     *,
     store: Location | None = None,
     checksum: bool = False,
     allow: Sequence[Any] = (),
-    workers: Workers = AUTO,
+    workers: Workers,
     observer: Observer | None = None,
 ) -> Iterator[Prepared]:
     """Hold a new or an existing run of a catalog while its tiles are brought up to date.
 
     - `path`: the run's folder: new, empty, or of a run, which is resumed.
-    - `catalog`: the catalog's file.
-    - `selection`: its tiles to process.
     - `store`: folder of stage results that several runs share; by default a folder of the run.
     - `checksum`: whether changed sources are detected by their content, not by size and time.
     - `allow`: folders besides the catalog's that its files may lie below.
@@ -152,14 +143,12 @@ def reopened(
     from_stage: str | None = None,
     settings: Sequence[str] = (),
     allow: Sequence[Any] = (),
-    workers: Workers = AUTO,
+    workers: Workers,
     observer: Observer | None = None,
 ) -> Iterator[Prepared]:
     """Hold an existing run while its tiles are brought up to date.
 
-    - `path`: the run's folder.
     - `tiles`: ids of the tiles to process; none given: all, or the failed ones.
-    - `failed`: whether the tiles that failed are processed.
     - `from_stage`: stage that is computed again, with all later ones; ``export``: only the products are
       written again.
     - `settings`: options of the workers: ``cluster.memory=8 GiB``.
@@ -178,8 +167,6 @@ def process(prepared: Prepared, verify: bool = False) -> Summary:
     """Bring the tiles of a run up to date, and write its tables, mosaics, collection and map.
 
     A tile that fails is counted, and does not stop the others.
-
-    - `verify`: see `run_tiles`.
     """
     run, observer = prepared.run, prepared.observer
     observer.start(len(run.catalog.tiles), sum(map(prepared.only, run.catalog.tiles)))
@@ -207,7 +194,7 @@ def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile
 
     With the failed ones go the tiles that were made without a file.
     """
-    folders = Folders(run.path)
+    files_of = tile_files(run.path)
     ids = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
     without_file = set[str]()
     if failed:
@@ -219,7 +206,7 @@ def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile
         if tile.id in ids or not (ids or failed):
             return True
         # The marker is enough, even if it is of other sources: a corrected file is a reason to rerun.
-        return tile.id in without_file or (failed and FAILED in folders(tile.id))
+        return tile.id in without_file or (failed and FAILED in files_of(tile.id))
 
     return selected
 
@@ -250,8 +237,6 @@ def with_workers(run: Run, settings: Sequence[str]) -> Run:
 
     Those of RUN/config.yaml that can start programs (`Cluster.programs`) count only if they are sealed: the
     run may come from anyone.
-
-    - `settings`: options of the command line: ``cluster.workers=8``.
     """
     changes = [parsed(text) for text in settings]
     for keys, _ in changes:
@@ -311,10 +296,8 @@ def _executor(run: Run, workers: Workers, died: bool, observer: Observer) -> Exe
         return SerialExecutor()
     cluster = run.config.cluster
     logs = run.path.resolve() / "logs" if isinstance(run.path, Path) else None
-    parallel = DaskExecutor(
-        workers.number, workers.scheduler, cluster, workers.dashboard, observer.line, logs
-    )
-    needed = workers.scheduler or workers.dashboard or cluster.needs_workers
-    if workers.executor == "dask" or died or needed:
+    scheduler = None if workers.executor in EXECUTORS else workers.executor
+    parallel = DaskExecutor(workers.number, scheduler, cluster, workers.dashboard, observer.line, logs)
+    if workers.executor != "auto" or died or workers.dashboard or cluster.needs_workers:
         return parallel
     return AdaptiveExecutor(workers.number or cluster.workers, parallel, observer.line)

@@ -22,9 +22,8 @@ from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.record import RECORD, Run, check_links, check_models
+from flexroad.pipeline.run.record import RECORD, USERS, Run, check_links, check_models, runs_using
 from flexroad.pipeline.run.status import known_record, open_database, peek_statuses
-from flexroad.pipeline.run.store_users import FOLDER, runs_using
 from flexroad.pipeline.store.records import DONE, FAILED
 from flexroad.pipeline.worker.exports import KINDS, LEVEL_KINDS
 
@@ -56,8 +55,6 @@ def exclusive(
 
     - `run`: the run; the caller holds its lock.
     - `without`: runs to ignore because they no longer exist.
-    - `notify`: receives one line when the lock of a dead process is taken over.
-    - `allow`: see `Run.open`.
     """
     with contextlib.ExitStack() as stack:
         runs = [run]
@@ -77,10 +74,7 @@ def exclusive(
 
 
 def find_garbage(runs: Sequence[Run]) -> Iterator[Garbage]:
-    """Yield the files that are not needed in the store of these runs and in the folder of the first run.
-
-    - `runs`: all runs of the store.
-    """
+    """Yield the unneeded files of a store and of the first run's folder; ``runs``: all runs of the store."""
     first = runs[0]
     # Before the needed ones are known: other commands may write to the store meanwhile, and that stays.
     unneeded = {name for name, _ in _in_store(first.store)}
@@ -107,7 +101,7 @@ def _others(run: Run, without: Sequence[Location]) -> list[Location]:
         users = set(runs_using(run.store))
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(
-            f"the list of runs in {run.store / FOLDER} cannot be read: {error!r}; correct or remove that file"
+            f"the list of runs in {run.store / USERS} cannot be read: {error!r}; correct or remove that file"
         ) from error
     others = (path for path in users if not any(_same(path, excluded) for excluded in (run.path, *without)))
     return sorted(others, key=str)

@@ -22,7 +22,7 @@ import shapely
 
 from flexroad.catalog import Grid, Tile
 from flexroad.catalog.crs import bounds_in, transformer
-from flexroad.catalog.grid import Bounds
+from flexroad.catalog.grid import Bounds, union
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.index import PROJECTION, STAC_VERSION, datetime_text
 from flexroad.catalog.storage.buckets import atomic_file
@@ -119,14 +119,9 @@ def _degrees(tiles: Sequence[Tile]) -> Bounds:
     by_crs: defaultdict[str, list[Bounds]] = defaultdict(list)
     for tile in tiles:
         by_crs[tile.grid.crs].append(tile.grid.bounds)
-    parts = [bounds_in("EPSG:4326", crs, _union(bounds)) for crs, bounds in by_crs.items()]
+    parts = [bounds_in("EPSG:4326", crs, union(bounds)) for crs, bounds in by_crs.items()]
     known = [part for part in parts if abs(part[0]) <= 180 and abs(part[3]) <= 90]
-    return _union(known) if known else (-180.0, -90.0, 180.0, 90.0)
-
-
-def _union(bounds: Sequence[Bounds]) -> Bounds:
-    wests, souths, easts, norths = zip(*bounds, strict=True)
-    return min(wests), min(souths), max(easts), max(norths)
+    return union(known) if known else (-180.0, -90.0, 180.0, 90.0)
 
 
 def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
@@ -273,18 +268,9 @@ def write_states(run: Run, where: Location) -> None:
         file.write('{"type": "FeatureCollection", "features": [')
         rows = zip(recorded(run, database), places, strict=True)
         for number, ((tile_id, state, record), place) in enumerate(rows):
-            feature = _feature(_map_row(tile_id, state, record, variant), place)
+            feature = _feature(tile_id, state, record, variant, place)
             file.write(f"{', ' if number else ''}{json.dumps(feature)}")
         file.write("]}")
-
-
-def _feature(row: Mapping[str, Any], outline: str | None) -> dict[str, Any]:
-    return {
-        "id": row["id"],
-        "type": "Feature",
-        "properties": {name: row.get(name) for name in MAP_COLUMNS},
-        "geometry": json.loads(outline) if outline else None,
-    }
 
 
 def outlines(tiles: Sequence[Tile]) -> Any:
@@ -305,9 +291,11 @@ def outlines(tiles: Sequence[Tile]) -> Any:
     )
 
 
-def _map_row(tile_id: str, state: TileState, record: TileRecord | None, variant: str) -> dict[str, Any]:
+def _feature(
+    tile_id: str, state: TileState, record: TileRecord | None, variant: str, outline: str | None
+) -> dict[str, Any]:
     stale = state in ("failed", "pending") and record is not None and record.has_products
-    row: dict[str, Any] = {"id": tile_id, "state": state, "stale": stale}
+    row: dict[str, Any] = dict.fromkeys(MAP_COLUMNS) | {"id": tile_id, "state": state, "stale": stale}
     # The record of a pending tile belongs to earlier files or options.
     if record is not None and state != "pending":
         row |= {"seconds": round(record.seconds, 3), "finished": record.finished or None}
@@ -317,4 +305,5 @@ def _map_row(tile_id: str, state: TileState, record: TileRecord | None, variant:
             if metrics["variant"] == variant:
                 row["error_estimate_m"] = metrics.get("error_estimate_m")
                 row["flags"] = metrics.get("flags") or None
-    return row
+    geometry = json.loads(outline) if outline else None
+    return {"id": tile_id, "type": "Feature", "properties": row, "geometry": geometry}

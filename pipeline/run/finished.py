@@ -8,12 +8,12 @@ is kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from flexroad.pipeline.config.stages import STAGE_NAMES
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing, product_layers
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import Folders, TileStatus, last_record, peek_statuses
+from flexroad.pipeline.run.status import TileStatus, last_record, peek_statuses, tile_files
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import MarkerStat, distances_of
@@ -71,7 +71,7 @@ class Snapshot:
     marker: MarkerStat | None
     """Name, size and version of its marker; None if it had none."""
     files: bytes = b""
-    """Hash of the sizes and times of all its files (`FileStates`); empty if they are not to be compared."""
+    """Hash of the sizes and times of all its files (`file_states`); empty if they are not to be compared."""
     distances: tuple[float, ...] = NO_DISTANCES
     """Distances of its mesh from its surface (m) in the order of `FIGURES`; NaN where it has none."""
 
@@ -97,37 +97,38 @@ def _digests(graph: TileGraph, variant: str) -> bytes:
     return bytes.fromhex("".join(node.fingerprint for node in graph.chain(variant)))
 
 
-class FileStates:
-    """Sizes and times of the files that the state of a tile depends on, in one pass over tiles."""
+def file_states(run: Run) -> Callable[[Tile], bytes]:
+    """Return a function from a tile to a hash of names, sizes and times of its results, sources and models.
 
-    def __init__(self, run: Run) -> None:
-        self._folders, self._stat_file = Folders(run.path), run.stat_cache()
-        self._layers = run.pattern.reads.union(product_layers(run.pattern.export))
-        self._models = [(str(file), source_stat(file)) for step in run.pattern.steps for file in step.files]
+    It is for one pass over tiles: sources in a bucket are looked up once.
+    """
+    files_of, stat_file = tile_files(run.path), run.stat_cache()
+    layers = run.pattern.reads.union(product_layers(run.pattern.export))
+    models = [(str(file), source_stat(file)) for step in run.pattern.steps for file in step.files]
 
-    def __call__(self, tile: Tile) -> bytes:
-        """Return a hash of the names, sizes and times of a tile's results, sources and models."""
+    def state(tile: Tile) -> bytes:
         sources = []
-        for layer in tile.all_layers:
-            if layer.name in self._layers:
-                try:
-                    sources += [(str(path), self._stat_file(path)) for path in tile.paths(layer)]
-                except CatalogError as error:
-                    # A layer with files that may not be read is looked up only if the tile needs them.
-                    sources.append((str(error), None))
-        products = sorted(self._folders(tile.id).items())
-        return blake2b(repr((products, sources, self._models)).encode(), digest_size=16).digest()
+        for layer in (layer for layer in tile.all_layers if layer.name in layers):
+            try:
+                sources += [(str(path), stat_file(path)) for path in tile.paths(layer)]
+            except CatalogError as error:
+                # A layer with files that may not be read is looked up only if the tile needs them.
+                sources.append((str(error), None))
+        products = sorted(files_of(tile.id).items())
+        return blake2b(repr((products, sources, models)).encode(), digest_size=16).digest()
+
+    return state
 
 
 def snapshots(run: Run, tiles: Iterable[Tile], variant: str) -> Iterator[tuple[Tile, Snapshot | None]]:
     """Yield each tile as it is now, with None if it is not finished; checks its sources and its products."""
-    files, seen = FileStates(run), b""
+    state, seen = file_states(run), b""
 
     def looked_at() -> Iterator[Tile]:
         nonlocal seen
         for tile in tiles:
             # Before its state is checked: a later change is noticed then.
-            seen = files(tile)
+            seen = state(tile)
             yield tile
 
     for status in peek_statuses(run, looked_at()):
@@ -236,59 +237,48 @@ class FinishedTile:
     @property
     def mesh(self) -> Mesh:
         """The mesh of road and terrain."""
-        mesh: Mesh = self._result("sample")
-        return mesh
+        return cast(Mesh, self._result("sample"))
 
     @property
     def metrics(self) -> Metrics:
         """The errors of the mesh."""
-        metrics: Metrics = self._result("evaluate")
-        return metrics
+        return cast(Metrics, self._result("evaluate"))
 
     @property
     def surface(self) -> Surface:
         """The fitted surface."""
-        surface: Surface = self._result("fit")
-        return surface
+        return cast(Surface, self._result("fit"))
 
     @property
     def road(self) -> RoadMask:
         """The road mask before the filter, with the cells beyond the survey."""
-        road: RoadMask = self._result("segment")
-        return road
+        return cast(RoadMask, self._result("segment"))
 
     @property
     def clusters(self) -> RoadClusters:
         """The road after the filter."""
-        clusters: RoadClusters = self._result("ecsrc")
-        return clusters
+        return cast(RoadClusters, self._result("ecsrc"))
 
     @property
     def quality(self) -> Quality:
         """Figures and height source of the surface."""
-        quality: Quality = self._result("assess")
-        return quality
+        return cast(Quality, self._result("assess"))
 
     @property
     def data(self) -> TileData:
         """The rasters; read from the source files."""
-        data: TileData = self._result("load")
-        return data
+        return cast(TileData, self._result("load"))
 
     @property
     def assessment(self) -> assess.Options:
         """The options of `quality`."""
-        options = self.graph.nodes[self.snapshot.nodes["assess"]].options
-        assert isinstance(options, assess.Options)
-        return options
-
-    @property
-    def cell_errors(self) -> tuple[Floats, NDArray[np.uint8]]:
-        """Estimated error (m) and height source of each cell of the core; needs the source files."""
-        return self.level_errors(0)
+        return cast(assess.Options, self.graph.nodes[self.snapshot.nodes["assess"]].options)
 
     def level_errors(self, number: int) -> tuple[Floats, NDArray[np.uint8]]:
-        """Return `cell_errors` of a level; those of level 0 if the tile does not have it."""
+        """Return estimated error (m) and height source of each cell of the core; needs the source files.
+
+        They are those of a level, or of level 0 if the tile does not have it.
+        """
         inputs = self.data, self.road, self.clusters, self.surface
         return assess.cell_errors(*inputs, self.assessment, number)
 
@@ -334,14 +324,11 @@ class FinishedTile:
         if stage not in self._results:
             # An evaluator searches the store itself; without one, a stored result needs no graph.
             stored = None if self.evaluator else self.place.artefacts.find(stage, name)
-            self._results[stage] = self._computed(name) if stored is None else stored.value
+            try:
+                self._results[stage] = stored.value if stored else self._evaluator(name)
+            except StageError as error:
+                raise ConfigError(f"{self.label}: {error}") from error
         return self._results[stage]
-
-    def _computed(self, name: str) -> Any:
-        try:
-            return self._evaluator(name)
-        except StageError as error:
-            raise ConfigError(f"{self.label}: {error}") from error
 
 
 @dataclass(frozen=True)

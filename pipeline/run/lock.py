@@ -28,21 +28,11 @@ from pathlib import Path
 from flexroad.catalog.storage.paths import Location, read
 from flexroad.catalog.text import Notify
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.lock_file import LockFile, LockStat, lock_file
+from flexroad.pipeline.run.lock_file import InBucket, LockStat, OnDisk, lock_file
 
 NAME = "lock.json"
 TRIES = 20
 """Attempts to take a lock that changes or is just being written."""
-
-
-@dataclass(frozen=True)
-class Heartbeat:
-    """Timing of lock renewal."""
-
-    interval_s: float = 30
-    """Interval at which the owner renews its lock (s)."""
-    stale_s: float = 300
-    """Age at which an owner on another machine counts as dead (s)."""
 
 
 @dataclass(frozen=True)
@@ -88,22 +78,20 @@ class Owner:
         """The content of the lock file."""
         return json.dumps(asdict(self), indent=1).encode()
 
-    def exit_reason(self, here: Owner) -> str | None:
-        """Return why this owner, on the machine of ``here``, counts as dead; None if it is alive."""
-        if self.boot != here.boot:
-            return f"{self.host} was restarted since"
-        start = started(self.pid)
-        if start is None:
-            return "that process is gone"
-        if start and self.start and start != self.start:
-            return "that process is gone, its number was given to another"
-        return None
-
 
 def exit_reason(holder: Owner) -> str | None:
     """Return why an owner is dead, if it is a process of this machine that has exited; else None."""
     here = Owner.me()
-    return holder.exit_reason(here) if (holder.host, holder.machine) == (here.host, here.machine) else None
+    if (holder.host, holder.machine) != (here.host, here.machine):
+        return None
+    if holder.boot != here.boot:
+        return f"{holder.host} was restarted since"
+    start = started(holder.pid)
+    if start is None:
+        return "that process is gone"
+    if start and holder.start and start != holder.start:
+        return "that process is gone, its number was given to another"
+    return None
 
 
 def describe_owner(holder: Owner) -> str:
@@ -117,16 +105,17 @@ def describe_owner(holder: Owner) -> str:
 
 @contextlib.contextmanager
 def run_lock(
-    run: Location, notify: Notify = lambda line: None, heartbeat: Heartbeat | None = None
+    run: Location, notify: Notify = lambda line: None, interval_s: float = 30, stale_s: float = 300
 ) -> Iterator[None]:
     """Hold the lock of a run folder; a context manager.
 
     - `run`: the run folder; on disk it must exist.
     - `notify`: receives one line when the lock of a dead process is observed or taken over, or this lock is
       lost.
-    - `heartbeat`: timing of renewal.
+    - `interval_s`: interval at which the owner renews its lock (s).
+    - `stale_s`: age at which an owner on another machine counts as dead (s).
     """
-    lock = _Lock(run, lock_file(run / NAME), Owner.me(), notify, heartbeat or Heartbeat())
+    lock = _Lock(run, lock_file(run / NAME), Owner.me(), notify, interval_s, stale_s)
     try:
         lock.take()
     except FileNotFoundError as error:
@@ -169,22 +158,22 @@ def started(pid: int) -> int | None:
 
 def _start_without_proc(pid: int) -> int | None:
     """Return 0 if a process exists whose start time cannot be read, None if it does not exist."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return None
-    except PermissionError:
-        return 0
+    with contextlib.suppress(PermissionError):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return None
     return 0
 
 
 @dataclass(frozen=True)
 class _Lock:
     run: Location
-    file: LockFile
+    file: OnDisk | InBucket
     me: Owner
     notify: Notify
-    heartbeat: Heartbeat
+    interval_s: float
+    stale_s: float
 
     def take(self) -> None:
         """Become the owner; if several processes try at the same time, exactly one succeeds."""
@@ -210,7 +199,7 @@ class _Lock:
 
     def renew_until(self, stop: threading.Event) -> None:
         """Renew the lock until ``stop`` is set; if another process has taken it over, end this process."""
-        while not stop.wait(self.heartbeat.interval_s):
+        while not stop.wait(self.interval_s):
             # Storage that is temporarily out of reach does not stop the run.
             with contextlib.suppress(OSError):
                 current = self.file.read()
@@ -234,14 +223,14 @@ class _Lock:
 
     def _dead(self, holder: Owner | None, current: LockStat) -> str | None:
         """Return why the owner counts as dead, None if it may be alive."""
-        watch_s = 1.5 * self.heartbeat.interval_s
+        watch_s = 1.5 * self.interval_s
         # A machine that has just been started cannot tell: an owner renews its lock only at intervals.
         before_start = current.age_s > max(watch_s, _uptime_s())
         if holder is not None and (holder.boot == self.me.boot or before_start):
             reason = exit_reason(holder)
             if reason or self._is_here(holder):
                 return reason
-        if abs(current.age_s) <= self.heartbeat.stale_s:
+        if abs(current.age_s) <= self.stale_s:
             return None
         self.notify(f"watching the lock of {_name(holder)} for {watch_s:.0f} s, to see whether it is renewed")
         time.sleep(watch_s)
@@ -263,7 +252,7 @@ class _Lock:
         # A process on another machine can be judged only by the age of its lock.
         return (
             f"{text}, last sign of life {abs(current.age_s):.0f} s ago; "
-            f"if it is dead, the same command takes over {self.heartbeat.stale_s:.0f} s after the last one"
+            f"if it is dead, the same command takes over {self.stale_s:.0f} s after the last one"
         )
 
 

@@ -14,7 +14,7 @@ import tempfile
 from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from flexroad.catalog.storage.paths import Location, named, read, remove, write
 
@@ -38,28 +38,9 @@ class LockStat:
     """ETag of the object in a bucket; empty on disk."""
 
 
-class LockFile(Protocol):
-    """The storage operations of a lock; each may raise OSError."""
-
-    def create(self, data: bytes) -> bool:
-        """Create the file; False if it exists."""
-
-    def read(self) -> LockStat | None:
-        """Return content and age of the file, None if it does not exist."""
-
-    def replace(self, expected: LockStat, data: bytes) -> bool:
-        """Replace the content; False if the file has changed since ``expected`` was read."""
-
-    def renew(self, expected: LockStat) -> None:
-        """Set the file's time to now."""
-
-    def remove(self, expected: LockStat) -> None:
-        """Remove the file if it has not changed since ``expected`` was read."""
-
-
 @dataclass(frozen=True)
 class OnDisk:
-    """A lock file on a local or network disk."""
+    """A lock file on a local or network disk; each method may raise OSError."""
 
     path: Path
 
@@ -128,7 +109,7 @@ class OnDisk:
 
 @dataclass(frozen=True)
 class InBucket:
-    """A lock file in a bucket."""
+    """A lock file in a bucket, with the methods of `OnDisk`."""
 
     path: UPath
 
@@ -189,6 +170,6 @@ def _status(error: BaseException | None) -> int | None:
     return None
 
 
-def lock_file(path: Location) -> LockFile:
+def lock_file(path: Location) -> OnDisk | InBucket:
     """Return a lock file on disk or in a bucket."""
     return OnDisk(path) if isinstance(path, Path) else InBucket(path)

@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
-from typing import TypeVar
+from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -33,7 +33,6 @@ PLAIN_EVERY_S = 10.0
 """Shortest interval of plain progress lines (s)."""
 SILENT_EVERY_S = 60.0
 """Interval of plain progress lines while there is no new result (s)."""
-T = TypeVar("T")
 
 
 @contextlib.contextmanager
@@ -60,30 +59,28 @@ def said_repeatedly(line: Callable[[float], str], notify: Notify, wait_s: float)
         speaker.join()
 
 
-class StepProgress:
-    """Shows how many items of a step are done: a bar on a terminal, else plain lines if it takes long."""
+def step_progress(console: Console) -> Callable[[Iterable[Any], str, int], Iterator[Any]]:
+    """Return a function that yields the items of a step and shows how many are done.
 
-    def __init__(self, console: Console) -> None:
-        self.console = console
+    It shows a bar on a terminal, else plain lines if the step takes long. Its arguments are the items, the
+    step (``checking tiles``) and the number of items.
+    """
 
-    def __call__(self, items: Iterable[T], step: str, total: int) -> Iterator[T]:
-        """Yield the items of a step.
-
-        - `step`: what is done with the items: ``checking tiles``.
-        - `total`: number of items.
-        """
-        if self.console.is_terminal:
-            yield from track(items, step, total, console=self.console, transient=True)
+    def tracked(items: Iterable[Any], step: str, total: int) -> Iterator[Any]:
+        if console.is_terminal:
+            yield from track(items, step, total, console=console, transient=True)
             return
         done = 0
 
         def line(spent_s: float) -> str:
             return f"{step}: {done} of {total}, {spent_s:.0f} s spent"
 
-        with said_repeatedly(line, lambda text: print_line(self.console, text), FIRST_S):
+        with said_repeatedly(line, lambda text: print_line(console, text), FIRST_S):
             for item in items:
                 yield item
                 done += 1
+
+    return tracked
 
 
 def print_line(console: Console, text: str) -> None:

@@ -17,10 +17,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
+import json
 import platform
 import shlex
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,27 +31,29 @@ from typing import Any
 import yaml
 
 from flexroad.catalog import Catalog, Tile
-from flexroad.catalog.allowlist import needed
 from flexroad.catalog.guard.source_files import source_stat
+from flexroad.catalog.index import needed
 from flexroad.catalog.storage.buckets import StatCache
-from flexroad.catalog.storage.links import links_out
 from flexroad.catalog.storage.paths import (
     Location,
     absolute,
     check_writable,
+    contained,
     entries,
     exists,
     flush_names,
-    is_remote,
+    links_out,
+    listing,
     parse_location,
     read,
+    remove,
     stat,
     visible_entry,
     write,
 )
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.loading import compose, load_config, read_mapping
-from flexroad.pipeline.config.models import ROOT, Config
+from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.config.stages import STAGE_NAMES, model_files
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import check_tiles
@@ -59,7 +63,6 @@ from flexroad.pipeline.graph.sources import Recorded, Stat
 from flexroad.pipeline.run.events import LOG
 from flexroad.pipeline.run.lock import NAME as LOCK
 from flexroad.pipeline.run.seal import seal, sealed
-from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import DONE, FAILED, dump_checked, load_checked
@@ -69,6 +72,9 @@ PACKAGES = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "das
 STORE = "store"
 RECORD = "run.json"
 """The first file of a run: a folder that has it is a run, also if it is not complete."""
+
+USERS = "runs"
+"""Folder of a shared store with a small file for each run that uses it, read by `flexroad clean`."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +142,10 @@ class Run:
         check_inputs(config, catalog)
         old = _record(path)
         # Existing meshes are relative to the earlier origin, which the last summary contains, too.
-        origin = (old or read_summary(path)).get("origin") or _origin(catalog)
-        store = store or _store(old, path, "--store")
+        origin = (old or read_summary(path)).get("origin")
+        if not origin:
+            origin = [min(axis) for axis in zip(*(tile.grid.origin for tile in catalog.usable), strict=True)]
+        store = store or _store(old, path, "add --store")
         exported = _exported(old, config)
         origin = (origin[0], origin[1])
         folders, collection = folders_of(catalog), _collection(old, path)
@@ -157,7 +165,7 @@ class Run:
             raise ConfigError(
                 f"{path} is no run: run.json is missing or damaged; make one with `flexroad run --out {path}`"
             )
-        store = _store(record, path, "--allow", allow)
+        store = _store(record, path, "begin with flexroad --allow", allow)
         config = _config(path / "config.yaml").model_copy(update={"name": record["config"]})
         listed = record.get("allowed", [])
         allowed = tuple(listed) if sealed(listed, record.get("seal")) else ()
@@ -189,7 +197,7 @@ class Run:
     def stat_cache(self) -> Stat:
         """Return a stat function for many source files; in a bucket it lists each folder once."""
         remote = StatCache()
-        return lambda file: remote(file) if is_remote(file) else source_stat(file)
+        return lambda file: source_stat(file) if isinstance(file, Path) else remote(file)
 
     def job(self, graph: TileGraph, force: frozenset[str] = frozenset()) -> TileJob:
         """Return the job that a worker needs to process one tile."""
@@ -259,7 +267,6 @@ def check_own(
     """Check that a folder has no visible files, or the mark of an earlier command (`is_own`).
 
     - `kind`: what the command writes: ``a run``.
-    - `option`: the option that names the folder.
     """
     try:
         other = visible_entry(folder, ignored)
@@ -309,7 +316,7 @@ def folders_of(catalog: Catalog) -> tuple[str, ...]:
     roots = [
         folder
         for root in sorted({tile.root for tile in made.tiles})
-        for folder in (root, *needed(made, root))
+        for folder in (root, *needed(made, AllowedFolders.of(root)))
     ]
     return tuple(dict.fromkeys([*(folder for allowed in given for folder in allowed.folders), *roots]))
 
@@ -325,8 +332,8 @@ def versions() -> dict[str, str]:
     return by_name
 
 
-def _store(record: dict[str, Any] | None, run: Location, option: str, allow: Sequence[Any] = ()) -> Location:
-    """Return the store of a run; one outside its folder must be sealed or allowed (`option`)."""
+def _store(record: dict[str, Any] | None, run: Location, remedy: str, allow: Sequence[Any] = ()) -> Location:
+    """Return the store of a run; one outside its folder must be sealed or allowed (`remedy`)."""
     if record is None or not record["shared_store"]:
         return run / "store"
     named = str(record["store"])
@@ -334,14 +341,9 @@ def _store(record: dict[str, Any] | None, run: Location, option: str, allow: Seq
     if not permitted and not sealed({"store": named}, record.get("store_seal")):
         raise ConfigError(
             f"{run} has its store in {named}, which this user has not given on this machine; if it is right, "
-            f"add {option} {shlex.quote(named)}"
+            f"{remedy} {shlex.quote(named)}"
         )
     return parse_location(named)
-
-
-def _origin(catalog: Catalog) -> tuple[float, float]:
-    corners = [tile.grid.origin for tile in catalog.usable]
-    return min(east for east, _ in corners), min(north for _, north in corners)
 
 
 def _exported(record: dict[str, Any] | None, config: Config) -> tuple[str, ...]:
@@ -361,8 +363,7 @@ def _config(path: Location) -> Config:
     if file is None and exists(path):
         raise ConfigError(f"{path} is not a regular file; `flexroad run` writes it again")
     if isinstance(path, Path):
-        # Earlier versions wrote it without `extends`.
-        return load_config(path, base=ROOT)
+        return load_config(path)
     return compose(read_mapping(read(path), str(path)), str(path))
 
 
@@ -377,3 +378,31 @@ def _record(run: Location) -> dict[str, Any] | None:
         raise ConfigError(f"cannot read {run / RECORD}: {error.strerror or error}") from error
     required = {"config", "store", "shared_store", "origin", "checksum", "versions"}
     return record if required <= record.keys() else None
+
+
+def register(store: Location, run: Location) -> None:
+    """Register a run with its store; not needed for a store in the run's own folder."""
+    if absolute(store) != absolute(run / "store"):
+        path = _entry(store, run)
+        if not exists(path):
+            write(path, json.dumps({"run": str(absolute(run))}).encode(), flushed=True)
+
+
+def runs_using(store: Location) -> Iterator[Location]:
+    """Yield the folders of the runs registered with a store."""
+    # A store in a run's folder belongs to that run.
+    if exists(store.parent / "run.json"):
+        yield absolute(store.parent)
+    for name in sorted(listing(contained(store / USERS, store))):
+        if name.endswith(".json") and not name.startswith("."):
+            yield parse_location(json.loads(read(store / USERS / name))["run"])
+
+
+def unregister(store: Location, run: Location) -> None:
+    """Remove a run from the runs of a store."""
+    remove(_entry(store, run))
+
+
+def _entry(store: Location, run: Location) -> Location:
+    name = hashlib.sha256(str(absolute(run)).encode()).hexdigest()[:16]
+    return contained(store / USERS / f"{name}.json", store)

@@ -30,10 +30,10 @@ from flexroad.pipeline.run.collection import write_collection
 from flexroad.pipeline.run.events import EventLog
 from flexroad.pipeline.run.record import Run, check_inputs
 from flexroad.pipeline.run.status import (
-    Folders,
     has_marker,
     open_database,
     recorded,
+    tile_files,
     tile_states,
     tile_statuses,
 )
@@ -336,8 +336,8 @@ def _repair(run: Run, database: RunDatabase, start: str) -> None:
 
 def _check_markers(run: Run, database: RunDatabase) -> None:
     """Record the done tiles whose marker was removed while the run worked as failed."""
-    folders = Folders(run.path)
-    for tile in [tile for tile in _done(run, database) if DONE not in folders(tile.id)]:
+    files_of = tile_files(run.path)
+    for tile in [tile for tile in _done(run, database) if DONE not in files_of(tile.id)]:
         record = database.get(tile.id)
         if record:
             database.record(_vanished(run, record, "missing: its folder was deleted while the run worked"))

@@ -10,6 +10,7 @@ centre line may be wider than the road of the mask, and goes on beside it withou
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from shapely import STRtree, box, points
 
 from flexroad.catalog import Bounds
+from flexroad.catalog.crs import same, transformer
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import has_borders
@@ -32,7 +34,6 @@ from flexroad.pipeline.run.finished import (
     open_variant,
     surface_and_road,
 )
-from flexroad.pipeline.run.points import Answer, Heights
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, peek_statuses
 from flexroad.tasks.levels.along_route import PlaceLevels
@@ -44,6 +45,90 @@ AT_ONCE = 50_000
 
 Numbers = NDArray[np.int8]
 Indices = NDArray[np.intp]
+
+
+LARGEST_STEP_M = 0.05
+"""Step between neighbouring tiles up to which they carry a road; tiles with common borders meet."""
+STEP_REMEDY = "use a run of production, whose tiles have common borders"
+Places = slice | Bools | NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """Heights of n points on each level."""
+
+    numbers: tuple[int, ...]
+    """The k levels, ascending; 0, the ground, is one of them."""
+    z: Floats
+    """``(k, n)``, m; NaN where a level is not, and beyond the surface."""
+    flags: Bits | None = None
+    """``(k, n)``, flags of the surface by `tasks.quality.flagged`; None if it has none."""
+
+    def __getitem__(self, places: Places) -> Heights:
+        flags = None if self.flags is None else self.flags[:, places]
+        return replace(self, z=self.z[:, places], flags=flags)
+
+    def flags_on(self, numbers: NDArray[np.int8]) -> Bits:
+        """Return the flags of the points on given levels, ``(n,)``."""
+        found = np.zeros(len(numbers), np.uint16)
+        if self.flags is not None:
+            for number, row in zip(self.numbers, self.flags, strict=True):
+                found[numbers == number] = row[numbers == number]
+        return found
+
+    @property
+    def ground(self) -> Floats:
+        """Heights of level 0, ``(n,)``, m."""
+        return np.asarray(self.z[self.numbers.index(0)])
+
+    @property
+    def several(self) -> Bools:
+        """Whether a point has another level than the ground, ``(n,)``."""
+        others = [number != 0 for number in self.numbers]
+        return np.asarray(np.isfinite(self.z[others]).any(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Values at n points; NaN and empty strings off the finished tiles.
+
+    Beyond the survey, where a surface is but has no data, only the tile is given.
+    """
+
+    height: Floats
+    """``(n,)``, m."""
+    normal: Floats
+    """``(n, 3)``, upward unit normals: east, north, up."""
+    tile: NDArray[np.str_]
+    """``(n,)``, tile ids."""
+    kind: NDArray[np.str_]
+    """``(n,)``, ``road`` or ``terrain`` according to the segmented mask."""
+    flags: Bits
+    """``(n,)``, raised flags of the cells at the points, by `tasks.quality.flagged`."""
+    earlier: tuple[str, ...] = ()
+    """Ids of tiles whose values are of earlier sources or options (`RunSampler.earlier`)."""
+    level: NDArray[np.int8] | None = None
+    """``(n,)``, numbers of the levels that the values are of; None if all are of the highest."""
+    numbers: tuple[int, ...] = (0,)
+    """The levels of the tiles that have points."""
+
+
+def to_crs(x: Floats, y: Floats, source: str | None, target: str) -> tuple[Floats, Floats]:
+    """Return coordinates in another CRS; NaN where they cannot be transformed.
+
+    - `x`, `y` ``(n,)``: first east, then north, whatever the order of the axes of the CRS.
+    - `source`: none if they already are in the CRS ``target``.
+    """
+    if source is None or same(source, target):
+        return x, y
+    east, north = transformer(source, target).transform(x, y)
+    finite = np.isfinite(east) & np.isfinite(north)
+    return np.where(finite, east, math.nan), np.where(finite, north, math.nan)
+
+
+def length_text(metres: float, digits: int = 0) -> str:
+    """Return a length for the user, in millimetres below one metre."""
+    return f"{1000 * metres:.{digits}f} mm" if metres < 1 else f"{metres:.2f} m"
 
 
 class SurfaceSampler(ABC):

@@ -11,11 +11,12 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from flexroad.catalog import Tile
+from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.buckets import ListedFiles
 from flexroad.catalog.storage.paths import FileStat, Location, entries, refresh
 from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
@@ -86,23 +87,19 @@ class TileStatus:
         return not self.done and self.last_record is not None and self.last_record.has_products
 
 
-@dataclass(frozen=True)
-class Folders:
-    """The files of a run's tiles: one listing per tile on disk, one listing for all tiles in a bucket."""
+def tile_files(run: Location) -> Callable[[str], dict[str, FileStat]]:
+    """Return a function from a tile's id to its files by name; in a bucket all tiles are listed at once."""
+    if isinstance(run, Path):
+        return lambda tile_id: TileProducts.of(run, tile_id).files()
 
-    run: Location
+    @cache
+    def listed() -> ListedFiles:
+        files = ListedFiles()
+        parts = ((name.partition("/"), file) for name, file in entries(run / "tiles"))
+        files.add((folder, name, file) for (folder, _, name), file in parts)
+        return files
 
-    def __call__(self, tile_id: str) -> dict[str, FileStat]:
-        """Return the files of a tile by name."""
-        folder = TileProducts.of(self.run, tile_id)
-        return folder.files() if isinstance(folder.path, Path) else self._listed.files(folder.path.name)
-
-    @cached_property
-    def _listed(self) -> ListedFiles:
-        listed = ListedFiles()
-        parts = ((name.partition("/"), file) for name, file in entries(self.run / "tiles"))
-        listed.add((folder, name, file) for (folder, _, name), file in parts)
-        return listed
+    return lambda tile_id: listed().files(safe_name(tile_id))
 
 
 def peek_statuses(run: Run, tiles: Iterable[Tile]) -> Iterator[TileStatus]:
@@ -118,12 +115,12 @@ def tile_statuses(
 
     With ``from_markers`` all markers are read, also those that the database has.
     """
-    folders, stat_file = Folders(run.path), run.stat_cache()
+    files_of, stat_file = tile_files(run.path), run.stat_cache()
     for tile in run.catalog.tiles if tiles is None else tiles:
         entry = database.get(tile.id)
         # A failure on a full disk has no marker, only a database entry.
         known = None if from_markers and entry and entry.marker else entry
-        yield _status(run, tile, known, folders(tile.id), stat_file)
+        yield _status(run, tile, known, files_of(tile.id), stat_file)
 
 
 def _status(

@@ -83,9 +83,7 @@ class Summary:
 def summarise(catalog: Catalog, tiles: Iterable[Line], variant: str) -> Summary:
     """Return the summary of a run.
 
-    - `catalog`: its catalog.
     - `tiles`: id, state and last record of its tiles; those that are missing are pending.
-    - `variant`: the variant whose flags are listed.
     """
     counts, without_roads = Counter[TileState](), 0
     flagged, failures = list[str](), list[Failure]()

@@ -41,7 +41,6 @@ Line = tuple[str, TileState, TileRecord | None]
 class RunDatabase:
     """States and records of a run's tiles; a context manager that writes all pending records on exit.
 
-    - `path`: the file.
     - `writable`: whether this process writes the file; it is then made empty if it is missing or damaged.
     """
 

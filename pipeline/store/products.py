@@ -10,8 +10,7 @@ from typing import Any
 
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.links import contained
-from flexroad.catalog.storage.paths import FileStat, Location
+from flexroad.catalog.storage.paths import FileStat, Location, contained
 from flexroad.pipeline.store.records import DONE, FAILED, dump_checked, load_checked
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)

@@ -140,10 +140,7 @@ def _chunks(rows: Iterable[MetricsRow]) -> Iterator[list[MetricsRow]]:
 
 
 def read_metrics(run: Location, name: str = METRICS) -> pd.DataFrame:
-    """Read the rows of a run.
-
-    - `name`: file in the folder of the run.
-    """
+    """Read the rows of a run."""
     path = run / name
     if not exists(path):
         raise ConfigError(f"{path} does not exist; `flexroad rerun {run}` finishes the run")

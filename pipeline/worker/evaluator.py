@@ -197,7 +197,8 @@ class Evaluator:
             framed: dict[str, Any] = {"frame": Frame(*frame)} if frame else {}
             if node.refit:
                 framed = {"refit": partial(_refit, options=node.refit, framed=framed)}
-            return node.function(*(inputs or [self.graph.readable]), node.options, **framed)
+            function = stage_function(node.stage, node.options)
+            return function(*(inputs or [self.graph.readable]), node.options, **framed)
         finally:
             # Also after an error: a file that is being replaced may be unreadable.
             check_unchanged(self.graph, files_read(self.graph, node))

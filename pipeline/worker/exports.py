@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.scan.rasters import quiet
-from flexroad.pipeline.graph.graph import TileGraph
+from flexroad.pipeline.graph.graph import TileGraph, product_layers
 from flexroad.pipeline.store.products import file_entry
 from flexroad.pipeline.worker.evaluator import check_unchanged
 from flexroad.tasks.errors import LayerMissing
@@ -124,10 +124,8 @@ def products(
 ) -> dict[str, Product]:
     """Return the products of the graph's export variants and formats, by file name.
 
-    - `graph`: the tile's graph, with the export options.
     - `evaluate`: returns the result of a node by its fingerprint.
     - `origin`: origin of the run: whole-metre (easting, northing) that mesh translations are relative to.
-    - `texture`: the photo on the mesh.
     """
     vertical = vertical_crs(graph.tile) if "cog" in graph.export.formats else None
     files: dict[str, Product] = {}
@@ -169,9 +167,9 @@ def _cog(
     with quiet():
         height_source, others = _of_levels(core, road.outside[window], surface, quality, vertical)
         return {
-            HEIGHT: cog.encode_height(heights, core, vertical),
-            ROAD: cog.encode_mask(kept, core),
-            HEIGHT_SOURCE: cog.encode_height_source(height_source, core),
+            HEIGHT: cog.encode(heights, core, cog.HEIGHT, vertical),
+            ROAD: cog.encode(kept, core, cog.ROAD),
+            HEIGHT_SOURCE: cog.encode(height_source, core, cog.HEIGHT_SOURCE),
             **others,
         }
 
@@ -191,9 +189,9 @@ def _of_levels(
             lower[number] = np.where(here, surface.at(number).height(*at), np.nan)
     files = {}
     for number, heights in sorted(lower.items()):
-        files[of_level(HEIGHT, number)] = cog.encode_height(heights, core, vertical)
-        files[of_level(HEIGHT_SOURCE, number)] = cog.encode_height_source(
-            quality.at(number).height_source, core
+        files[of_level(HEIGHT, number)] = cog.encode(heights, core, cog.HEIGHT, vertical)
+        files[of_level(HEIGHT_SOURCE, number)] = cog.encode(
+            quality.at(number).height_source, core, cog.HEIGHT_SOURCE
         )
     return top_height_source(quality, top), files
 
@@ -215,10 +213,7 @@ def assets(files: Mapping[str, Product], variants: tuple[str, ...], grid: Grid) 
 
 
 def item_assets(variants: tuple[str, ...], formats: Iterable[str], cells: set[float]) -> dict[str, Any]:
-    """Return what the assets of all items have in common, for a collection.
-
-    - `cells`: the cell sizes of the tiles (m).
-    """
+    """Return what the assets of all items have in common, for a collection."""
     cell = cells.copy().pop() if len(cells) == 1 else None
     return {
         asset_key(kind, variant, variants): {"type": kind.media_type}
@@ -272,9 +267,10 @@ def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
     export, tile = graph.export, graph.tile
     if not export.texture:
         return None, ""
-    if not graph.product_sources:
+    layers = tile.layers_on(product_layers(export))
+    if not layers:
         return None, NO_PHOTO
-    (layer,) = graph.product_sources
+    (layer,) = layers
     try:
         photo = tile_photo(tile, layer, export.texture_px)
     finally:
@@ -289,7 +285,6 @@ def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
 def tile_photo(tile: Tile, layer: Layer, largest_px: int) -> Orthophoto | None:
     """Return the orthophoto of a tile, None if no pixel of it is known.
 
-    - `layer`: the tile's orthophoto.
     - `largest_px`: largest width and height (pixels); a finer photo is averaged.
     """
     source = layer_source(replace(tile, layers=(layer,)), layer.name)

@@ -21,7 +21,7 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.levels.seen import level_clusters
 from flexroad.tasks.roads.distances import columns_of, within
 from flexroad.tasks.roads.dtm_validity import Slices, invalid_dtm
-from flexroad.tasks.roads.flat_patches import Patches, flat_patches
+from flexroad.tasks.roads.flat_patches import flat_patches
 from flexroad.tasks.roads.union_find import (
     Roots,
     clean,
@@ -136,21 +136,25 @@ def _clusters_of(
     """Return the clusters of one level."""
     cell, theta = data.grid.cell, options.theta_z_m
     points = road.mask & np.isfinite(data.dsm)
-    patches = flat_patches(data.dsm, points, cell, options.roughness_m, BEND, data.dtm, theta)
+    centres, trend, reach, climbs = flat_patches(
+        data.dsm, points, cell, options.roughness_m, BEND, data.dtm, theta
+    )
     # Neighbouring patches share most of their cells, so they always merge. Across gaps, clusters merge if any
     # two of their edge cells agree in height along the street's slope.
-    roots = _merged(patches.centres, options.theta_xy_m / cell, data.dsm, patches.trend, theta)
-    clusters = _covered(roots, patches.reach)
+    roots = _merged(centres, options.theta_xy_m / cell, data.dsm, trend, theta)
+    clusters = _covered(roots, reach)
     ground = _on_ground(data, clusters, theta, raised_m2_per_m)
     reach = max(1, math.floor(REACH_M / cell + 1e-9))
     # The plane of a foot goes on up the object's side.
-    climbing = patches.climbs & (np.abs(data.dsm - data.dtm) > theta)
+    climbing = climbs & (np.abs(data.dsm - data.dtm) > theta)
     others = points & ~ground & ~climbing
     consistency = ground_consistency(data.dsm, data.dtm, ground, others, reach, theta)
     kept = ground | (consistency == CONSISTENT)
     alone = others & (consistency == NO_NEIGHBOURS)
     kept[alone] = np.abs(data.dsm[alone] - data.dtm[alone]) <= theta
-    labels = _labels(data.dsm, kept, patches, cell, options)
+    # By gaps alone: heights were checked before.
+    roots = _merged(kept, options.theta_xy_m / cell, data.dsm, trend, math.inf)
+    labels = clean(kept, roots, least_cells(options.min_area_m2, cell), options.keep_largest)
     dtm_invalid = invalid_dtm(data, road, labels > 0, near)
     if options.shoulder_m == 0:
         return RoadClusters(data.grid, labels, dtm_invalid)
@@ -199,12 +203,6 @@ def _medians(values: Floats, member: NDArray[np.intp], count: int) -> Floats:
     medians = np.full(count, UNKNOWN_M)
     medians[present] = (ordered[(first + (n - 1) // 2)[present]] + ordered[(first + n // 2)[present]]) / 2
     return medians
-
-
-def _labels(dsm: Floats, kept: Bools, patches: Patches, cell: float, options: Options) -> NDArray[np.int32]:
-    """Label the clusters of the kept cells by gaps alone; heights were checked before."""
-    roots = _merged(kept, options.theta_xy_m / cell, dsm, patches.trend, math.inf)
-    return clean(kept, roots, least_cells(options.min_area_m2, cell), options.keep_largest)
 
 
 def _merged(members: Bools, gap: float, heights: Floats, slope: Floats, theta: float) -> NDArray[np.int32]:

@@ -33,9 +33,6 @@ from flexroad.tasks.types import Bools, Floats, RoadClusters, TileData
 
 VERSION = 1
 
-STOP_TOLERANCE, STOP_WINDOW = 1e-4, 20
-"""The fit ends early when the loss changes by at most this share over so many steps."""
-
 
 class Options(BaseOptions):
     """Options of the NURBS fit; the defaults are the paper's."""
@@ -134,18 +131,18 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
 
 def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Floats]:
     """Return the optimised control heights above the datum (m) and the weights."""
-    schedule = adam.Schedule(
-        options.learning_rate, options.iterations, STOP_TOLERANCE, STOP_WINDOW, options.result == "last",
-    )  # fmt: skip
+    steps, last = (options.learning_rate, options.iterations), options.result == "last"
     if weights := WEIGHTS.get(options.weights):
         one, value, _ = weights
         variables = np.stack([start, np.full_like(start, one)])
-        (z, s), _ = adam.minimise(loss_by_variables(loss, weights), variables, np.array(math.inf), schedule)
+        (z, s), _ = adam.minimise(
+            loss_by_variables(loss, weights), variables, np.array(math.inf), *steps, last
+        )
         return z, value(s)
     variables = np.stack([start, np.zeros_like(start)])
     limit = np.array([math.inf, MAX_LOG_WEIGHT])[:, None, None]
     if options.engine == "torch":
-        (z, rho), _ = adam.minimise_with_torch(loss, variables, limit, schedule, options.device)
+        (z, rho), _ = adam.minimise_with_torch(loss, variables, limit, *steps, options.device)
     else:
-        (z, rho), _ = adam.minimise(loss, variables, limit, schedule)
+        (z, rho), _ = adam.minimise(loss, variables, limit, *steps, last)
     return z, np.exp(rho)

@@ -33,9 +33,9 @@ from flexroad.tasks.spline.irls import HuberObjective, minimise
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import Lattice, Range, Space, check_cells, start_heights, surface_on
-from flexroad.tasks.spline.stepped import border_steps, ground_beside, spline_around, with_steps
+from flexroad.tasks.spline.stencil import bending_energy
+from flexroad.tasks.spline.stepped import border_steps, spline_around, with_steps
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.spline.thin_plate import bending_energy
 from flexroad.tasks.types import Bools, Floats, Level, LevelSpline, RoadClusters, RoadMask, TileData
 
 VERSION = 8
@@ -94,8 +94,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
     surface = _spline(seen, clusters, options, frame)
     if clusters.levels:
         surface = LevelledSurface.of(surface, _level_splines(data, clusters, options, frame), data.core)
-    beside = ground_beside(seen, clusters, frame) if options.steps else None
-    return with_steps(beside, surface, data.core) if beside else surface
+    return with_steps(seen, clusters, surface, frame) if options.steps else surface
 
 
 def _level_splines(
@@ -342,6 +341,5 @@ def _minimum(
     # Divided by the number of cells with a height, like the differences, so that voids do not change the
     # balance.
     bending = bending_energy(stiffness / np.count_nonzero(np.isfinite(heights)), space)
-    loss = objective(heights, weight, space)
-    convex = HuberObjective(loss, first.shape, huber_m, bending, held)
-    return minimise(convex, first, ITERATIONS, tolerance)[0]
+    loss = HuberObjective(objective(heights, weight, space), held, bending, huber_m)
+    return minimise(loss, first, ITERATIONS, tolerance)[0]

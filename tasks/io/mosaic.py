@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rasterio.enums import Resampling
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.crs import bounds_in, in_plan, same, short
@@ -29,7 +28,7 @@ from flexroad.tasks.io.height_units import (
 )
 from flexroad.tasks.io.raster import RasterWindow, misalignment, read_raster, read_window
 from flexroad.tasks.io.raster_grid import header
-from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights, reach_m, shared_m2
+from flexroad.tasks.io.sheets import covered, lay_classes, lay_heights, reach_m, shared_m2
 from flexroad.tasks.types import Bools, Floats
 
 
@@ -152,8 +151,8 @@ def _read(
     """
     read: list[tuple[SourceFile, RasterWindow]] = []
     left_out: list[tuple[SourceFile, Unusable]] = []
-    absurd_cells = 0
-    coverage = Coverage(grid)
+    absurd_cells, area_m2 = 0, 0.0
+    missing, unchecked = np.ones(grid.shape, np.bool_), list[RasterWindow]()
     for file in files:
         try:
             patch = _window(tile, layer, file, grid, core)
@@ -168,8 +167,16 @@ def _read(
         if patch is None:
             continue
         read.append((file, patch))
-        if file is not files[-1] and coverage.completed_by(patch):
-            break
+        if patch.lattice.crs:
+            continue
+        unchecked.append(patch)
+        area_m2 += shared_m2(patch.lattice.bounds, grid.bounds)
+        # Cells are compared only if the areas of the files suffice.
+        if file is not files[-1] and area_m2 / grid.cell**2 >= 0.999 * missing.size:
+            while unchecked:
+                missing &= ~covered(unchecked.pop(), grid)
+            if not missing.any():
+                break
     return read, left_out, absurd_cells
 
 
@@ -197,10 +204,7 @@ def _window(tile: Tile, layer: Layer, file: SourceFile, grid: Grid, core: Grid) 
     if file.extent and max(map(abs, file.extent)) <= FARTHEST:
         # Where a file without georeference lies: the same for all tiles.
         core = Grid.covering(core.crs, file.extent, core.cell)
-    resampling = Resampling.average if heights else Resampling.mode
-    return read_window(
-        file.path, file.title, grid, core, layer.crs, resampling, heights, layer.reproject, tile.missing
-    )
+    return read_window(file.path, file.title, grid, core, layer.crs, heights, layer.reproject, tile.missing)
 
 
 def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow | None) -> None:

@@ -16,8 +16,7 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.vrt import WarpedVRT
 
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
-from flexroad.catalog.scan.rasters import quiet
-from flexroad.catalog.scan.valid_cells import color_kinds
+from flexroad.catalog.scan.rasters import color_kinds, quiet
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import LayerMissing, TaskError, Unusable, leave_out
@@ -127,12 +126,15 @@ def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.flo
     coarser = min(cell_x / lattice.dx, cell_y / lattice.dy) > 1 + LATTICE_TOLERANCE
     bands = (1, 2, 3) if src.count >= 3 else (1,)
     has_alpha = ColorInterp.alpha in color_kinds(src)
+    transform = lattice.transform
+    if lattice.northward:
+        transform = Affine(lattice.dx, 0, lattice.west, 0, lattice.dy, lattice.bounds[1])
     with WarpedVRT(
         src,
         # If the file's CRS is the same one by another name: prevent a reprojection.
         src_crs=lattice.crs or pixels.crs,
         crs=pixels.crs,
-        src_transform=_transform(lattice),
+        src_transform=transform,
         transform=pixels.transform,
         width=pixels.width,
         height=pixels.height,
@@ -146,9 +148,3 @@ def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.flo
         known: Bools = vrt.read(alpha) > 0
         colour: NDArray[np.float32] = vrt.read(bands)
     return np.where(known, colour, np.float32(0)), known
-
-
-def _transform(lattice: RasterGrid) -> Affine:
-    if lattice.northward:
-        return Affine(lattice.dx, 0, lattice.west, 0, lattice.dy, lattice.bounds[1])
-    return lattice.transform

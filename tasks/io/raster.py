@@ -22,8 +22,7 @@ from flexroad.catalog.crs import short
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.guard.open_raster import ERRORS, has_own_blocks, kept_raster, open_raster
 from flexroad.catalog.guard.source_files import InputRejected, files_of, read_through
-from flexroad.catalog.scan.rasters import heights_fault
-from flexroad.catalog.scan.valid_cells import transparent
+from flexroad.catalog.scan.rasters import heights_fault, transparent
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason
 from flexroad.tasks.errors import TaskError, Unusable
@@ -96,7 +95,6 @@ def read_window(
     grid: Grid,
     core: Grid,
     crs: str | None,
-    resampling: Resampling = Resampling.average,
     heights: bool = False,
     reproject: bool = False,
     missing: frozenset[str] | None = None,
@@ -110,8 +108,8 @@ def read_window(
     - `name`: name of the file in messages: ``dsm a.tif``.
     - `core`: position of a file without georeference, if it has as many cells.
     - `crs`: CRS of a file without one.
-    - `resampling`: how several cells are read as one: ``average`` of heights, ``mode`` of classes.
-    - `heights`: whether the file must have heights: one band of real numbers.
+    - `heights`: whether the file must have heights: one band of real numbers. Several cells are then read
+      as their mean, else as the most frequent of their values.
     - `reproject`: whether the file may be in another CRS than the grid; the window is then on its own
       lattice.
     - `missing`: see `read_raster`.
@@ -119,6 +117,7 @@ def read_window(
     """
 
     def read(src: Any, damaged: bool = False) -> RasterWindow | None:
+        resampling = Resampling.average if heights else Resampling.mode
         fault = heights_fault(src) if heights else None
         if fault:
             raise Unusable(f"{name} {fault}", str(path))

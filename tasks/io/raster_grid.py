@@ -15,8 +15,7 @@ from rasterio.enums import MaskFlags
 from flexroad.catalog.crs import bounds_in, in_plan, same, scales, short, transformer
 from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from flexroad.catalog.scan.rasters import georeference_fault
-from flexroad.catalog.scan.valid_cells import alpha_band
+from flexroad.catalog.scan.rasters import alpha_band, georeference_fault
 from flexroad.catalog.storage.paths import Location
 from flexroad.tasks.errors import Unusable
 from flexroad.tasks.types import Bools, Floats
@@ -207,33 +206,28 @@ class Header:
     alpha: int | None
     """Number of the alpha band that GDAL does not take for a mask, None without one."""
 
-    @classmethod
-    def of(cls, src: Any) -> Header:
-        """Return that of an open raster."""
-        transform, masks = src.transform, src.mask_flag_enums[0]
-        fault = georeference_fault(src)
-        if fault is None and (transform.b or transform.d):
-            fault = "is rotated; turn it north up with gdalwarp"
-        known = fault is None and not transform.is_identity
-        alpha = alpha_band(src)
-        return cls(
-            lattice=RasterGrid.of(transform, src.width, src.height) if known else None,
-            fault=None if transform.is_identity else fault,
-            crs=src.crs.to_wkt() if src.crs else None,
-            all_valid=MaskFlags.all_valid in masks and alpha is None,
-            nan_is_nodata=masks == [MaskFlags.nodata] and math.isnan(src.nodata) and alpha is None,
-            alpha=alpha,
-        )
-
 
 _headers = WeakKeyDictionary[Any, Header]()
 
 
 def header(src: Any) -> Header:
     """Return the header of an open raster. rasterio makes parts of it anew at each access, so it is kept."""
-    found = _headers.get(src)
-    if found is None:
-        found = _headers[src] = Header.of(src)
+    if src in _headers:
+        return _headers[src]
+    transform, masks = src.transform, src.mask_flag_enums[0]
+    fault = georeference_fault(src)
+    if fault is None and (transform.b or transform.d):
+        fault = "is rotated; turn it north up with gdalwarp"
+    known = fault is None and not transform.is_identity
+    alpha = alpha_band(src)
+    _headers[src] = found = Header(
+        lattice=RasterGrid.of(transform, src.width, src.height) if known else None,
+        fault=None if transform.is_identity else fault,
+        crs=src.crs.to_wkt() if src.crs else None,
+        all_valid=MaskFlags.all_valid in masks and alpha is None,
+        nan_is_nodata=masks == [MaskFlags.nodata] and math.isnan(src.nodata) and alpha is None,
+        alpha=alpha,
+    )
     return found
 
 

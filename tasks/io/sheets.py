@@ -22,30 +22,6 @@ from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.types import Bools, Floats
 
 
-class Coverage:
-    """Whether files in a grid's CRS have a value in each of its cells, so that no further file is needed."""
-
-    def __init__(self, grid: Grid) -> None:
-        self._grid = grid
-        self._missing = np.ones(grid.shape, np.bool_)
-        self._unchecked: list[RasterWindow] = []
-        self._most_cells = 0.0
-
-    def completed_by(self, patch: RasterWindow) -> bool:
-        """Add a file; return whether all cells have a value now. Files in another CRS do not count."""
-        if patch.lattice.crs:
-            return False
-        grid = self._grid
-        self._most_cells += shared_m2(patch.lattice.bounds, grid.bounds) / grid.cell**2
-        self._unchecked.append(patch)
-        # Cells are compared only if the areas of the files suffice.
-        if self._most_cells < 0.999 * self._missing.size:
-            return False
-        while self._unchecked:
-            self._missing &= ~_covered(self._unchecked.pop(), grid)
-        return not self._missing.any()
-
-
 def shared_m2(extent: Bounds | None, bounds: Bounds) -> float:
     """Return the area that an extent shares with a tile (m2), 0 if it is None."""
     if extent is None:
@@ -91,11 +67,11 @@ def lay_heights(patches: Sequence[RasterWindow], grid: Grid) -> Floats:
     laid = _resampled_together(groups, grid)
     of_group = {id(patch): heights for group, heights in zip(groups, laid, strict=True) for patch in group}
     for patch in ordered:
-        np.copyto(values, of_group[id(patch)], where=np.isnan(values) & _covered(patch, grid))
+        np.copyto(values, of_group[id(patch)], where=np.isnan(values) & covered(patch, grid))
     return values
 
 
-def _covered(patch: RasterWindow, grid: Grid) -> Bools:
+def covered(patch: RasterWindow, grid: Grid) -> Bools:
     """Return the cells of a grid whose centres lie in cells of a file with a value, ``(H, W)``."""
     return ~np.isnan(resample_to(patch, grid, Resampling.nearest))
 

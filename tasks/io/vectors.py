@@ -159,7 +159,7 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
             raise _error(
                 request,
                 f"has {count(len(kinds), 'layer')}: {_listed(file, kinds)}; make the catalog with "
-                "--roads-layer, or name one with segment.layer",
+                "--roads 'FILE|layername=NAME', or name one with segment.layer",
             )
         # Only where the file's CRS may be replaced: the bounds of a GeoJSON take a reading of all of it.
         bounds = bool(request.bare_crs) and set(names) != set(OSM)

@@ -13,7 +13,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-import scipy
 import shapely
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.text import count
 from flexroad.tasks.io.vectors import has_place
 from flexroad.tasks.meshing.road_outline import polygons_of
-from flexroad.tasks.roads.flat_patches import flat_patches
+from flexroad.tasks.roads.flat_patches import flat_cells
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import BLEND_M, Bools, Floats, Level, TileData
 
@@ -206,10 +205,7 @@ def _is_level(abutment: shapely.LineString, deck: Bools, street: Bools, data: Ti
 
 
 def _flat(heights: Floats, road: Bools, cell: float) -> Bools:
-    """Return the cells of flat patches of a road."""
-    patches = flat_patches(heights, road & np.isfinite(heights), cell, ROUGHNESS_M, BEND)
-    side = 2 * patches.reach + 1
-    return np.asarray(scipy.ndimage.binary_dilation(patches.centres, np.ones((side, side))))
+    return flat_cells(heights, road & np.isfinite(heights), cell, ROUGHNESS_M, BEND)
 
 
 def _median(values: Floats) -> float:

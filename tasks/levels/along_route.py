@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 
@@ -52,28 +52,22 @@ def structures(levels: NDArray[np.int8], s: Floats) -> tuple[Structure, ...]:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class RouteLevels:
-    """The levels along a route of which a part is on a deck or in a tunnel."""
+def route_levels(route: Route) -> Callable[[Floats, Floats], PlaceLevels] | None:
+    """Return a function of x and y of places on and beside a route; None if all of it is on level 0.
 
-    spans: NDArray[np.object_]
-    """Lines, of one level each, in the route's coordinates."""
-    levels: PlaceLevels
-    """Those of the spans."""
+    It returns their levels in their broadcast shape.
+    """
+    if not any(part.level for part in route.parts):
+        return None
+    lines, numbers, own = zip(*_spans(route), strict=True)
+    tree, levels = shapely.STRtree(lines), PlaceLevels(np.array(numbers, np.int8), np.array(own))
 
-    @classmethod
-    def of(cls, route: Route) -> RouteLevels | None:
-        """Return the levels of a route, None if all of it is on level 0."""
-        if not any(part.level for part in route.parts):
-            return None
-        spans, numbers, own = zip(*_spans(route), strict=True)
-        return cls(np.array(spans, object), PlaceLevels(np.array(numbers, np.int8), np.array(own)))
-
-    def at(self, x: Floats, y: Floats) -> PlaceLevels:
-        """Return the levels of places on and beside the route, in their broadcast shape."""
+    def at(x: Floats, y: Floats) -> PlaceLevels:
         x, y = np.broadcast_arrays(x, y)
-        nearest = shapely.STRtree(self.spans).nearest(shapely.points(x.ravel(), y.ravel()))
-        return self.levels[np.asarray(nearest).reshape(x.shape)]
+        nearest = tree.nearest(shapely.points(x.ravel(), y.ravel()))
+        return levels[np.asarray(nearest).reshape(x.shape)]
+
+    return at
 
 
 def _spans(route: Route) -> Iterator[tuple[shapely.LineString, int, bool]]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.meshing.lines import AT_BORDER_M, GRID_M, parts_of
 from flexroad.tasks.meshing.road_outline import encoded, lines_of
-from flexroad.tasks.spline.mesh_border import SAME_M, on_border
+from flexroad.tasks.spline.frame import SAME_M, on_border
 from flexroad.tasks.types import Bools, Floats, Level, Surface
 
 WALL_M = 0.25
@@ -161,23 +161,17 @@ def without_abutments(lines: NDArray[np.object_], outlines: Sequence[LevelOutlin
     return parts_of(lines_of(shapely.difference(shapely.multilinestrings(lines), beside)))
 
 
-@dataclass(frozen=True, eq=False)
-class JoinedGround:
-    """The surface of level 0, with the heights of the other level on abutments."""
+def with_abutments(
+    heights: Floats, easting: Floats, northing: Floats, surface: Surface, outlines: Sequence[LevelOutline],
+    origin: tuple[float, float],
+) -> Floats:  # fmt: skip
+    """Return heights of points, ``(n,)``, m, with those of the other level on abutments.
 
-    surface: Surface
-    origin: tuple[float, float]
-    """Easting and northing that the outlines are relative to (m)."""
-    outlines: Sequence[LevelOutline]
-
-    def height(self, easting: Floats, northing: Floats) -> Floats:
-        """Return heights (m) at scattered points, ``(n,)``."""
-        return self.on_abutments(easting, northing, self.surface.height(easting, northing))
-
-    def on_abutments(self, easting: Floats, northing: Floats, heights: Floats) -> Floats:
-        """Return heights of points, ``(n,)``, with those on abutments replaced."""
-        points, result = np.column_stack([easting, northing]), heights.copy()
-        for outline in self.outlines:
-            at = outline.has_abutment_at(points - self.origin)
-            result[at] = self.surface.at(outline.number).height(*points[at].T)
-        return result
+    - `surface`: that of level 0, with the other levels.
+    - `origin`: easting and northing that the outlines are relative to (m).
+    """
+    points, result = np.column_stack([easting, northing]), heights.copy()
+    for outline in outlines:
+        at = outline.has_abutment_at(points - origin)
+        result[at] = surface.at(outline.number).height(*points[at].T)
+    return result

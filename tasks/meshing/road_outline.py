@@ -6,7 +6,6 @@ Coordinates are metres from the whole-metre origin of a grid (`Grid.origin`). Po
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from flexroad.catalog.borders import Border
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.io.vectors import has_place
 from flexroad.tasks.meshing.lines import GRID_M
-from flexroad.tasks.types import Bools, Floats
+from flexroad.tasks.types import Floats
 
 TOLERANCE_M = 0.01
 """Largest distance by which an outline is simplified (m)."""
@@ -25,20 +24,6 @@ GAP_M = 0.02
 """Gaps between roads up to this width (m) are closed: drawn neighbours often miss each other."""
 MARGIN_M = 1.0
 """Distance beyond a grid up to which its roads are kept (m)."""
-
-
-@dataclass(frozen=True, eq=False)
-class RoadOutline:
-    """Roads as areas, and their outline on a tile."""
-
-    areas: shapely.MultiPolygon
-    lines: NDArray[np.object_]
-    """Lines through the tile, each closed or from border to border."""
-
-    def contains(self, points: Floats) -> Bools:
-        """Return which points, ``(n, 2 or more)``, are on the road, ``(n,)``."""
-        shapely.prepare(self.areas)
-        return np.asarray(shapely.contains_xy(self.areas, points[:, 0], points[:, 1]))
 
 
 def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
@@ -59,17 +44,21 @@ def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
     return np.frombuffer(shapely.to_wkb(shapely.multipolygons(polygons)), np.uint8)
 
 
-def road_outline(areas: NDArray[np.uint8], local: Bounds, spacing_m: float) -> RoadOutline:
-    """Return the outline of roads on a tile, with points at most a distance (m) apart.
+def road_outline(
+    areas: NDArray[np.uint8], local: Bounds, spacing_m: float
+) -> tuple[shapely.MultiPolygon, NDArray[np.object_]]:
+    """Return roads as areas, and their outline on a tile: lines, each closed or from border to border.
 
     - `areas`: the result of `encoded`.
     - `local`: west, south, east and north of the tile (m).
+    - `spacing_m`: largest distance of the points of lines (m).
     """
     united = shapely.from_wkb(areas.tobytes())
+    shapely.prepare(united)
     inside = shapely.intersection(shapely.boundary(united), shapely.box(*local))
     parts = shapely.get_parts(shapely.line_merge(lines_of(inside)))
     simple = shapely.simplify(shapely.multilinestrings(parts), TOLERANCE_M)
-    return RoadOutline(united, shapely.get_parts(shapely.segmentize(simple, spacing_m)))
+    return united, shapely.get_parts(shapely.segmentize(simple, spacing_m))
 
 
 def crossings(areas: NDArray[np.uint8] | None, border: Border) -> Floats:

@@ -21,7 +21,7 @@ import startinpy
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.meshing.parts import middles
+from flexroad.tasks.meshing.lines import middles
 from flexroad.tasks.types import Bools, Floats
 
 SNAP_TOLERANCE_M = 1e-9
@@ -82,11 +82,7 @@ def constrained(points: Floats, segments: Edges, lattices: Sequence[Lattice] = (
     - `lattices`: lattices on which many of the points lie.
     - result ``(F, 3)``: counter-clockwise; beside the segments the triangulation is Delaunay's.
     """
-    return with_edges(points, delaunay(points, lattices), segments)
-
-
-def with_edges(points: Floats, faces: Faces, segments: Edges) -> Faces:
-    """Return faces of a triangulation, changed so that segments are edges, ``(F, 3)``; see `constrained`."""
+    faces = delaunay(points, lattices)
     if not len(segments):
         return faces
     missing = segments[~_has_edges(faces, segments, len(points))]

@@ -17,7 +17,6 @@ rim would not do: both are equal with overlaps, too.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -39,24 +38,16 @@ RIM, REPEATED = 1, 2
 Indices = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class Fault:
-    """One kind of fault of a mesh."""
-
-    kind: str
-    count: int
-    place: str
-    """Index, or easting and northing (m), of the first one."""
-
-    def __str__(self) -> str:
-        return f"{self.count} {self.kind} (the first at {self.place})"
+Fault = tuple[str, int, str]
+"""Kind, number, and index or place (easting and northing, m) of the first one."""
 
 
 def check(mesh: Mesh) -> None:
     """Check a mesh."""
     if found := faults(mesh):
+        listed = ", ".join(f"{number} {kind} (the first at {place})" for kind, number, place in found)
         raise MeshFault(
-            f"the mesh has {', '.join(map(str, found))}; this is an error of FlexRoad, report it; "
+            f"the mesh has {listed}; this is an error of FlexRoad, report it; "
             "other spacings (sample.road_m, sample.terrain_m) may avoid it"
         )
 
@@ -67,38 +58,33 @@ def faults(mesh: Mesh) -> tuple[Fault, ...]:
     Each group of checks presupposes the one before: numbers and indices, faces and vertices, overlaps. So
     only the faults of the first group with faults are returned.
     """
-    vertices, faces = mesh.vertices, mesh.faces
     for group in (_invalid_numbers, _invalid_parts, _overlaps):
-        if found := tuple(group(vertices, faces, mesh.origin)):
+        if found := tuple(group(mesh)):
             return found
     return ()
 
 
-def _invalid_numbers(
-    vertices: Floats, faces: NDArray[np.int32], origin: tuple[float, float, float]
-) -> Iterator[Fault]:
+def _invalid_numbers(mesh: Mesh) -> Iterator[Fault]:
+    vertices, faces = mesh.vertices, mesh.faces
     infinite = ~np.isfinite(vertices).all(axis=1)
     if infinite.any():
-        yield Fault("vertices that are not finite", int(infinite.sum()), f"vertex {infinite.argmax()}")
+        yield "vertices that are not finite", int(infinite.sum()), f"vertex {infinite.argmax()}"
     if faces.min(initial=0) < 0 or faces.max(initial=-1) >= len(vertices):
         beyond = ((faces < 0) | (faces >= len(vertices))).any(axis=1)
-        yield Fault("faces with unknown vertices", int(beyond.sum()), f"face {beyond.argmax()}")
+        yield "faces with unknown vertices", int(beyond.sum()), f"face {beyond.argmax()}"
 
 
-def _invalid_parts(
-    vertices: Floats, faces: NDArray[np.int32], origin: tuple[float, float, float]
-) -> Iterator[Fault]:
-    sides = _sides(vertices, faces)
-    yield from _found("degenerate faces", sides == 0, faces, vertices, origin)
-    yield from _found("inverted faces", sides == -1, faces, vertices, origin)
-    unused = np.ones(len(vertices), np.bool_)
-    unused[faces] = False
-    yield from _found("unused vertices", unused, np.arange(len(vertices))[:, None], vertices, origin)
+def _invalid_parts(mesh: Mesh) -> Iterator[Fault]:
+    sides = _sides(mesh.vertices, mesh.faces)
+    yield from _found("degenerate faces", sides == 0, mesh.faces, mesh)
+    yield from _found("inverted faces", sides == -1, mesh.faces, mesh)
+    unused = np.ones(len(mesh.vertices), np.bool_)
+    unused[mesh.faces] = False
+    yield from _found("unused vertices", unused, np.arange(len(unused))[:, None], mesh)
 
 
-def _overlaps(
-    vertices: Floats, faces: NDArray[np.int32], origin: tuple[float, float, float]
-) -> Iterator[Fault]:
+def _overlaps(mesh: Mesh) -> Iterator[Fault]:
+    vertices, faces = mesh.vertices, mesh.faces
     ends, kinds = _directed(faces, *edges(faces, len(vertices)))
     rim = ends[kinds == RIM]
     once, lines = np.unique(rim)[:, None], vertices[rim, :2]
@@ -109,22 +95,16 @@ def _overlaps(
         ("outline edges under or over other faces", lambda: _covered(lines), rim),
     )
     for kind, find, parts in findings:
-        if found := tuple(_found(kind, find(), parts, vertices, origin)):
+        if found := tuple(_found(kind, find(), parts, mesh)):
             yield from found
             return
 
 
-def _found(
-    kind: str,
-    at: Bools,
-    parts: NDArray[np.integer],
-    vertices: Floats,
-    origin: tuple[float, float, float],
-) -> Iterator[Fault]:
+def _found(kind: str, at: Bools, parts: NDArray[np.integer], mesh: Mesh) -> Iterator[Fault]:
     """Yield the faults of one kind; ``parts`` are vertices, edges or faces, ``(n, 1 to 3)``."""
     if at.any():
-        east, north = vertices[parts[at.argmax()], :2].mean(axis=0) + origin[:2]
-        yield Fault(kind, int(at.sum()), f"{east:.3f}, {north:.3f}")
+        east, north = mesh.vertices[parts[at.argmax()], :2].mean(axis=0) + mesh.origin[:2]
+        yield kind, int(at.sum()), f"{east:.3f}, {north:.3f}"
 
 
 @compiled()

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.crs import compound
@@ -14,7 +13,6 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.height_source import HeightSource
-from flexroad.tasks.types import Bools, Floats
 
 rasterio = lazy("rasterio")
 
@@ -85,44 +83,52 @@ HEIGHT_SOURCE = Band(
 )
 
 
-def encode_height(height: Floats, grid: Grid, vertical: str | None = None) -> bytes:
-    """Return heights at the cell centres of a grid, ``(H, W)``, m, as GeoTIFF: float32, nodata NaN.
+def encode(values: NDArray[Any], grid: Grid, band: Band, vertical: str | None = None) -> bytes:
+    """Return a value in each cell of a grid, ``(H, W)``, as GeoTIFF.
 
     Parameters
     ----------
+    values : ndarray, (H, W)
+        Heights at the cell centres (m), NaN where unknown; road cells; or the cells' `HeightSource`.
+    band : Band
+        What they are: `HEIGHT`, `ROAD` or `HEIGHT_SOURCE`.
     vertical : str, optional
-        Vertical CRS of the heights; the file's CRS is then compound.
+        Vertical CRS of heights; the file's CRS is then compound.
 
     Raises
     ------
     TaskError
         If the array does not have the grid's shape.
     """
-    crs = compound(grid.crs, vertical) if vertical else grid.crs
-    return _encode(height.astype(np.float32), grid, crs, HEIGHT, predictor=3, overview_resampling="average")
-
-
-def encode_mask(road: Bools, grid: Grid) -> bytes:
-    """Return a road mask, ``(H, W)``, as GeoTIFF: uint8, 1 is road.
-
-    Raises
-    ------
-    TaskError
-        If the array does not have the grid's shape.
-    """
-    values = road.astype(np.uint8)
-    return _encode(values, grid, grid.crs, ROAD, overview_resampling="mode")
-
-
-def encode_height_source(height_source: NDArray[np.uint8], grid: Grid) -> bytes:
-    """Return the `HeightSource` of each cell, ``(H, W)``, as GeoTIFF: uint8; 0 is nodata.
-
-    Raises
-    ------
-    TaskError
-        If the array does not have the grid's shape.
-    """
-    return _encode(height_source, grid, grid.crs, HEIGHT_SOURCE, overview_resampling="mode")
+    if values.shape != grid.shape:
+        raise TaskError(f"{band.name} of {values.shape} cells does not fit a grid of {grid.shape}")
+    # A raster of one block is not filled up to a larger one.
+    longest = max(grid.shape)
+    how = (
+        {"overview_resampling": "mode"}
+        if band.classes
+        else {"predictor": 3, "overview_resampling": "average"}
+    )
+    profile: dict[str, Any] = {
+        "driver": "COG",
+        "dtype": band.dtype,
+        "count": 1,
+        "width": grid.width,
+        "height": grid.height,
+        "crs": compound(grid.crs, vertical) if vertical else grid.crs,
+        "transform": grid.transform,
+        "compress": "deflate",
+        "level": LEVEL,
+        "nodata": band.nodata,
+        "blocksize": min(BLOCK, longest + -longest % BLOCK_MULTIPLE),
+        **how,
+    }
+    with rasterio.io.MemoryFile() as file:
+        with file.open(**profile) as raster:
+            raster.write(values.astype(band.dtype), 1)
+            describe(raster, 1, band)
+        encoded: bytes = file.read()
+    return encoded
 
 
 def encode_style(band: Band) -> bytes:
@@ -147,32 +153,6 @@ def encode_style(band: Band) -> bytes:
     ET.indent(style, " ")
     text: bytes = ET.tostring(style, "utf-8")
     return STYLE_DOCTYPE + text + b"\n"
-
-
-def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: Any) -> bytes:
-    if values.shape != grid.shape:
-        raise TaskError(f"{band.name} of {values.shape} cells does not fit a grid of {grid.shape}")
-    # A raster of one block is not filled up to a larger one.
-    longest = max(grid.shape)
-    profile = {
-        "driver": "COG",
-        "dtype": band.dtype,
-        "count": 1,
-        "width": grid.width,
-        "height": grid.height,
-        "crs": crs,
-        "transform": grid.transform,
-        "compress": "deflate",
-        "level": LEVEL,
-        "nodata": band.nodata,
-        "blocksize": min(BLOCK, longest + -longest % BLOCK_MULTIPLE),
-    }
-    with rasterio.io.MemoryFile() as file:
-        with file.open(**profile, **options) as raster:
-            raster.write(values, 1)
-            describe(raster, 1, band)
-        encoded: bytes = file.read()
-    return encoded
 
 
 def describe(raster: Any, number: int, band: Band) -> None:

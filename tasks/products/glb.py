@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.lazy import lazy
-from flexroad.tasks.meshing.normals import mesh_normals, vertex_normals
-from flexroad.tasks.meshing.parts import part, texture_coordinates
-from flexroad.tasks.meshing.relief import Sheet
+from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.types import Floats, Mesh, Orthophoto
 
 Image = lazy("PIL.Image")
@@ -110,7 +108,7 @@ def encode(
         number of its level. Axes: x east, y up, z south; metres. Equal inputs give equal bytes.
     """
     normals = mesh_normals(mesh) if normals is None else normals
-    uv = texture_coordinates(mesh, texture.bounds) if texture else None
+    uv = mesh.texture_coordinates(texture.bounds) if texture else None
     file = _File()
     shift = _y_up(np.subtract(mesh.origin, run_origin)).tolist()
     tile = file.add("nodes", {"name": name, "children": [], "matrix": [*IDENTITY, *shift, 1.0]})
@@ -127,42 +125,39 @@ def encode(
         ):
             faces = is_kind & of_level
             if faces.any():
-                used, corners = part(mesh, faces)
-                vertices = _Vertices(mesh.vertices[used], normals[used], None if uv is None else uv[used])
-                node = file.add_mesh(vertices, corners, _material(kind, colour, image, image is not None))
+                used, corners = mesh.part(faces)
+                node = file.add_mesh(
+                    mesh.vertices[used],
+                    normals[used],
+                    None if uv is None else uv[used],
+                    corners,
+                    _material(kind, colour, image, image is not None),
+                )
                 file.tree["nodes"][parent]["children"].append(node)
     return file.encoded(tile, _georeference(mesh, run_origin))
 
 
-def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes, photo: bool) -> bytes:
-    """Return a coarse copy of meshes with its image as GLB.
+def encode_ground(
+    places: Floats, normals: Floats, uv: Floats, faces: NDArray[np.int32], image: bytes, photo: bool
+) -> bytes:
+    """Return a mesh with an image as GLB with one node, ``ground``.
 
     Parameters
     ----------
-    sheet : Sheet
-        Triangles and skirt.
-    local : ndarray, (V, 3)
-        Its points in a frame of their own: east, north and up (m).
-    bounds : tuple of float
-        West, south, east and north of the image's outer edges (m, in the CRS of the sheet).
+    places, normals : ndarray, (V, 3)
+        The vertices in a frame of their own: east, north and up (m), and their unit normals.
+    uv : ndarray, (V, 2)
+        Their places in the image, from west to east and from south to north.
+    faces : ndarray, (F, 3)
+        Counter-clockwise from above.
     image : bytes
         The image seen from above, JPEG.
     photo : bool
         Whether the image is made of photos, which are shown without a light.
-
-    Returns
-    -------
-    bytes
-        One node, ``ground``. Axes: x east, y up, z south; metres. The skirt has the colours and normals of
-        the edge above it, so that it does not show.
     """
-    top = vertex_normals(local[: sheet.top.max() + 1], sheet.faces[: sheet.count])
-    west, south, east, north = bounds
-    uv = (sheet.points[sheet.top, :2] - (west, south)) / (east - west, north - south)
     file = _File()
     material = _material("ground", (), file.add_image(image), photo)
-    node = file.add_mesh(_Vertices(local, top[sheet.top], uv), sheet.faces, material)
-    return file.encoded(node)
+    return file.encoded(file.add_mesh(places, normals, uv, faces, material))
 
 
 def _y_up(points: Floats) -> Floats:
@@ -190,18 +185,6 @@ def _material(name: str, colour: tuple[int, ...], texture: int | None, unlit: bo
     return {"name": name, "pbrMetallicRoughness": look} | ({"extensions": {UNLIT: {}}} if unlit else {})
 
 
-@dataclass(frozen=True, eq=False)
-class _Vertices:
-    """The vertices of a part in east, north and up."""
-
-    places: Floats
-    """``(V, 3)`` (m)."""
-    normals: Floats
-    """``(V, 3)``."""
-    uv: Floats | None
-    """Places in the image, ``(V, 2)``: from west to east and from south to north."""
-
-
 class _File:
     """A binary glTF file in the making: the tree of its JSON, and the pieces of its buffer."""
 
@@ -224,20 +207,29 @@ class _File:
         return self.add("textures", {"source": image, "sampler": self.add("samplers", SAMPLER)})
 
     def add_mesh(
-        self, vertices: _Vertices, faces: NDArray[np.int32] | NDArray[np.intp], material: dict[str, Any]
+        self,
+        places: Floats,
+        normals: Floats,
+        uv: Floats | None,
+        faces: NDArray[np.int32],
+        material: dict[str, Any],
     ) -> int:
-        """Add a mesh, named like its material; return the index of its node."""
+        """Add a mesh, named like its material; return the index of its node.
+
+        - `places`, `normals` ``(V, 3)``: of its vertices, in east, north and up.
+        - `uv` ``(V, 2)``: places in the image, from west to east and from south to north.
+        """
         attributes = {
-            "POSITION": self._add_array(_y_up(vertices.places), "VEC3"),
-            "NORMAL": self._add_array(_y_up(vertices.normals), "VEC3"),
+            "POSITION": self._add_array(_y_up(places), "VEC3"),
+            "NORMAL": self._add_array(_y_up(normals), "VEC3"),
         }
-        if vertices.uv is not None:
+        if uv is not None:
             # glTF counts from the top of the image.
-            from_top = np.column_stack([vertices.uv[:, 0], 1.0 - vertices.uv[:, 1]])
+            from_top = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])
             attributes["TEXCOORD_0"] = self._add_array(from_top, "VEC2")
         primitive = {
             "attributes": attributes,
-            "indices": self._add_indices(faces, len(vertices.places)),
+            "indices": self._add_indices(faces, len(places)),
             "material": self.add("materials", material),
         }
         name = material["name"]
@@ -268,7 +260,7 @@ class _File:
         }  # fmt: skip
         return self.add("accessors", accessor)
 
-    def _add_indices(self, faces: NDArray[np.int32] | NDArray[np.intp], count: int) -> int:
+    def _add_indices(self, faces: NDArray[np.int32], count: int) -> int:
         """Add the corners of faces, indices into ``count`` vertices; return the index of the accessor."""
         # The largest number of a type has another meaning in graphics.
         short = count < 2**16

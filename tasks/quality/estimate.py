@@ -105,7 +105,6 @@ def climbed(smooth: Floats, dtm: Floats, kept: Bools, cell: float, dsm_dtm_toler
     - `smooth`, `dtm`: heights of the surface without steps, and of the terrain (m).
     - `kept`: road cells that the filter kept.
     - `cell`: size of a cell (m).
-    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     """
     steep = kept & (np.abs(smooth - dtm) > dsm_dtm_tolerance_m)
     if steep.any():
@@ -198,7 +197,6 @@ def compare(
     """Compare a surface with DSM and DTM cell by cell; with levels, level 0 with what it sees.
 
     - `data`, `road`, `clusters`, `surface`: as in `tasks.quality.assess.assess`.
-    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     - `only_road`: leave the estimated error NaN beside the road; that takes less time.
     """
     data, clusters = level_data(data, clusters), with_approaches(clusters)
@@ -246,11 +244,3 @@ def _lacking(road: Bools, classes: NDArray[np.uint8], below: Bools, cell: float)
         known = road & ((classes == HeightSource.MEASURED) | (classes == HeightSource.DTM))
         lacking[by_deck] = distances(by_deck, known) * cell > TUNNEL_M / 2
     return np.asarray(lacking)
-
-
-def heights_fitted(data: TileData, clusters: RoadClusters) -> Floats:
-    """Return the heights of a fit, ``(H, W)``, m; NaN where none enters.
-
-    They are those of `with_road_heights` on kept road cells, else the valid DTM.
-    """
-    return ground_to_fit(with_road_heights(data, clusters), clusters)

@@ -48,7 +48,6 @@ def flagged_cells(
     - `cells`: the surface beside DSM and DTM.
     - `cell`: size of a cell (m).
     - `limits`: threshold of each flag.
-    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     - `raised`: the flags of the tile.
     """
     road = cells.on_road
@@ -165,7 +164,6 @@ def places(cells: Compared, grid: Grid, dsm_dtm_tolerance_m: float) -> dict[str,
     """Return the place of the worst cell, or of the middle of the largest patch, by flag.
 
     - `cells`: the surface beside DSM and DTM, in the cells of ``grid``.
-    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     - result: easting and northing (m) by flag, whether it is raised or not. Flags without a place are absent:
       those of the complete tile (``weights``, ``no-road``) and those of which the tile has no cell.
     """

@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.tasks.meshing.parts import middles
+from flexroad.tasks.meshing.lines import middles
 from flexroad.tasks.roads.dtm_validity import DSM_DTM_TOLERANCE_M, valid_dtm
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
@@ -39,7 +39,6 @@ def height_source(
     - `data`: DSM and DTM, m.
     - `road`: gives the cells beyond the survey.
     - `clusters`: the road cells fitted to their DSM, and the cells with an invalid DTM.
-    - `dsm_dtm_tolerance_m`: largest difference between DSM and DTM of the same ground (m).
     """
     has_dtm = np.isfinite(valid_dtm(data, clusters))
     agreed = has_dtm & (np.abs(data.dsm - data.dtm) <= dsm_dtm_tolerance_m)

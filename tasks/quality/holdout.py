@@ -15,7 +15,9 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.levels.seen import level_data
 from flexroad.tasks.metrics.evaluate import mean
-from flexroad.tasks.quality.estimate import INTERVAL, SQUARE_M, compare, heights_fitted
+from flexroad.tasks.quality.estimate import INTERVAL, SQUARE_M, compare
+from flexroad.tasks.roads.dtm_validity import ground_to_fit
+from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.types import Bools, RoadClusters, RoadMask, Surface, TileData
 
 INSET_M = 15.0
@@ -39,7 +41,6 @@ def holdout(
 
     - `data`, `road`, `clusters`: as in `tasks.quality.assess.assess`.
     - `refit`: the fit; not needed if ``share`` is 0.
-    - `dsm_dtm_tolerance_m`: largest difference between two heights of the same ground (m).
     - `share`: share of the squares that are withheld, from 0 to 1.
     - result: the figures of `Quality` by name.
     """
@@ -59,7 +60,7 @@ def holdout(
         # Too few heights are left for a second fit; the tile has its surface all the same.
         return _figures(0.0, np.nan, np.nan)
     cells = compare(rest, road, clusters, surface, dsm_dtm_tolerance_m, only_road=True)
-    off = cells.height - heights_fitted(seen, clusters)[window]
+    off = cells.height - ground_to_fit(with_road_heights(seen, clusters), clusters, window)
     counted = (squares >= 0) & kept[window]
     _, number = np.unique(squares[counted], return_inverse=True)
     count = np.bincount(number)

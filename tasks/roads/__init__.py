@@ -1,4 +1,1 @@
-"""Road masks: rasterise vectors, clean and compare masks, align orthophotos, find invalid DTM cells.
-
-And the lines of OpenCRG and OpenDRIVE: routes, reference lines, heights and profiles along them.
-"""
+"""Roads: rasterise vectors, clean masks, align orthophotos, find invalid DTM cells, chain routes."""

@@ -11,20 +11,12 @@ from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 DSM_DTM_TOLERANCE_M = 0.3
 """Largest difference of two heights of the same ground (m)."""
-
-
 NEAR_M = 5.0
 """Standard deviation of the Gaussian weights of the kept cells around a gap (m)."""
-
-
 REACH_M = 3 * NEAR_M
 """Farther than this from any kept cell the DTM is not checked (m)."""
-
-
 CREST_M = 100.0
 """Smallest radius of crests and sags expected where a road is hidden (m)."""
-
-
 THIN_M2 = 0.2
 """Cells whose variance in some direction is below this (m2) lie on a line and define no plane."""
 
@@ -99,16 +91,12 @@ def extrapolated_plane(
         # Central moments give two equations for the slopes, then the height at offset 0.
         rr, rc, cc = rr - r * r, rc - r * c, cc - c * c
         mr, mc = mr - m * r, mc - m * c
-        determinant = np.where(_least_spread(rr, rc, cc) >= THIN_M2, rr * cc - rc * rc, np.nan)
+        least_variance = (rr + cc) / 2 - np.hypot((rr - cc) / 2, rc)
+        determinant = np.where(least_variance >= THIN_M2, rr * cc - rc * rc, np.nan)
         by_row, by_col = (mr * cc - mc * rc) / determinant, (mc * rr - mr * rc) / determinant
         left = mm - m * m - by_row * mr - by_col * mc
         height, scatter = datum + m - by_row * r - by_col * c, np.sqrt(np.maximum(left, 0.0))
     return height, scatter, np.sqrt(nearest) * cell
-
-
-def _least_spread(rr: Floats, rc: Floats, cc: Floats) -> Floats:
-    """Return the smaller eigenvalue of symmetric 2 x 2 matrices."""
-    return np.asarray((rr + cc) / 2 - np.hypot((rr - cc) / 2, rc))
 
 
 @compiled()

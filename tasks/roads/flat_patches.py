@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
@@ -19,18 +19,16 @@ CLIMB = 0.15
 """Steepest road off the ground (m per m): ramps are built with up to 15%, and heaps lie at 50% and more."""
 
 
-@dataclass(frozen=True, eq=False)
-class Patches:
-    """The flat patches of a tile, by their centres."""
+Patches = tuple[Bools, Floats, int, Bools]
+"""Centres of flat patches, ``(H, W)``; the slope of the street along rows and columns there, ``(H, W, 2)``, m
+per cell, 0 elsewhere; the number of cells from a centre to the edge of its patch; and the centres of the
+patches that were left out because they climb an object, ``(H, W)``."""
 
-    centres: Bools
-    """Cells that are the centre of a flat patch, ``(H, W)``."""
-    trend: Floats
-    """Slope of the street along rows and columns at each centre, ``(H, W, 2)``, m per cell; 0 elsewhere."""
-    reach: int
-    """Number of cells from a centre to the edge of its patch."""
-    climbs: Bools
-    """Centres of the patches that were left out because they climb an object, ``(H, W)``."""
+
+def flat_cells(heights: Floats, points: Bools, cell: float, roughness_m: float, bend: float) -> Bools:
+    """Return the cells in flat patches, ``(H, W)``; the parameters are as of `flat_patches`."""
+    centres, _, reach, _ = flat_patches(heights, points, cell, roughness_m, bend)
+    return np.asarray(scipy.ndimage.binary_dilation(centres, np.ones((2 * reach + 1,) * 2)))
 
 
 def flat_patches(
@@ -68,7 +66,7 @@ def flat_patches(
         slopes[climbs] = 0.0
     around = max(1, math.floor(STREET_M / cell + 1e-9))
     centres = _along_street(slopes, smooth, around, (bend * cell) ** 2)
-    return Patches(centres, slopes, reach, climbs)
+    return centres, slopes, reach, climbs
 
 
 @compiled()

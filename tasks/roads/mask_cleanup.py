@@ -16,7 +16,6 @@ from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import Bools, TileData
 
 cv2 = lazy("cv2")
@@ -46,7 +45,7 @@ def clean(mask: Bools, data: TileData, cleanup: Cleanup) -> Bools:
     if cleanup == "corridor":
         mask = mask & within(_roads(data), cell, CORRIDOR_M)
     filled = fill(close(mask, cell, CLOSE_M), cell, FILL_M2)
-    return drop(mask | (filled & ~beyond_extent(data)), cell, DROP_M2)
+    return drop(mask | (filled & ~data.beyond_extent()), cell, DROP_M2)
 
 
 def close(mask: Bools, cell: float, width_m: float) -> Bools:

@@ -7,7 +7,6 @@ from typing import Literal
 import numpy as np
 
 from flexroad.tasks import options
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1
@@ -35,4 +34,4 @@ def segment(data: TileData, options: Options) -> RoadMask:
             "segment: the road mask has no road cell on this tile; if there are roads, give the values that "
             "mean road with --road-value of `flexroad catalog rasters`"
         )
-    return RoadMask(data.grid, data.core, mask, beyond_extent(data), notes=(note,) if note else ())
+    return RoadMask(data.grid, data.core, mask, data.beyond_extent(), notes=(note,) if note else ())

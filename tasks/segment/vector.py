@@ -10,7 +10,6 @@ from pydantic import Field, model_validator
 from flexroad.tasks.levels.abutments import levels_of
 from flexroad.tasks.meshing.road_outline import encoded
 from flexroad.tasks.roads import rasterise
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 2
@@ -55,7 +54,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     if data.roads is None:
         note = "segment: no file of the roads layer reaches this tile, so it counts as a tile without roads"
         nowhere = np.zeros(data.grid.shape, np.bool_)
-        return RoadMask(data.grid, data.core, nowhere, beyond_extent(data), bridge=nowhere, notes=(note,))
+        return RoadMask(data.grid, data.core, nowhere, data.beyond_extent(), bridge=nowhere, notes=(note,))
     roads = rasterise.roads(data.roads, data.grid, options, options.levels)
     levels, left_out = levels_of(roads.areas, roads.shapes, roads.level, data)
     areas, bridge = roads.areas[roads.level == 0], roads.bridge[roads.level == 0]
@@ -71,7 +70,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
         grid=data.grid,
         core=data.core,
         mask=mask,
-        outside=beyond_extent(data),
+        outside=data.beyond_extent(),
         bridge=rasterise.cells(areas[bridge], data.grid),
         areas=encoded(areas, data.core) if options.outlines else None,
         notes=notes,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,33 +27,23 @@ else:
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
 
 
-@dataclass(frozen=True)
-class Schedule:
-    """Step size, largest number of steps, and rule for early stopping."""
+STOP_TOLERANCE, STOP_WINDOW = 1e-4, 20
+"""The steps end early when the loss changes by at most this share over so many of them."""
 
-    rate: float
-    """Learning rate, in units of the variables."""
-    iterations: int
-    """Largest number of steps."""
-    tolerance: float
-    """Stop when the loss changed by at most this share of it over ``window`` steps."""
-    window: int
-    """Number of steps over which the change of the loss is taken."""
-    last: bool = False
-    """Whether the result is the last step, whatever its loss; else it is the one with the lowest loss."""
 
-    def has_finished(self, losses: Sequence[float]) -> bool:
-        """Return whether to stop, from the losses at the start and after each step so far."""
-        steps = len(losses) - 1
-        if steps >= self.iterations or steps < self.window:
-            return steps >= self.iterations
-        before, now = losses[steps - self.window], losses[steps]
-        return abs(before - now) <= self.tolerance * before
+def _has_finished(losses: Sequence[float], iterations: int) -> bool:
+    """Return whether to stop, from the losses at the start and after each step so far."""
+    steps = len(losses) - 1
+    if steps >= iterations or steps < STOP_WINDOW:
+        return steps >= iterations
+    before, now = losses[steps - STOP_WINDOW], losses[steps]
+    return abs(before - now) <= STOP_TOLERANCE * before
 
 
 def minimise(
-    objective: Callable[[Floats], tuple[float, Floats]], start: Floats, limit: Floats, schedule: Schedule
-) -> tuple[Floats, list[float]]:
+    objective: Callable[[Floats], tuple[float, Floats]], start: Floats, limit: Floats, rate: float,
+    iterations: int, last: bool = False,
+) -> tuple[Floats, list[float]]:  # fmt: skip
     """Take Adam steps from ``start`` and return the variables with the lowest loss of all steps, or the last.
 
     The length of a step does not fall with the gradient, so the last step need not be the best: from a start
@@ -63,8 +52,9 @@ def minimise(
     - `objective`: returns the loss and its gradient at the variables.
     - `start`: variables to start from; not changed.
     - `limit`: bound on the variables' absolute values, broadcast against ``start``.
-    - `schedule`: learning rate and stopping rule.
-    - `variables`: those of the lowest loss, or of the last step with ``schedule.last``.
+    - `rate`: learning rate, in units of the variables.
+    - `iterations`: largest number of steps.
+    - `last`: whether the result is the last step, whatever its loss.
     - `losses`: the loss at the start and after each step.
     """
     variables = best = start.copy()
@@ -77,12 +67,12 @@ def minimise(
         if loss < lowest or not losses:
             lowest, best = loss, variables.copy()
         losses.append(loss)
-        if schedule.has_finished(losses):
-            return (variables if schedule.last else best), losses
+        if _has_finished(losses, iterations):
+            return (variables if last else best), losses
         step = len(losses)
         _step(
             variables.reshape(-1), gradient.ravel(), mean, variance, limits,
-            schedule.rate / (1 - BETA_1**step), 1 - BETA_2**step,
+            rate / (1 - BETA_1**step), 1 - BETA_2**step,
         )  # fmt: skip
 
 
@@ -107,64 +97,55 @@ def _step(
             variables[i] = -limit[i]
 
 
-class TorchObjective:
-    """The same loss as `tasks.spline.objective.Objective`, for tensors on one device, in float64.
+def torch_loss(
+    objective: Objective, shape: tuple[int, int], device: str
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return the loss (m) of float64 tensors ``(2, m, n)`` on a device, z and rho: the same as of arrays."""
+    m, n = shape
+    basis_u = _tensor(dense(objective.start_u, objective.along_u.T, n), device)
+    basis_v = _tensor(dense(objective.start_v, objective.along_v, m), device)
+    target, factor = _tensor(objective.target, device), _tensor(objective.factor, device)
 
-    Raises
-    ------
-    TaskError
-        If the device is not available.
-    """
-
-    def __init__(self, objective: Objective, shape: tuple[int, int], device: str) -> None:
-        if device == "cpu":
-            # At these sizes two threads are slower than one.
-            torch.set_num_threads(1)
-        elif (torch.device(device).index or 0) >= (gpus := torch.cuda.device_count()):
-            devices = " or ".join(["cpu", *(f"cuda:{i}" for i in range(gpus))])
-            raise TaskError(f"no device {device!r} on this machine; set fit.device to {devices}")
-        m, n = shape
-        self.device = device
-        self.basis_u = self.tensor(dense(objective.start_u, objective.along_u.T, n))
-        self.basis_v = self.tensor(dense(objective.start_v, objective.along_v, m))
-        self.target, self.factor = self.tensor(objective.target), self.tensor(objective.factor)
-        self.lambda_reg, self.free_weights = objective.lambda_reg, objective.free_weights
-
-    def tensor(self, array: Floats) -> torch.Tensor:
-        """Return the array on the device."""
-        return torch.tensor(array, dtype=torch.float64, device=self.device)
-
-    def __call__(self, variables: torch.Tensor) -> torch.Tensor:
-        """Return the loss (m) at ``variables``, ``(2, m, n)``: z and rho."""
-        z, rho = variables[0], variables[1] if self.free_weights else variables[1].detach()
+    def loss(variables: torch.Tensor) -> torch.Tensor:
+        z, rho = variables[0], variables[1] if objective.free_weights else variables[1].detach()
         w = rho.exp()
-        surface = self._spline(w * z) / self._spline(w)
-        data = (self.factor * (surface - self.target).abs()).sum()
-        return data + self.lambda_reg * self._regulariser(z)
+        surface = (basis_v @ (w * z) @ basis_u.T) / (basis_v @ w @ basis_u.T)
+        return (factor * (surface - target).abs()).sum() + objective.lambda_reg * _range_term(z)
 
-    def _spline(self, coefficients: torch.Tensor) -> torch.Tensor:
-        return self.basis_v @ coefficients @ self.basis_u.T
+    return loss
 
-    def _regulariser(self, z: torch.Tensor) -> torch.Tensor:
-        rows, cols = z.shape
 
-        def neighbours(outside: float) -> torch.Tensor:
-            padded = torch.nn.functional.pad(z, (1, 1, 1, 1), value=outside)
-            shifts = [padded[1 + i : 1 + i + rows, 1 + j : 1 + j + cols] for i, j in NEIGHBOURS.tolist()]
-            return torch.stack(shifts)
+def _tensor(array: Floats, device: str) -> torch.Tensor:
+    return torch.tensor(array, dtype=torch.float64, device=device)
 
-        high, low = neighbours(-torch.inf).max(dim=0).values, neighbours(torch.inf).min(dim=0).values
-        return ((high - low) ** 2).mean()
+
+def _range_term(z: torch.Tensor) -> torch.Tensor:
+    """Return the regulariser over ``lambda_reg``, as `tasks.spline.objective.range_term`."""
+    rows, cols = z.shape
+
+    def neighbours(outside: float) -> torch.Tensor:
+        padded = torch.nn.functional.pad(z, (1, 1, 1, 1), value=outside)
+        shifts = [padded[1 + i : 1 + i + rows, 1 + j : 1 + j + cols] for i, j in NEIGHBOURS.tolist()]
+        return torch.stack(shifts)
+
+    high, low = neighbours(-torch.inf).max(dim=0).values, neighbours(torch.inf).min(dim=0).values
+    return ((high - low) ** 2).mean()
 
 
 def minimise_with_torch(
-    objective: Objective, start: Floats, limit: Floats, schedule: Schedule, device: str
+    objective: Objective, start: Floats, limit: Floats, rate: float, iterations: int, device: str
 ) -> tuple[Floats, list[float]]:
-    """Minimise like `minimise`, with torch's Adam and autograd, on ``device``."""
-    loss_at = TorchObjective(objective, (start.shape[1], start.shape[2]), device)
-    variables = loss_at.tensor(start).requires_grad_()
-    bound = loss_at.tensor(np.broadcast_to(limit, start.shape))
-    adam: Any = torch.optim.Adam([variables], lr=schedule.rate, betas=(BETA_1, BETA_2), eps=EPSILON)
+    """Minimise like `minimise`, with torch's Adam and autograd, on ``device`` if that is available."""
+    if device == "cpu":
+        # At these sizes two threads are slower than one.
+        torch.set_num_threads(1)
+    elif (torch.device(device).index or 0) >= (gpus := torch.cuda.device_count()):
+        devices = " or ".join(["cpu", *(f"cuda:{i}" for i in range(gpus))])
+        raise TaskError(f"no device {device!r} on this machine; set fit.device to {devices}")
+    loss_at = torch_loss(objective, (start.shape[1], start.shape[2]), device)
+    variables = _tensor(start, device).requires_grad_()
+    bound = _tensor(np.broadcast_to(limit, start.shape), device)
+    adam: Any = torch.optim.Adam([variables], lr=rate, betas=(BETA_1, BETA_2), eps=EPSILON)
     best = start
     losses: list[float] = []
     while True:
@@ -173,7 +154,7 @@ def minimise_with_torch(
         if not losses or loss.item() < min(losses):
             best = variables.detach().cpu().numpy().copy()
         losses.append(loss.item())
-        if schedule.has_finished(losses):
+        if _has_finished(losses, iterations):
             return best, losses
         loss.backward()
         adam.step()

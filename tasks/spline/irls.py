@@ -7,9 +7,8 @@ solution for the lowest loss (Huber and Ronchetti, "Robust Statistics", section 
 Under Huber's function, the later steps of a narrow spline with a small tolerance are nearly those of Newton's
 method, see `OUTLIERS`.
 
-The normal equations of narrow splines are solved by `tasks.spline.banded`, the others by
-`tasks.spline.multigrid`, from step to step more precisely: the error of a step is corrected by the next ones,
-which are shorter.
+The normal equations of wide splines are solved from step to step more precisely
+(`tasks.spline.normal_equations`): the error of a step is corrected by the next ones, which are shorter.
 """
 
 from __future__ import annotations
@@ -20,16 +19,13 @@ from functools import cached_property
 import numpy as np
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.spline.banded import Banded
-from flexroad.tasks.spline.multigrid import Multigrid
+from flexroad.tasks.spline.normal_equations import Multigrid, is_narrow, solve_banded
 from flexroad.tasks.spline.objective import Objective
 from flexroad.tasks.spline.stencil import (
-    Lags,
     add_from_cells,
     at_cells,
     from_lines,
     gram,
-    line_width,
     multiply,
     to_lines,
 )
@@ -64,33 +60,22 @@ class HuberObjective:
 
     objective: Objective
     """Targets, their factors and the basis, of one degree along both axes; its regulariser is ignored."""
-    shape: tuple[int, int]
-    """Number of control points along northing and easting, (m, n)."""
-    huber_m: float = 0.0
+    held: Bools
+    """Control points that keep their height, ``(m, n)``: rows along northing."""
+    bending: Floats
+    """Second derivatives of the bending energy (`tasks.spline.stencil.bending_energy`)."""
+    huber_m: float
     """Smaller differences d count as ``d^2 / (2 huber_m)``, others as ``|d| - huber_m / 2``; 0 is L1."""
-    bending: Floats | None = None
-    """Second derivatives of the bending energy, by `tasks.spline.thin_plate.bending_energy`; None if the loss
-    has the height differences only."""
-    held: Bools | None = None
-    """Control points that keep their height, ``(m, n)``; None if all are free."""
 
     @cached_property
-    def solver(self) -> Banded | Multigrid:
-        """The solver of the normal equations, with its memory."""
-        kind = Banded if Banded.suits(self.shape, self.degree) else Multigrid
-        return kind(self.shape, self.degree, self.held)
+    def multigrid(self) -> Multigrid | None:
+        """The solver of the normal equations, with its memory; None for a narrow spline."""
+        return None if is_narrow(self.held.shape, self.degree) else Multigrid(self.degree, self.held)
 
     @property
     def degree(self) -> int:
         """Degree of the basis along both axes."""
         return int(self.objective.along_v.shape[1]) - 1
-
-    @cached_property
-    def stiffness(self) -> Floats:
-        """Second derivatives of the bending energy; zeros without it."""
-        (m, n), p = self.shape, self.degree
-        nothing = np.zeros((n, p + 1, p + 1, line_width(m, p)))
-        return nothing if self.bending is None else self.bending
 
     @cached_property
     def basis(self) -> tuple[Starts, Floats, Starts, Floats]:
@@ -114,7 +99,7 @@ class HuberObjective:
     def bend(self, lines: Floats) -> Floats:
         """Return the gradient of the bending energy."""
         out = np.empty_like(lines)
-        multiply(self.stiffness, lines, out, _lags(self.degree))
+        multiply(self.bending, lines, out, (0.0,) * (self.degree + 1))
         return out
 
     def model_step(
@@ -126,14 +111,17 @@ class HuberObjective:
         - `residuals` ``(H, W)``: surface minus targets (m).
         - `floor_m`: smaller differences get the weight of this one (m).
         - `share`: share of the weight of larger differences that enters the matrix.
-        - `tolerance`, `refresh`: see `tasks.spline.multigrid.Multigrid.solve`.
+        - `tolerance`, `refresh`: see `Multigrid.solve`.
         """
         weight, pull = np.empty_like(residuals), np.empty_like(residuals)
         _weigh(residuals, self.objective.factor, floor_m, share, weight, pull)
-        stencil, slope = self.stiffness.copy(), bend.copy()
+        stencil, slope = self.bending.copy(), bend.copy()
         gram(weight, *self.basis, stencil)
         add_from_cells(pull, *self.basis, slope)
-        step = self.solver.solve(stencil, -slope, tolerance, refresh)
+        if self.multigrid:
+            step = self.multigrid.solve(stencil, -slope, tolerance, refresh)
+        else:
+            step = solve_banded(stencil, -slope, self.held)
         return step, float(np.vdot(slope, step))
 
 
@@ -152,7 +140,7 @@ def minimise(
     residuals, bend = loss.heights(lines) - loss.objective.target, loss.bend(lines)
     losses, precision = [loss(start)], LOOSE
     floor_m = loss.huber_m or FINAL_M
-    newton = loss.huber_m > 0 and tolerance <= PRECISE and isinstance(loss.solver, Banded)
+    newton = loss.huber_m > 0 and tolerance <= PRECISE and not loss.multigrid
     share, later = 1.0, OUTLIERS if newton else 1.0
     for number in range(iterations):
         least = INITIAL_M * COOLING**number
@@ -172,7 +160,7 @@ def minimise(
         if least <= floor_m and decrease <= tolerance * losses[-2]:
             break
         precision = min(LOOSE, max(TIGHT, 0.1 * decrease / losses[-2]))
-    return from_lines(lines, loss.shape[0], loss.degree), losses
+    return from_lines(lines, len(loss.held), loss.degree), losses
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,10 +205,6 @@ class _Line:
             else:
                 high, high_slope, low_slope = t, slope, low_slope / 2
         return t, value
-
-
-def _lags(degree: int) -> Lags:
-    return (0.0,) * (degree + 1)
 
 
 @compiled(error_model="numpy", fused=True)

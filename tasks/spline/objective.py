@@ -88,8 +88,8 @@ def objective(
     - `free_weights`: whether the weights are variables.
     """
     valid = np.isfinite(heights)
-    start_u, along_u = kept_basis(space.knots_u, space.degree[0], space.u)
-    start_v, along_v = kept_basis(space.knots_v, space.degree[1], space.v)
+    start_u, along_u = kept_basis(space.knots_u.tobytes(), space.degree[0], space.u.tobytes())
+    start_v, along_v = kept_basis(space.knots_v.tobytes(), space.degree[1], space.v.tobytes())
     return Objective(
         target=np.where(valid, heights, 0.0),
         factor=np.where(valid, factor, 0.0) / np.count_nonzero(valid),

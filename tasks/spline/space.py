@@ -46,12 +46,6 @@ class Space:
         p, q = self.degree
         return len(self.knots_u) - p - 1, len(self.knots_v) - q - 1
 
-    @property
-    def transposed(self) -> Space:
-        """The same splines with the axes exchanged, for arrays ``(W, H)``."""
-        (p, q), (u_m, v_m) = self.degree, self.unit_m
-        return Space(self.knots_v, self.knots_u, (q, p), self.v, self.u, (v_m, u_m))
-
 
 @dataclass(frozen=True)
 class Lattice:

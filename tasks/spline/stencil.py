@@ -13,12 +13,18 @@ length is known when they are compiled, and short loops over it are unrolled.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.spline.surface import Starts
+from flexroad.tasks.spline.space import Space
+from flexroad.tasks.spline.surface import KEPT, Starts, basis, dense
 from flexroad.tasks.types import Floats
 
+Derivatives = tuple[Starts, tuple[Floats, Floats, Floats]]
+"""First basis function that is not zero at each cell of one axis, ``(N,)``; the functions from it on, and
+their first and second derivatives, ``(N, p + 1)`` each."""
 Lags = tuple[float, ...]
 VECTOR = 16
 """Lines are a multiple of this long, besides the zeros at their ends, so that no loop has a remainder."""
@@ -162,3 +168,51 @@ def multiply(stencil: Floats, x: Floats, out: Floats, lags: Lags) -> None:
         add_block(stencil[j, 0], x[j], 1.0, out[j], lags)
         add_lower(stencil, x, j, 1.0, out[j], lags)
         add_upper(stencil, x, j, 1.0, out[j], lags)
+
+
+def bending_energy(stiffness: Floats, space: Space) -> Floats:
+    """Return the second derivatives of the bending energy by the control heights, as a stencil.
+
+    The energy is that of a thin plate of the surface's shape: ``E = sum over cells of stiffness *
+    (z_xx^2 + 2 z_xy^2 + z_yy^2)`` with derivatives per metre, so that it does not depend on the number of
+    control points; it is 0 for planes. For control heights z it is ``z^T S z / 2``, with the gradient
+    ``S z``.
+
+    - `stiffness` ``(H, W)``: weight of the squared curvature in each cell (m3).
+    - `space`: the splines, of degree 2 at least, with the parameters of the raster's columns and rows.
+    """
+    start_u, along_u = _derivatives(
+        space.knots_u.tobytes(), space.degree[0], space.u.tobytes(), space.unit_m[0]
+    )
+    start_v, along_v = _derivatives(
+        space.knots_v.tobytes(), space.degree[1], space.v.tobytes(), space.unit_m[1]
+    )
+    n, m = space.points
+    lags = space.degree[0] + 1
+    stencil = np.zeros((n, lags, lags, line_width(m, lags - 1)))
+    for times, by_u, by_v in ((1.0, 2, 0), (2.0, 1, 1), (1.0, 0, 2)):
+        gram(2 * times * stiffness, start_u, along_u[by_u], start_v, along_v[by_v], stencil)
+    return stencil
+
+
+@lru_cache(maxsize=KEPT)
+def _derivatives(knots_bytes: bytes, degree: int, u_bytes: bytes, unit_m: float) -> Derivatives:
+    """Return the basis functions at u and their first and second derivatives per metre.
+
+    They are kept for the next fit and must not be changed. A derivative is a spline of one degree less over
+    the knots without the outermost (de Boor, "A practical guide to splines", chapter X).
+    """
+    knots, u = np.frombuffer(knots_bytes), np.frombuffer(u_bytes)
+    points = len(knots) - degree - 1
+    coefficients, derivatives = np.eye(points), []
+    first, _, _ = basis(knots, degree, u)
+    support = first[:, None] + np.arange(degree + 1)
+    for order in range(3):
+        inner, lower = knots[order : len(knots) - order], degree - order
+        start, values, _ = basis(inner, lower, u)
+        derivative = dense(start, values, points - order) @ coefficients / unit_m**order
+        derivatives.append(np.take_along_axis(derivative, support, axis=1))
+        if lower:
+            rate = lower / (inner[lower + 1 : -1] - inner[1 : points - order])
+            coefficients = rate[:, None] * np.diff(coefficients, axis=0)
+    return first, (derivatives[0], derivatives[1], derivatives[2])

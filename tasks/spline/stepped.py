@@ -111,41 +111,6 @@ def without_steps(surface: Surface) -> Surface:
     return NurbsSurface(**{field.name: getattr(surface, field.name) for field in fields(NurbsSurface)})
 
 
-@dataclass(frozen=True, eq=False)
-class Beside:
-    """Heights of the ground beside a tile's streets; arrays are ``(H, W)``, on the tile's core."""
-
-    cells: Bools
-    """The cells that may have a step."""
-    dsm: Floats
-    """DSM of those near the road or a wall (m), by the heights that roads are fitted to; else NaN."""
-    dtm: Floats
-    """DTM of the cells (m); else NaN."""
-    south_north: Floats
-    """Steps on the southern and the northern border, ``(2, W)``, m, from west to east."""
-    west_east: Floats
-    """Steps on the western and the eastern border, ``(2, H)``, m, from north to south."""
-
-
-def ground_beside(data: TileData, clusters: RoadClusters, frame: Frame | None = None) -> Beside | None:
-    """Return the heights beside the streets of a tile, None if the filter gives no such cells.
-
-    Without a frame there are no steps on the border.
-    """
-    if clusters.beside is None:
-        return None
-    window = data.grid.window(data.core)
-    cells = clusters.beside[window]
-    near = within(clusters.mask[window], data.core.cell, KERB_M)
-    dsm = ground_heights(data, clusters).dsm[window]
-    low, high = _around_dtm(data.dtm[window])
-    preferred = near | (high - low >= WALL_M) | (np.abs(dsm - data.dtm[window]) >= WALL_M)
-    dtm = np.where(cells, data.dtm[window], np.nan)
-    rows, cols = cells.shape
-    border = frame.steps(cells.shape) if frame else (np.zeros((2, cols)), np.zeros((2, rows)))
-    return Beside(cells, np.where(cells & preferred, dsm, np.nan), dtm, *border)
-
-
 def _borders(values: Floats, borders: Floats) -> tuple[NDArray[np.intp], Bools, Bools]:
     """Return the nearest border of each value, whether it is on it, and whether it is between two."""
     nearest = np.searchsorted((borders[:-1] + borders[1:]) / 2, values)
@@ -153,38 +118,59 @@ def _borders(values: Floats, borders: Floats) -> tuple[NDArray[np.intp], Bools, 
     return nearest, on, ~on & (values > borders[0]) & (values < borders[-1])
 
 
-def with_steps(beside: Beside, surface: NurbsSurface, core: Grid) -> SteppedSurface:
-    """Return a tile's surface with the steps of the cells beside its streets.
+def with_steps(
+    data: TileData, clusters: RoadClusters, surface: NurbsSurface, frame: Frame | None
+) -> NurbsSurface:
+    """Return a tile's surface with the steps of the cells beside its streets, if the filter gives such cells.
+
+    Without a frame there are no steps on the border. A surface that can have steps must have none yet.
+    """
+    if clusters.beside is None:
+        return surface
+    core = data.core
+    border = frame.steps(core.shape) if frame else (np.zeros((2, core.width)), np.zeros((2, core.height)))
+    south_north, west_east = (steps.astype(np.float32) for steps in border)
+    parts: dict[str, Any] = {
+        "steps": _cell_steps(data, clusters, clusters.beside, surface),
+        "south_north": south_north,
+        "west_east": west_east,
+        "cells": core,
+    }
+    if isinstance(surface, SteppedSurface):
+        return replace(surface, **parts)
+    return SteppedSurface(**vars(surface), **parts)
+
+
+def _cell_steps(
+    data: TileData, clusters: RoadClusters, beside: Bools, surface: NurbsSurface
+) -> NDArray[np.float32]:
+    """Return the steps of the cells beside streets, ``(H, W)``, m, on the tile's core.
 
     A cell has the height of its DSM if that shows the ground, averaged with the neighbours whose steps are
     alike, so that edges remain. Behind an object it has the height of the wall around, if there is one; else
-    that of its DTM, or, without DTM, a step between those around. A surface that can have steps must have
-    none yet.
+    that of its DTM, or, without DTM, a step between those around.
     """
+    core, window = data.core, data.grid.window(data.core)
+    cells, dtm, dsm = beside[window], data.dtm[window], ground_heights(data, clusters).dsm[window]
+    low, high = _around_dtm(dtm)
+    near_road = within(clusters.mask[window], core.cell, KERB_M)
+    preferred = near_road | (high - low >= WALL_M) | (np.abs(dsm - dtm) >= WALL_M)
+    dsm, dtm = np.where(cells & preferred, dsm, np.nan), np.where(cells, dtm, np.nan)
     spline = surface.lattice(core.eastings, core.northings)
-    rise, smoothed = beside.dsm - spline, beside.dtm - spline
+    rise, smoothed = dsm - spline, dtm - spline
     # The DTM is smoothed: beside a wall it has not reached the full height of the ground above or below it.
-    low, high = _around_dtm(beside.dtm)
+    low, high = _around_dtm(dtm)
     reach = OPEN_M + ROUNDED * np.maximum(high - low, 0.0)
-    away = np.minimum(np.abs(beside.dsm - low), np.abs(beside.dsm - high))
-    is_open = (np.abs(beside.dsm - beside.dtm) <= OPEN_M) | (away <= reach)
-    shown = beside.cells & ((np.abs(rise) <= SAME_M) | is_open)
-    steps = np.where(beside.cells, smoothed, 0.0)
-    near = np.isfinite(beside.dsm)
+    away = np.minimum(np.abs(dsm - low), np.abs(dsm - high))
+    is_open = (np.abs(dsm - dtm) <= OPEN_M) | (away <= reach)
+    shown = cells & ((np.abs(rise) <= SAME_M) | is_open)
+    steps = np.where(cells, smoothed, 0.0)
+    near = np.isfinite(dsm)
     around = _around(np.where(shown, rise, np.nan), near)
     walls = _walls(around, smoothed[near])
     steps[near] = np.where(np.abs(walls) >= WALL_M, walls, smoothed[near])
     steps[shown] = _alike(around[shown[near]], rise[shown])
-    filled = between(steps, beside.cells)
-    south_north, west_east = (border.astype(np.float32) for border in (beside.south_north, beside.west_east))
-    parts: dict[str, Any] = {
-        "steps": filled.astype(np.float32),
-        "south_north": south_north,
-        "west_east": west_east,
-    }
-    if isinstance(surface, SteppedSurface):
-        return replace(surface, **parts, cells=core)
-    return SteppedSurface(**vars(surface), **parts, cells=core)
+    return between(steps, cells).astype(np.float32)
 
 
 def _alike(around: Floats, own: Floats) -> Floats:
@@ -278,10 +264,10 @@ def border_steps(
     window, strip = border.strip(math.ceil(KERB_M / data.grid.cell) + 1)
     grid, heights = strip.grid, ground_heights(data, clusters)
     part = TileData(data.tile_id, grid, grid, heights.dsm[window], heights.dtm[window])
-    own = RoadClusters(grid, clusters.labels[window], None, clusters.beside[window])
-    both = border.along(clusters.beside).all(axis=0)
-    beside = ground_beside(part, own) if both.any() else None
-    steps = with_steps(beside, spline, grid).steps.astype(np.float64) if beside else np.zeros(grid.shape)
+    own = RoadClusters(grid, clusters.labels[window])
+    both, steps = border.along(clusters.beside).all(axis=0), np.zeros(grid.shape)
+    if both.any():
+        steps = _cell_steps(part, own, clusters.beside[window], spline).astype(np.float64)
     mean = np.where(both, strip.along(steps).sum(axis=0) / 2, 0.0)
     return {"steps": rounded(mean), "road_m": border.along(_to_road(road, border)).min(axis=0)}
 

@@ -10,7 +10,7 @@ east.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -22,6 +22,8 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats, Surface
 
 Starts = NDArray[np.intp]
+SplineOf = Callable[..., Floats]
+"""The spline of coefficients at given places; with ``du=1`` or ``dv=1`` its first derivative along u or v."""
 
 KEPT = 16
 """Number of axes whose basis functions are kept: tiles, corners and edges have few different ones."""
@@ -81,13 +83,9 @@ def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats
     return span[:, 0] - degree, values, _pair(degree * share, -degree * share)
 
 
-def kept_basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats]:
-    """Return first functions and values of `basis`, kept for the next call: they must not be changed."""
-    return _kept_basis(knots.tobytes(), degree, u.tobytes())
-
-
 @lru_cache(maxsize=KEPT)
-def _kept_basis(knots: bytes, degree: int, u: bytes) -> tuple[Starts, Floats]:
+def kept_basis(knots: bytes, degree: int, u: bytes) -> tuple[Starts, Floats]:
+    """Return first functions and values of `basis`, kept for the next call: they must not be changed."""
     start, values, _ = basis(np.frombuffer(knots), degree, np.frombuffer(u))
     return start, values
 
@@ -154,7 +152,11 @@ class NurbsSurface(Surface):
         inside_u, inside_v = self._clipped(u, v)
         along_u = basis_matrix(self.knots_u, self.degree[0], inside_u)
         along_v = basis_matrix(self.knots_v, self.degree[1], inside_v)
-        return self._height(_LatticeBasis(along_u, along_v), (u - inside_u)[None, :], (v - inside_v)[:, None])
+
+        def spline(coefficients: Floats, du: int = 0, dv: int = 0) -> Floats:
+            return np.asarray(along_v[dv] @ coefficients @ along_u[du].T)
+
+        return self._height(spline, (u - inside_u)[None, :], (v - inside_v)[:, None])
 
     def slope(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
         """Return the derivatives of the height by easting and by northing (m/m) at scattered points.
@@ -209,52 +211,30 @@ class NurbsSurface(Surface):
         u, v = np.broadcast_arrays(*self._parameters(easting, northing))
         return u.shape, (u.ravel(), v.ravel())
 
-    def _at_points(self, u: Floats, v: Floats) -> _PointBasis:
+    def _at_points(self, u: Floats, v: Floats) -> SplineOf:
         start_u, *along_u = basis(self.knots_u, self.degree[0], u)
         start_v, *along_v = basis(self.knots_v, self.degree[1], v)
-        return _PointBasis(start_u, along_u, start_v, along_v)
 
-    def _height(self, at: _PointBasis | _LatticeBasis, beyond_u: Floats, beyond_v: Floats) -> Floats:
+        def spline(coefficients: Floats, du: int = 0, dv: int = 0) -> Floats:
+            out = np.empty(len(start_u))
+            _contract(start_u, along_u[du], start_v, along_v[dv], coefficients, out)
+            return out
+
+        return spline
+
+    def _height(self, spline: SplineOf, beyond_u: Floats, beyond_v: Floats) -> Floats:
         if not (beyond_u.any() or beyond_v.any()):
-            return at.contract(self.A) / at.contract(self.W) + self.datum
-        z, by_u, by_v = self._taylor(at)
+            return np.asarray(spline(self.A) / spline(self.W) + self.datum)
+        z, by_u, by_v = self._taylor(spline)
         return z + by_u * beyond_u + by_v * beyond_v + self.datum
 
-    def _taylor(self, at: _PointBasis | _LatticeBasis) -> tuple[Floats, Floats, Floats]:
+    def _taylor(self, spline: SplineOf) -> tuple[Floats, Floats, Floats]:
         """Return height above the datum and its derivatives by u and v (quotient rule)."""
-        w = at.contract(self.W)
-        z = at.contract(self.A) / w
-        by_u = (at.contract(self.A, du=1) - z * at.contract(self.W, du=1)) / w
-        by_v = (at.contract(self.A, dv=1) - z * at.contract(self.W, dv=1)) / w
+        w = spline(self.W)
+        z = spline(self.A) / w
+        by_u = (spline(self.A, du=1) - z * spline(self.W, du=1)) / w
+        by_v = (spline(self.A, dv=1) - z * spline(self.W, dv=1)) / w
         return z, by_u, by_v
-
-
-@dataclass(frozen=True, eq=False)
-class _PointBasis:
-    """Basis functions at scattered points; ``along_*`` are values and slopes, ``(N, degree + 1)`` each."""
-
-    start_u: Starts
-    along_u: Sequence[Floats]
-    start_v: Starts
-    along_v: Sequence[Floats]
-
-    def contract(self, coefficients: Floats, du: int = 0, dv: int = 0) -> Floats:
-        """Return the spline of these coefficients, or its first derivative, ``(N,)``."""
-        out = np.empty(len(self.start_u))
-        _contract(self.start_u, self.along_u[du], self.start_v, self.along_v[dv], coefficients, out)
-        return out
-
-
-@dataclass(frozen=True, eq=False)
-class _LatticeBasis:
-    """Basis matrices of a lattice's columns and rows; each a pair of values and slopes."""
-
-    along_u: tuple[Floats, Floats]
-    along_v: tuple[Floats, Floats]
-
-    def contract(self, coefficients: Floats, du: int = 0, dv: int = 0) -> Floats:
-        """Return the spline of these coefficients, or its first derivative, ``(rows, cols)``."""
-        return np.asarray(self.along_v[dv] @ coefficients @ self.along_u[du].T)
 
 
 @compiled()

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 
 from flexroad.catalog import Catalog, CatalogError, Grid, Layer, Tile
-from flexroad.catalog.allowlist import check_allowed, needed
+from flexroad.catalog.index import check_allowed, needed
 from flexroad.catalog.tile import LAYERS
 from flexroad.catalog.trust import AllowedFolders
 
@@ -39,8 +39,8 @@ def test_file_outside_folder_raises_error_with_option(tmp_path, file, allow):
     option = f"--allow {allow.format(tmp_path / 'dsm')}"
     with pytest.raises(CatalogError, match="^tile one: dsm names ") as caught:
         check(tile_catalog, home)
-    assert str(caught.value).endswith(f"to allow it, add {option}")
-    (folder,) = needed(tile_catalog, home)
+    assert str(caught.value).endswith(f"to allow it, begin with flexroad {option}")
+    (folder,) = needed(tile_catalog, AllowedFolders.of(home))
     assert folder in option
     check(tile_catalog, home, [folder])
     check(tile_catalog, home, [folder + "/"])
@@ -90,10 +90,10 @@ def test_link_in_folder_that_leads_out_needs_allow(tmp_path, file):
     (home / "link.tif").symlink_to(data / "a.tif")
     tile_catalog = catalog("inside.tif", file, root=home)
     target = data / file.rpartition("/")[2].replace("link", "a")
-    line = f"^tile one: dsm names .*, by a link {target}, outside .*; to allow it, add --allow {data}$"
+    line = f"^tile one: dsm names .*, by a link {target}, outside .*; .* begin with flexroad --allow {data}$"
     with pytest.raises(CatalogError, match=line):
         check(tile_catalog, home)
-    assert needed(tile_catalog, home) == (str(data),)
+    assert needed(tile_catalog, AllowedFolders.of(home)) == (str(data),)
     # The folder to allow may be named by a link, too.
     (tmp_path / "alias of data").symlink_to(data)
     for folder in (data, tmp_path / "alias of data"):
@@ -133,7 +133,7 @@ def test_catalog_in_bucket_allows_only_its_folder(bucket):
 
 def test_needed_returns_few_folders(tmp_path):
     def folders(*files):
-        return needed(catalog(*files, root=tmp_path), tmp_path)
+        return needed(catalog(*files, root=tmp_path), AllowedFolders.of(tmp_path))
 
     assert folders("a.tif", "b/c.tif") == ()
     assert folders("/d/dsm/a.tif", "/d/dsm/b/a.tif", "/d/dsm-2/a.tif") == ("/d/dsm", "/d/dsm-2")

@@ -71,13 +71,13 @@ def test_area_of_degrees_has_straight_sides_in_degrees(tmp_path):
 def test_layer_is_chosen_by_name(tmp_path):
     path = written(tmp_path / "a.gpkg", rectangle(0, 50), layer="west")
     written(path, rectangle(450, 480), layer="east")
-    assert Area.read(path, "east").touched(GRIDS) == [False] * 4 + [True]
+    assert Area.read(f"{path}|layername=east").touched(GRIDS) == [False] * 4 + [True]
     with pytest.raises(
-        CatalogError, match=r"has 2 layers: west \(.*\), east \(.*\); name one with --area-layer"
+        CatalogError, match=r"has 2 layers: west \(.*\), east \(.*\); name one, such as .*layername=west'$"
     ):
         Area.read(path)
     with pytest.raises(CatalogError, match=r"has no layer 'north'; it has west \("):
-        Area.read(path, "north")
+        Area.read(f"{path}|layername=north")
 
 
 def test_polygon_that_crosses_itself_is_used(tmp_path):

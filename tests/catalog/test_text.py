@@ -5,7 +5,7 @@ import os
 import pytest
 
 from flexroad.catalog import CatalogError
-from flexroad.catalog.allowlist import AllowedFolders
+from flexroad.catalog.index import AllowedFolders
 from flexroad.catalog.storage.paths import parse_location
 from flexroad.catalog.storage.settings import s3_options
 from flexroad.catalog.text import without_credentials
@@ -52,7 +52,7 @@ def test_address_with_credentials_is_refused_without_them(take, monkeypatch):
     assert "wJalr" not in str(raised.value)
 
 
-@pytest.mark.parametrize("place", ["--catalog", "--out", "--store", "--scheduler"])
+@pytest.mark.parametrize("place", ["--catalog", "--out", "--store", "--executor"])
 def test_commands_show_no_credentials(flexroad, survey, tmp_path, place):
     words = {"--catalog": survey, "--out": tmp_path / "run"}
     words[place] = f"s3://AKIA:{SECRET}@bucket/x"

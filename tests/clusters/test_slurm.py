@@ -11,7 +11,7 @@ import cloudpickle
 import pytest
 import yaml
 
-from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.models import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, clusters
 from flexroad.pipeline.execute.clusters import open_cluster

@@ -12,7 +12,7 @@ from tests.real.shown import flexroad as command
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
-PREPARE = "--crs EPSG:2994 --to-crs EPSG:2993 --roads-layer road_polygons -o data"
+PREPARE = "--crs EPSG:2994 --to-crs EPSG:2993 -o data"
 ROOF = (194459, 259803)
 """A smooth roof on a car park, which slopes up to 7 m above it."""
 STAIRS = (194249, 259528)
@@ -25,8 +25,8 @@ def folder(real_data, tmp_path_factory):
     path, autzen = tmp_path_factory.mktemp("autzen"), real_data / "autzen"
     roads = autzen / "roads" / "autzen_north_roads.gpkg"
     scan = str(autzen / "autzen_north.laz")
-    command(["prepare", "points", scan, "--roads", str(roads), *shlex.split(PREPARE)], path)
-    run = ["run", "--catalog", "data/catalog.parquet", "--out", "run", "--allow", str(roads.parent)]
+    command(["prepare", scan, "--roads", f"{roads}|layername=road_polygons", *shlex.split(PREPARE)], path)
+    run = ["--allow", str(roads.parent), "run", "--catalog", "data/catalog.parquet", "--out", "run"]
     command(run, path)
     return path
 

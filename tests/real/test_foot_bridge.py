@@ -22,8 +22,8 @@ SOUTH, NORTH = (193987.1, 258843.6), (194060.8, 259039.2)
 WIDTH_M = 4.0
 PATHS = [[(193974.4, 258809.9), SOUTH], [NORTH, (194067.9, 259057.9)]]
 """The level ground from which the deck begins."""
-PREPARE = "prepare points seen.laz --crs EPSG:2994 --cell 0.5 --tile-size 150 --roads roads.gpkg -o data"
-RUN = "run --config production_vector --catalog data/catalog.parquet --allow . --out run"
+PREPARE = "prepare seen.laz --crs EPSG:2994 --cell 0.5 --tile-size 150 --roads roads.gpkg -o data"
+RUN = "--allow . run --config production_vector --catalog data/catalog.parquet --out run"
 
 
 @pytest.fixture(scope="module")

@@ -397,7 +397,7 @@ def test_load_fine_file_is_read_with_few_cells_in_one(tmp_path, cell, nodata):
     grids = Grid(UTM, 500000.0, 5600100.0, 1.0, 61, 61), Grid(UTM, 500007.0, 5600081.0, 1.0, 40, 40)
     loaded = []
     for grid in grids:
-        patch = read_window(tmp_path / "fine.tif", "dsm fine.tif", grid, grid, None)
+        patch = read_window(tmp_path / "fine.tif", "dsm fine.tif", grid, grid, None, heights=True)
         assert grid.width * 2 <= patch.values.shape[1] <= grid.width * 4 + 8
         assert misalignment(patch.file_lattice, grid) == f"its cells are {cell:g} m, the tile's 1 m"
         loaded.append(resample_to(patch, grid, Resampling.bilinear))
@@ -414,7 +414,7 @@ def test_load_fine_mask_takes_most_frequent_class(tmp_path):
     classes = np.kron(np.random.default_rng(0).integers(0, 5, (20, 20)), np.ones((8, 8))).astype(np.uint8)
     write(tmp_path / "mask.tif", classes, 500000, 5600100, cell=0.125)
     grid = Grid(UTM, 500000.0, 5600100.0, 1.0, 20, 20)
-    patch = read_window(tmp_path / "mask.tif", "mask", grid, grid, None, Resampling.mode)
+    patch = read_window(tmp_path / "mask.tif", "mask", grid, grid, None)
     assert patch.step == 4
     np.testing.assert_array_equal(resample_to(patch, grid, Resampling.nearest), classes[::8, ::8])
 

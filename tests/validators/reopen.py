@@ -335,16 +335,16 @@ def autzen(data: Path, folder: Path) -> Survey:
     """Return the north of the Autzen survey, with its centre lines."""
     survey, roads = Survey("Autzen", folder / "autzen"), data / "autzen" / "roads" / "autzen_north_roads.gpkg"
     if not (survey.folder / "catalog.parquet").exists():
-        layer = ["--roads", roads, "--roads-layer", "road_polygons", "--roads-where", ROADS]
+        layer = ["--roads", f"{roads}|layername=road_polygons", "--roads-where", ROADS]
         points = data / "autzen" / "autzen_north.laz"
-        _flexroad(survey.folder, "prepare", "points", points, "--crs", "EPSG:2994", *layer, "-o", ".")
-    return _exported(survey, "--drape", "--roads", roads, "--roads-layer", "road_centerlines")
+        _flexroad(survey.folder, "prepare", points, "--crs", "EPSG:2994", *layer, "-o", ".")
+    return _exported(survey, "--drape", "--roads", f"{roads}|layername=road_centerlines")
 
 
 def _exported(survey: Survey, *options: object) -> Survey:
     """Run and export a survey."""
     _flexroad(survey.folder, "run", "--catalog", "catalog.parquet", "--out", "run")
-    formats = ["--format", FORMATS, "--height-offset", OFFSET_M, *options]
+    formats = ["--format", FORMATS, "--vertical", OFFSET_M, *options]
     _flexroad(survey.folder, "export", "run", *formats, "-o", "out")
     return survey
 

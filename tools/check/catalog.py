@@ -1,25 +1,31 @@
 """Check of a catalog: layers per tile, what would fail, shift of the photo, and decks that no road names.
 
-The decks are written to a map, ``decks.geojson``, to be checked.
+A deck is level road above the DTM that goes on as street of the same height. The decks are written to a map,
+``decks.geojson``, to be checked.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
+import scipy
 import shapely
 from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 
 from flexroad.catalog import LAYERS, Catalog, Tile
-from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import short, transformer
+from flexroad.catalog.grid import Grid
+from flexroad.catalog.index import check_allowed
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.scan.cell_values import plateau_notes
 from flexroad.catalog.storage.paths import Location, exists, read, remove, write
 from flexroad.catalog.text import count, write_reason
@@ -35,8 +41,10 @@ from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.options import Options
 from flexroad.tasks.roads import attributes, coregistration, rasterise
-from flexroad.tasks.types import TileData
-from flexroad.tools.check.likely_decks import Deck, likely_decks
+from flexroad.tasks.roads.flat_patches import flat_cells
+from flexroad.tasks.types import Bools, Floats, TileData
+
+rasterio = lazy("rasterio")
 
 MAX_PHOTO_TILES = 12
 """Number of tiles whose photo is compared with the heights, spread evenly over the catalog."""
@@ -47,6 +55,38 @@ MOST_TILES = 200
 """Number of tiles that are looked at, spread evenly over the catalog, unless all are asked for."""
 LEAST_HALO_M = 50.0
 """Ground around a tile that is read: a deck that reaches beyond the tile is seen as a whole (m)."""
+RISE_M, AREA_M2 = 1.5, 20.0
+"""Least height above the DTM, and least area, of what may be a deck."""
+ROUGHNESS_M, BEND = 0.15, 0.1
+"""Limits of flat patches (`flat_patches`): those of ``ecsrc: planar``."""
+STREET_M = 0.5
+"""Largest difference of DSM and DTM on a street (m)."""
+END_M, END_M2 = 6.0, 4.0
+"""A deck ends at a street of at least this area within this distance."""
+STEP_M, GRADE = 0.5, 0.1
+"""Largest difference in height of a street to a deck that ends there: a step, and a slope (m per m)."""
+GAP_M = 1.5
+"""Places of streets that are this near to each other are one end (m)."""
+ENDS = 2
+"""What has fewer ends may also be a roof."""
+EVERY_WAY = np.ones((3, 3), bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Deck:
+    """A place that looks like a deck."""
+
+    area: shapely.Geometry
+    """Outline of its flat cells."""
+    rise_m: float
+    """Median height above the DTM."""
+    ends: int
+    """Number of places where a street of the same height goes on."""
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it cannot be a roof."""
+        return self.ends >= ENDS
 
 
 def check(catalog: Catalog, config: Config, path: Path, every_deck: bool = False) -> Iterator[Finding]:
@@ -92,17 +132,13 @@ def _photos(tiles: Sequence[Tile]) -> Iterator[Finding]:
     pairs: list[coregistration.Pair] = []
     for tile in sample:
         try:
-            pairs.append(_pair(tile))
+            data = load.load(tile, load.Options(min_valid=0.0))
+            assert data.dop is not None  # the caller selects tiles with a photo
+            pairs.append(coregistration.pair(data, read_photo(data.dop, data.grid)))
         except TaskError as error:
             yield Finding(f"{tile.id}: {error}", fault=True)
     if pairs:
         yield _shift(pairs, sample[0].grid.cell)
-
-
-def _pair(tile: Tile) -> coregistration.Pair:
-    data = load.load(tile, load.Options(min_valid=0.0))
-    assert data.dop is not None  # the caller selects tiles with a photo
-    return coregistration.pair(data, read_photo(data.dop, data.grid))
 
 
 def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Finding:
@@ -259,3 +295,54 @@ def _named(data: TileData, options: rasterise.Options) -> NDArray[np.object_]:
         shapes.append(table.geometry.to_numpy()[numbers > 0])
     areas: NDArray[np.object_] = shapely.buffer(np.concatenate(shapes), options.default_width_m / 2)
     return areas
+
+
+def likely_decks(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> list[Deck]:
+    """Return the places of road that look like decks.
+
+    - `dsm`, `dtm`: heights (m), NaN where unknown.
+    - `road`: cells of roads, with those on decks.
+    - `grid`: the grid of all of them.
+    """
+    points = road & np.isfinite(dsm)
+    flat = flat_cells(dsm, points, grid.cell, ROUGHNESS_M, BEND) & points
+    rise = dsm - dtm
+    street = flat & (np.abs(rise) <= STREET_M)
+    parts, number = scipy.ndimage.label(flat & (rise > RISE_M), EVERY_WAY)
+    sizes = np.bincount(parts.ravel(), minlength=number + 1) * grid.cell**2
+    decks = []
+    for k, box in enumerate(scipy.ndimage.find_objects(parts), 1):
+        if sizes[k] >= AREA_M2:
+            # Only what is near matters: a tile may have millions of cells.
+            around = _grown(box, math.ceil(END_M / grid.cell) + 1, road.shape)
+            own, here = parts[around] == k, grid.part(*around)
+            ends = _ends(own, street[around], dsm[around], grid.cell)
+            decks.append(Deck(_outline(own, here), float(np.median(rise[around][own])), ends))
+    return decks
+
+
+def _grown(box: tuple[slice, ...], cells: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Return the rows and columns of a box, and so many cells on each side of it."""
+    rows, cols = (
+        slice(max(side.start - cells, 0), min(side.stop + cells, length))
+        for side, length in zip(box, shape, strict=True)
+    )
+    return rows, cols
+
+
+def _ends(own: Bools, street: Bools, dsm: Floats, cell: float) -> int:
+    """Return the number of streets of the same height within `END_M` of some cells."""
+    away, nearest = scipy.ndimage.distance_transform_edt(~own, sampling=cell, return_indices=True)
+    off = np.abs(dsm - dsm[tuple(nearest)])
+    level = street & (away <= END_M) & (off <= STEP_M + GRADE * away)
+    grown = scipy.ndimage.binary_dilation(level, iterations=max(1, round(GAP_M / cell)))
+    places, _ = scipy.ndimage.label(grown)
+    sizes = np.bincount(places[level], minlength=1) * cell**2
+    return int((sizes[1:] >= END_M2).sum())
+
+
+def _outline(cells: Bools, grid: Grid) -> shapely.Geometry:
+    """Return the outline of some cells, without the steps from cell to cell."""
+    shapes = rasterio.features.shapes(cells.astype(np.uint8), mask=cells, transform=grid.transform)
+    outline = shapely.union_all([shapely.geometry.shape(shape) for shape, _ in shapes])
+    return shapely.simplify(outline, grid.cell)

@@ -125,6 +125,7 @@ def _write(path: Path, folder: Path, proposed: Sequence[Proposal]) -> None:
 
 @app.command("check", cls=Command)
 def catalog_check(
+    ctx: typer.Context,
     path: options.CatalogFile,
     config: Annotated[
         str | None,
@@ -137,14 +138,13 @@ def catalog_check(
     decks: Annotated[
         bool, typer.Option("--decks", help="Look for decks on all tiles, not only on 200 of them.")
     ] = False,
-    allow: options.Allow = None,
 ) -> None:
     """Check a catalog before a long run.
 
     Prints layers, what would fail in a run, the shift between photo and heights, and how many places look
     like decks that no road names. These are written to decks.geojson beside the catalog.
     """
-    catalog, faults = Catalog.read(path, allow or ()), 0
+    catalog, faults = Catalog.read(path, options.allowed(ctx)), 0
     for remark in check(catalog, load_config(config or fitting_config(catalog)), path, decks):
         echo(f"warning: {remark.text}" if remark.fault or remark.warning else remark.text)
         faults += remark.fault

@@ -18,9 +18,9 @@ from flexroad.catalog import layouts
 from flexroad.catalog.crs import in_plan, plan_unit, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
+from flexroad.catalog.scan.inputs import MESHES, POINTS, is_project
 from flexroad.catalog.scan.point_clouds import inspect
-from flexroad.catalog.scan.rasters import quiet
-from flexroad.catalog.scan.valid_cells import read_valid
+from flexroad.catalog.scan.rasters import quiet, read_valid
 from flexroad.catalog.scan.vectors import layers as layers_of
 from flexroad.catalog.scan.vectors import listed
 from flexroad.catalog.sources import nrw
@@ -41,9 +41,9 @@ FEW_VALUES = 40
 
 SUFFIXES = {
     "raster": (".tif", ".tiff", ".asc", ".xyz", ".txt", ".gz", ".vrt", ".jp2"),
-    "cloud": (".las", ".laz"),
+    "cloud": POINTS,
     "vector": (".gpkg", ".sqlite", ".shp", ".geojson", ".fgb", ".osm", ".pbf"),
-    "mesh": (".obj", ".ply", ".gltf", ".glb"),
+    "mesh": MESHES,
     "photo": (".jpg", ".jpeg"),
     "archive": (".zip", ".7z", ".tar", ".tgz", ".rar"),
 }
@@ -61,7 +61,7 @@ NO_CRS = "it has no CRS: which is it (--crs)?"
 
 LAYERS = ("dsm", "dtm", "road_height", "dop", "road_mask")
 """Layers that rasters are given for."""
-LAYER = "--roads-layer with the layer of the roads"
+LAYER = "|layername=NAME to --roads, in quotes, with the layer of the roads"
 """What to add for a vector file of several layers."""
 
 
@@ -214,7 +214,7 @@ def _vectors(path: Path) -> Download:
     if not any(re.search(ROADS, name.lower()) for name in (path.stem, *layers)):
         unclear = "are these roads? If so, give it with --roads"
         return Download(path, "vector", listed(layers), question=unclear)
-    question = "which layer are the roads (--roads-layer)?" if len(layers) > 1 else ""
+    question = "which layer are the roads (--roads FILE|layername=NAME)?" if len(layers) > 1 else ""
     return Download(path, "roads", listed(layers), question=question)
 
 
@@ -224,13 +224,13 @@ def proposals(folder: Path, found: Sequence[Download]) -> Iterator[Proposal]:
     for download in found:
         by_kind[download.kind].append(download)
     yield from _of_rasters(folder, by_kind)
-    for number, (command, inputs, crs) in enumerate(_sources(folder, by_kind)):
-        out = Path(f"{_title(folder)}_{command}{number or ''}")
+    for number, (kind, inputs, crs) in enumerate(_sources(folder, by_kind)):
+        out = Path(f"{_title(folder)}_{kind}{number or ''}")
         roads = _roads(by_kind)
-        words = ["flexroad", "prepare", command, *map(str, inputs), "-o", str(out), *roads]
+        words = ["flexroad", "prepare", *map(str, inputs), "-o", str(out), *roads]
         lacking = [] if roads else ["--roads FILE with the roads of the area"]
         lacking += [LAYER] if roads and by_kind["roads"][0].question else []
-        lacking += ["--crs"] if command == "points" and crs is None else []
+        lacking += ["--crs"] if kind == "points" and crs is None else []
         catalog = out / "catalog.parquet"
         # Areas become a road mask, lines stay vectors: the command itself says what comes next.
         yield Proposal(shlex.join(words), catalog, "", _listed(lacking))
@@ -249,21 +249,22 @@ def _roads(by_kind: Mapping[str, Sequence[Download]]) -> list[str]:
 def _sources(
     folder: Path, by_kind: Mapping[str, Sequence[Download]]
 ) -> Iterator[tuple[str, list[Path], str | None]]:
-    """Yield the inputs of each ``flexroad prepare`` command, with their CRS."""
-    if any((folder / name).is_dir() for name in ("odm_dem", "odm_texturing", "odm_orthophoto")):
+    """Yield the kind, the inputs and the CRS of each ``flexroad prepare`` command."""
+    if is_project(folder):
         yield "odm", [folder], None
         return
-    clouds = by_kind["cloud"]
+    clouds, meshes = by_kind["cloud"], {mesh.path.parent for mesh in by_kind["mesh"]}
     for crs in dict.fromkeys(cloud.crs for cloud in clouds):
         files = [cloud.path for cloud in clouds if cloud.crs == crs]
-        others = {cloud.path.parent for cloud in clouds if cloud.crs != crs}
+        others = meshes | {cloud.path.parent for cloud in clouds if cloud.crs != crs}
         # A folder stands for its files if they belong together.
         names = dict.fromkeys(file if file.parent in others else file.parent for file in files)
         yield "points", list(names), crs
     for mesh in by_kind["mesh"]:
         yield "mesh", [mesh.path], None
-    textures = {mesh.path.parent for mesh in by_kind["mesh"]}
-    if photos := {photo.path.parent for photo in by_kind["photo"]} - textures:
+    # Images beside points or a mesh are previews or textures.
+    beside = meshes | {cloud.path.parent for cloud in clouds}
+    if photos := {photo.path.parent for photo in by_kind["photo"]} - beside:
         yield "photos", sorted(photos), None
 
 

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location, read, stat, write
-from flexroad.catalog.text import count, no_formula
+from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile, GroundTile, passing
-from flexroad.pipeline.run.points import LARGEST_STEP_M, length_text
-from flexroad.pipeline.run.sampler import TileSampler
+from flexroad.pipeline.run.sampler import LARGEST_STEP_M, TileSampler, length_text
+from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.levels.along_route import PlaceLevels, RouteLevels, structures
+from flexroad.tasks.levels.along_route import PlaceLevels, route_levels, structures
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats, HeightAt
@@ -32,10 +31,10 @@ from flexroad.tools.export import reference_line as lines
 from flexroad.tools.export.georeference import LocalFrame
 from flexroad.tools.export.network import Network, network
 from flexroad.tools.export.profiles import (
+    NONE,
     HeightGrid,
     Profiles,
     across,
-    elevation_error,
     grid_error,
     height_grid,
     largest_steps,
@@ -56,9 +55,14 @@ from flexroad.tools.export.tile_outputs import (
     write_whole,
 )
 
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = lazy("pandas")
+
 VERSION = 8
 """Of the roads themselves: their division, lines, grids and errors."""
-INTERNAL = {"bounds", "lanes_assumed"}
+INTERNAL = ["bounds", "lanes_assumed"]
 """Entries of a road's row that the report does not show."""
 SUMMARY = (
     *("crg_max_mm", "profiles_mean_mm", "profiles_max_mm", "elevation_mean_mm", "elevation_max_mm"),
@@ -136,7 +140,7 @@ class RouteUnit:
 
     def levels(self, x: Floats, y: Floats) -> PlaceLevels | None:
         """Return the levels of places in the local frame; None if the route is on level 0 alone."""
-        return None if self._levels is None else self._levels.at(x, y)
+        return None if self._levels is None else self._levels(x, y)
 
     def levels_on(self, x: Floats, y: Floats) -> NDArray[np.int8]:
         """Return the levels of the centre line at places on it."""
@@ -144,8 +148,8 @@ class RouteUnit:
         return np.zeros(x.shape, np.int8) if found is None else found.of_line
 
     @cached_property
-    def _levels(self) -> RouteLevels | None:
-        return RouteLevels.of(self.route)
+    def _levels(self) -> Callable[[Floats, Floats], PlaceLevels] | None:
+        return route_levels(self.route)
 
     def height(self, work: Work, steps: bool = False) -> HeightAt:
         """Return, in the local frame, the surface without steps, or how much higher the one with steps is."""
@@ -187,7 +191,7 @@ def write_crg(
     work = Work(roads.frame, source.vertical)
     rows, _ = write_units(opencrg.VERSION, crg_output, work, roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
-    error, steps = summary["crg_max_mm"], steps_left_out(_metres(summary["crg_steps_max_mm"]))
+    error, steps = summary["crg_max_mm"], steps_left_out((summary["crg_steps_max_mm"] or 0.0) / 1000)
     surface = SMOOTH if steps else "the surface"
     text = f"misses {surface} by at most {length_text(error / 1000, 1)}{steps}" if error is not None else ""
     return with_line(summary, text)
@@ -225,7 +229,7 @@ def _without_crg(summary: Mapping[str, Any]) -> str:
         )
         for name in ("profiles", "elevation")
     ]
-    steps = steps_left_out(_metres(summary["carriageway_steps_max_mm"]))
+    steps = steps_left_out((summary["carriageway_steps_max_mm"] or 0.0) / 1000)
     surface = SMOOTH if steps else "the surface"
     alone = f"by elevation alone (CARLA, SUMO) by {errors[1]}"
     return f"misses {surface} by {errors[0]}, without OpenCRG; {alone}{steps}"
@@ -292,7 +296,7 @@ def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Pro
     """Return numbers, grids, profiles and rows of a route's roads, and why it has none."""
     height, step = unit.height(work), unit.height(work, steps=True)
     line, problem = reference_line(unit)
-    parts = [] if line is None else lines.usable(line, height(line.x, line.y), lines.Options())
+    parts = [] if line is None else lines.usable(line, height(line.x, line.y))
     roads = []
     for part, own in enumerate(parts):
         grid = height_grid(own, height)
@@ -304,12 +308,11 @@ def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Pro
 
 def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
     """Return the line of a route, or why it has none."""
-    options = lines.Options()
     try:
-        line = lines.reference_line(unit.route, options)
+        line = lines.reference_line(unit.route)
     except TaskError as error:
         return None, str(error)
-    return line, f"shorter than {options.min_length_m:g} m" if line is None else ""
+    return line, f"shorter than {lines.MIN_LENGTH_M:g} m" if line is None else ""
 
 
 def route_row(unit: RouteUnit, roads: list[ManifestRow], problem: str) -> ManifestRow:
@@ -330,7 +333,8 @@ def row(
     """
     line = grid.line
     (crg_median, crg_max), (mean, most) = grid_error(grid, height), profile_error(grid, fitted)
-    level_mean, level_most = elevation_error(grid, fitted)
+    # CARLA and SUMO take the elevation alone, across a level road.
+    level_mean, level_most = profile_error(grid, Profiles(fitted.elevation, NONE))
     crg_steps, carriageway_steps = largest_steps(grid, step)
     half, lanes = float(line.width.max()) / 2, opendrive.lane_count(line)
     errors = {
@@ -367,25 +371,17 @@ def millimetres(metres: float) -> float | None:
     return round(metres * 1000, 3) if np.isfinite(metres) else None
 
 
-def _metres(length_mm: float | None) -> float | None:
-    return None if length_mm is None else length_mm / 1000
-
-
 def report(folder: Location, rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
     """Write the report of the roads, if it is new; return the summary for the manifest."""
     every = [road for row in rows for road in row["roads"]]
-    text = io.StringIO(newline="")
-    columns = [name for name in every[0] if name not in INTERNAL]
-    table = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
-    table.writeheader()
-    table.writerows({name: no_formula(value) for name, value in road.items()} for road in every)
-    data, file = text.getvalue().encode(), folder / REPORT
+    table = pd.DataFrame(every, dtype=object).drop(columns=INTERNAL)
+    data, file = csv_text(table).encode(), folder / REPORT
     known = stat(file)
     if known is None or known.size != len(data) or read(file) != data:
         write(file, data)
     return {
         **totals(rows, roads),
-        **{name: (_mean if "_mean_" in name else _largest)(every, name) for name in SUMMARY},
+        **{name: _of_all(every, name) for name in SUMMARY},
         "faults": tile_faults(every),
     }
 
@@ -454,16 +450,10 @@ def with_line(figures: Mapping[str, Any], error: str = "") -> dict[str, Any]:
     return {**figures, "summary": f"{text}; {error}" if error else text}
 
 
-def _known(roads: list[ManifestRow], key: str) -> list[ManifestRow]:
-    return [road for road in roads if road[key] is not None]
-
-
-def _largest(roads: list[ManifestRow], key: str) -> float | None:
-    return max((road[key] for road in _known(roads, key)), default=None)
-
-
-def _mean(roads: list[ManifestRow], key: str) -> float | None:
-    """Return the mean over the length of the roads."""
-    known = _known(roads, key)
+def _of_all(roads: list[ManifestRow], key: str) -> float | None:
+    """Return the mean over the length of the roads, or the largest value; None if it is not known."""
+    known = [road for road in roads if road[key] is not None]
+    if "_mean_" not in key:
+        return max((road[key] for road in known), default=None)
     length = sum(road["length_m"] for road in known)
     return round(sum(road[key] * road["length_m"] for road in known) / length, 3) if known else None

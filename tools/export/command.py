@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -17,10 +16,10 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.signals import INTERRUPTED
 from flexroad.pipeline.cli.stdio import echo, end_for_steps
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
-from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.errors import ClusterLost
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-from flexroad.pipeline.run.points import STEP_REMEDY
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
+from flexroad.pipeline.run.sampler import STEP_REMEDY
 from flexroad.tools.export.driver import check_formats
 from flexroad.tools.export.driver import export as write
 from flexroad.tools.export.georeference import Datum
@@ -32,6 +31,7 @@ app = group()
 @app.command(cls=Command)
 @options.with_options
 def export(
+    ctx: typer.Context,
     path: options.Run,
     formats: Annotated[
         str,
@@ -48,22 +48,9 @@ def export(
     vertical: Annotated[
         str | None,
         typer.Option(
-            metavar="CRS",
-            help="Vertical CRS of the run's heights, for 3dtiles.",
-            rich_help_panel=INPUTS,
-        ),
-    ] = None,
-    geoid: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Geoid of the heights (.gtx, .tif), instead.", rich_help_panel=INPUTS
-        ),
-    ] = None,
-    height_offset: Annotated[
-        float | None,
-        typer.Option(
-            metavar="METRES",
-            help="Height of the vertical datum above the ellipsoid, instead.",
+            metavar="CRS|FILE|METRES",
+            help="Vertical datum of the run's heights, for 3dtiles: its CRS, its geoid (.gtx, .tif), or its "
+            "height above the ellipsoid in m.",
             rich_help_panel=INPUTS,
         ),
     ] = None,
@@ -77,29 +64,25 @@ def export(
     tile: options.TileIds = None,
     bbox: options.Box = None,
     area: options.Area = None,
-    area_layer: options.AreaLayer = None,
-    allow: options.Allow = None,
     workers: options.Parallel = 1,
 ) -> None:
     """Write finished tiles in the formats of other programs.
 
     The same command goes on after an interruption. FOLDER/export.json says what was written.
     """
-    chosen = replace(chosen, datum=_datum(vertical, geoid, height_offset))
-    if chosen.roads_layer and not chosen.roads:
-        raise ConfigError("--roads-layer needs --roads; of the catalog, the layer is known")
+    chosen = replace(chosen, datum=None if vertical is None else Datum.of(vertical))
     folder = parse_location(output)
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)
-    track = StepProgress(Console(stderr=True))
+    track = step_progress(Console(stderr=True))
     runner = SerialExecutor() if workers == 1 else DaskExecutor(workers)
     try:
         source = select(
             parse_location(path),
             tile or (),
             bbox,
-            allow=[str(place) for place in allow or ()],
-            area=Area.read(area, area_layer) if area else None,
+            allow=options.allowed(ctx),
+            area=Area.read(area) if area else None,
             track=track,
         )
         if source.left_out:
@@ -129,17 +112,3 @@ def _say(name: str, written: dict[str, Any], folder: Location) -> None:
 
 def _note(line: str) -> None:
     echo(f"note: {line}", err=True)
-
-
-def _datum(vertical: str | None, geoid: Path | None, offset: float | None) -> Datum | None:
-    given = {
-        "crs": vertical,
-        "geoid": None if geoid is None else str(geoid),
-        "offset": None if offset is None else f"{offset:g}",
-    }
-    chosen = {kind: value for kind, value in given.items() if value is not None}
-    if len(chosen) > 1:
-        raise ConfigError("give one of --vertical, --geoid and --height-offset")
-    for kind, value in chosen.items():
-        return Datum(kind, value)  # type: ignore[arg-type]
-    return None

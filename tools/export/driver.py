@@ -31,8 +31,8 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.points import STEP_REMEDY
 from flexroad.pipeline.run.record import Run, check_own
+from flexroad.pipeline.run.sampler import STEP_REMEDY
 from flexroad.pipeline.run.status import Track, ended, untracked
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.export.formats import FORMATS, Format
@@ -42,7 +42,7 @@ SAME = ("variant", "crs", "tiles", "results")
 """Entries of the manifest that two exports into one folder have in common if both are of the same results."""
 DATUM_REMEDY = (
     "needs heights above the ellipsoid of WGS 84, and the heights of a run are above a vertical datum; say "
-    "which: --vertical EPSG:N (PROJ needs its grid), --geoid FILE (.gtx or .tif), or --height-offset METRES"
+    "which: --vertical EPSG:N (PROJ needs its grid), --vertical FILE (.gtx or .tif), or --vertical METRES"
 )
 MANIFEST = "export.json"
 BEGUN = ".flexroad-export"

@@ -18,7 +18,6 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import FinishedTile
-from flexroad.tasks.roads.extent import covered
 from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tools.export import (
@@ -35,7 +34,7 @@ from flexroad.tools.export import (
 )
 from flexroad.tools.export.georeference import Georeference
 from flexroad.tools.export.network import network
-from flexroad.tools.export.source import Options, Source, TileItem, layer_state, texture_of
+from flexroad.tools.export.source import Options, Source, layer_state, texture_of
 from flexroad.tools.export.tile_outputs import (
     Encode,
     TileOutput,
@@ -55,7 +54,7 @@ NO_PHOTO = "no orthophoto, in plain colours"
 
 def landxml_part(tile: FinishedTile, project: landxml.Project) -> TileOutput:
     """Return the part of a LandXML file."""
-    part = landxml.part(tile.mesh, project.joined).encode()
+    part = landxml.part(tile.mesh, project.joined)
     return TileOutput({part_name(tile.id): part}, {"height_error_m": _error_m(tile, 10**-landxml.DECIMALS)})
 
 
@@ -78,10 +77,9 @@ def obj_output(
     return TileOutput(files, {"height_error_m": _error_m(tile, 10**-obj.DECIMALS)})
 
 
-def draped_obj_output(item: TileItem, place: Georeference) -> TileOutput:
+def draped_obj_output(tile: FinishedTile, place: Georeference) -> TileOutput:
     """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
-    tile, name = item.tile, safe_name(item.id)
-    image = texture_of(tile)
+    image, name = texture_of(tile), safe_name(tile.id)
     materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
     output = obj_output(tile, place, materials, image.bounds if image else None)
     if image is None:
@@ -115,8 +113,11 @@ def step_output(tile: FinishedTile, place: Georeference) -> TileOutput:
     surface, source, name = tile.surface, tile.tile, safe_name(tile.id)
     if not isinstance(surface, NurbsSurface):
         raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
-    bounds, beyond_m2 = covered(tile.road)
-    steps_m = _steps_m(tile)
+    bounds, beyond_m2 = step.covered(tile.road)
+    steps_m = 0.0
+    if isinstance(surface, SteppedSurface):
+        inside = ~tile.road.outside[tile.road.grid.window(tile.road.core)]
+        steps_m = round(float(np.abs(surface.steps[inside]).max(initial=0.0)), 6)
     about = {"bounds": list(bounds), "beyond_survey_m2": beyond_m2, "steps_max_m": steps_m}
     files = {
         f"{name}{step.NAME}": step.encode(surface, bounds, tile.id, source.datetime, place),
@@ -126,15 +127,6 @@ def step_output(tile: FinishedTile, place: Georeference) -> TileOutput:
     notes += [BEYOND] if beyond_m2 else []
     notes += [OF_LEVEL_0] if surface.levels else []
     return TileOutput(files, {"steps_max_m": steps_m} | ({"note": "; ".join(notes)} if notes else {}))
-
-
-def _steps_m(tile: FinishedTile) -> float:
-    """Return the largest step of a tile's surface within the survey (m)."""
-    surface, road = tile.surface, tile.road
-    if not isinstance(surface, SteppedSurface):
-        return 0.0
-    inside = ~road.outside[road.grid.window(road.core)]
-    return round(float(np.abs(surface.steps[inside]).max(initial=0.0)), 6)
 
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]
@@ -173,8 +165,7 @@ def write_landxml(
 
     def join(local: Path, parts: Iterator[bytes]) -> None:
         with local.open("wb") as file:
-            decoded = (landxml.Part.decode(part) for part in parts)
-            landxml.join(file, decoded, project, local.parent, options.compress)
+            landxml.join(file, parts, project, local.parent, options.compress)
 
     file = folder / f"{source.run.path.name}{name}"
     return write_joined(source, tiles, file, landxml.VERSION, landxml_part, project, executor, join)
@@ -203,8 +194,16 @@ def write_obj(
         write(folder / MATERIALS, obj.encode_materials())
         return _write_each(obj.VERSION, obj_output, source, tiles, folder, options, executor)
     remove(folder / MATERIALS)
-    items = (TileItem(tile, f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}") for tile in tiles)
-    return figures(write_outputs(items, folder, obj.VERSION, draped_obj_output, source.place, executor))
+    rows = write_outputs(
+        tiles,
+        folder,
+        obj.VERSION,
+        draped_obj_output,
+        source.place,
+        executor,
+        made_of=lambda tile: f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}",
+    )
+    return figures(rows)
 
 
 def _write_each(
@@ -220,9 +219,7 @@ def _write_each(
     return figures(write_outputs(tiles, folder, version, encode, source.place, executor))
 
 
-def _along_roads(title: str, version: int, write: Write) -> Format:
-    return Format(title, write, version, None, check=network, of_roads=True)
-
+_along_roads = partial(Format, precision_m=None, check=network, of_roads=True)
 
 FORMATS = {
     "3dtiles": Format(
@@ -239,8 +236,8 @@ FORMATS = {
         "STEP AP214, for CAD", partial(_write_each, step.VERSION, step_output), step.VERSION, 1e-9
     ),
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
-    "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
-    "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),
-    "lines": _along_roads("Road lines as GeoPackage, for GIS", road_lines.VERSION, road_lines.write_lines),
+    "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", along_roads.write_crg, opencrg.VERSION),
+    "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", along_roads.write_xodr, opendrive.VERSION),
+    "lines": _along_roads("Road lines as GeoPackage, for GIS", road_lines.write_lines, road_lines.VERSION),
 }
 """By the name on the command line."""

@@ -18,6 +18,8 @@ from typing import Any, Literal
 
 import numpy as np
 from pyproj import CRS, Transformer
+from pyproj.crs import ProjectedCRS
+from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 from pyproj.exceptions import ProjError
 
 from flexroad.catalog import crs as crs_of
@@ -116,33 +118,9 @@ class LocalFrame:
 
     @cached_property
     def _transformer(self) -> Transformer:
-        geodetic = _geodetic(self.crs).to_json_dict()
-        metre = {"type": "LinearUnit", "name": "metre", "conversion_factor": 1}
-        values = {
-            "Latitude of natural origin": (self.latitude, "degree"),
-            "Longitude of natural origin": (self.longitude, "degree"),
-            "Scale factor at natural origin": (1, "unity"),
-            "False easting": (0, metre),
-            "False northing": (0, metre),
-        }
-        local = {
-            "type": "ProjectedCRS",
-            "name": "local transverse Mercator",
-            "base_crs": geodetic,
-            "conversion": {
-                "name": "local",
-                "method": {"name": "Transverse Mercator", "id": {"authority": "EPSG", "code": 9807}},
-                "parameters": [{"name": k, "value": v, "unit": u} for k, (v, u) in values.items()],
-            },
-            "coordinate_system": {
-                "subtype": "Cartesian",
-                "axis": [
-                    {"name": "Easting", "abbreviation": "E", "direction": "east", "unit": "metre"},
-                    {"name": "Northing", "abbreviation": "N", "direction": "north", "unit": "metre"},
-                ],
-            },
-        }
-        return Transformer.from_crs(_plan(self.crs), CRS.from_json_dict(local), always_xy=True)
+        conversion = TransverseMercatorConversion(self.latitude, self.longitude, 0, 0, 1)
+        local = ProjectedCRS(conversion, geodetic_crs=_geodetic(self.crs))
+        return Transformer.from_crs(_plan(self.crs), local, always_xy=True)
 
 
 def _plan(crs: str) -> CRS:
@@ -164,11 +142,19 @@ class Datum:
     value: str
     """The vertical CRS (EPSG:7837), the file of a geoid (GTX or GeoTIFF), or a number of metres."""
 
+    @classmethod
+    def of(cls, text: str) -> Datum:
+        """Return the datum that a user names: by a number of metres, the file of a geoid, or a CRS."""
+        try:
+            return cls("offset", f"{float(text):g}")
+        except ValueError:
+            return cls("geoid" if text.lower().endswith((".gtx", ".tif", ".tiff")) else "crs", text)
+
     def __post_init__(self) -> None:
         if self.kind == "geoid" and not Path(self.value).is_file():
-            raise CatalogError(f"--geoid {self.value} does not exist")
+            raise CatalogError(f"--vertical {self.value} does not exist")
         if self.kind == "offset" and not np.isfinite(float(self.value)):
-            raise CatalogError(f"--height-offset {self.value} is no number of metres")
+            raise CatalogError(f"--vertical {self.value} is no number of metres")
 
     @property
     def text(self) -> str:
@@ -179,40 +165,33 @@ class Datum:
             "offset": f"heights plus {self.value} m are above the ellipsoid",
         }[self.kind]
 
+    def geographic(
+        self, crs: str, easting: Floats, northing: Floats, height: Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return longitude and latitude (degrees) and height above the ellipsoid (m), ``(n,)`` each.
 
-@dataclass(frozen=True)
-class Ellipsoidal:
-    """Conversion of eastings, northings and heights to WGS 84."""
-
-    crs: str
-    """The horizontal CRS."""
-    datum: Datum
-
-    def geographic(self, easting: Floats, northing: Floats, height: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return longitude and latitude (degrees) and height above the ellipsoid (m), ``(n,)`` each."""
+        - `crs`: horizontal CRS of the points.
+        """
+        reason = "the geoid does not cover the area"
         try:
-            if self.datum.kind == "crs":
-                source = compound(self.crs, self.datum.value)
-                return _transform(_exact(source, GEOGRAPHIC), easting, northing, height)
-            longitude, latitude = _exact(self.crs, GEOGRAPHIC).transform(easting, northing, errcheck=True)
-            if self.datum.kind == "offset":
-                return longitude, latitude, height + float(self.datum.value)
-            above = _transform(_geoid(self.datum.value), longitude, latitude, np.zeros_like(height))[2]
+            if self.kind == "crs":
+                return _transform(_exact(compound(crs, self.value), GEOGRAPHIC), easting, northing, height)
+            longitude, latitude = _exact(crs, GEOGRAPHIC).transform(easting, northing, errcheck=True)
+            if self.kind == "offset":
+                return longitude, latitude, height + float(self.value)
+            above = _transform(_geoid(self.value), longitude, latitude, np.zeros_like(height))[2]
+            if np.isfinite(above).all():
+                return longitude, latitude, height + above
         except ProjError as error:
-            raise CatalogError(self._failure(str(error))) from error
-        if not np.isfinite(above).all():
-            raise CatalogError(self._failure("the geoid does not cover the area"))
-        return longitude, latitude, height + above
-
-    def _failure(self, reason: str) -> str:
-        return (
-            f"no exact conversion from {short(self.crs)} and {self.datum.text} to the ellipsoid of WGS 84: "
-            f"{reason}; give the geoid's grid with --geoid FILE, or a constant with --height-offset"
+            reason = str(error)
+        raise CatalogError(
+            f"no exact conversion from {short(crs)} and {self.text} to the ellipsoid of WGS 84: {reason}; "
+            "give the geoid's grid with --vertical FILE, or a constant with --vertical METRES"
         )
 
 
 def geocentric(longitude: Floats, latitude: Floats, height: Floats) -> Floats:
-    """Return coordinates from the Earth's centre (m), ``(n, 3)``, of results of `Ellipsoidal.geographic`."""
+    """Return coordinates from the Earth's centre (m), ``(n, 3)``, of results of `Datum.geographic`."""
     return np.stack(_transform(_exact(GEOGRAPHIC, GEOCENTRIC), longitude, latitude, height), axis=-1)
 
 

@@ -13,6 +13,7 @@ import gzip
 import io
 import shutil
 import tempfile
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -27,9 +28,7 @@ from numpy.typing import NDArray
 from flexroad.catalog import crs
 from flexroad.catalog.text import printable
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.meshing import parts
-from flexroad.tasks.meshing.parts import Indices
-from flexroad.tasks.types import Bools, Floats, Mesh
+from flexroad.tasks.types import Floats, Mesh
 
 VERSION = 1
 NAME = ".xml"
@@ -63,9 +62,8 @@ POINT_START, POINT_END = b'<P id="%d">%b\n', "%.4f %.4f %.4f</P>\n"
 FACE = b"<F>%d %d %d</F>\n"
 CLASSES = (("road", "Road surface"), ("ground", "Ground beside the road"))
 """Name and meaning of the surfaces."""
-LEVEL = "level"
-"""Begin of the names of the other levels in a part's archive."""
 
+Arrays = dict[str, NDArray[Any]]
 Place = tuple[int, int, int]
 """Easting, northing and height in units of the last decimal."""
 
@@ -83,94 +81,55 @@ class Project:
     """Whether the meshes have common vertices at their borders, which the surfaces then share."""
 
 
-@dataclass(frozen=True, eq=False)
-class PartSurface:
-    """The faces of one class of one mesh."""
+def part(mesh: Mesh, joined: bool = True) -> bytes:
+    """Return what a mesh gives to a file, all of it but the numbers of its points, as NumPy archive.
 
-    points: bytes
-    """The end of the line of each point, from its northing on; of n points."""
-    corners: NDArray[np.int32]
-    """Numbers of points, from 0, ``(k, 3)``."""
-    rim: NDArray[np.int32]
-    """Of each point at the rim of the mesh: its number here, and its row in the part's rim, ``(r, 2)``."""
-    limits: Floats
-    """Lowest and highest height (m), ``(2,)``."""
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """What one mesh gives to a file."""
-
-    crs: str
-    places: NDArray[np.int64]
-    """Easting, northing and height of the vertices at its rim, in units of the last decimal, ``(R, 3)``."""
-    angles: Floats
-    """Sum of the angles in plan of the faces around each of them (radians), ``(R,)``."""
-    surfaces: tuple[PartSurface, PartSurface]
-    """Road and ground."""
-    levels: tuple[tuple[int, Part], ...] = ()
-    """Number and part of each other level, which has a road alone."""
-
-    def encode(self) -> bytes:
-        """Return the part as NumPy archive, for `decode`."""
-        arrays = {"crs": np.array(self.crs), "places": self.places, "angles": self.angles}
-        for number, surface in enumerate(self.surfaces):
-            arrays[f"points{number}"] = np.frombuffer(surface.points, np.uint8)
-            arrays |= {f"{name}{number}": getattr(surface, name) for name in ("corners", "rim", "limits")}
-        for number, other in self.levels:
-            arrays[f"{LEVEL}{number}"] = np.frombuffer(other.encode(), np.uint8)
-        buffer = io.BytesIO()
-        np.savez(buffer, **arrays)  # type: ignore[arg-type]  # its flags are named like no array
-        return buffer.getvalue()
-
-    @classmethod
-    def decode(cls, data: bytes) -> Part:
-        """Return the part that `encode` has written."""
-        with np.load(io.BytesIO(data), allow_pickle=False) as npz:
-            road, ground = (
-                PartSurface(
-                    npz[f"points{k}"].tobytes(), npz[f"corners{k}"], npz[f"rim{k}"], npz[f"limits{k}"]
-                )
-                for k in range(2)
-            )
-            levels = tuple(
-                (int(name.removeprefix(LEVEL)), cls.decode(npz[name].tobytes()))
-                for name in npz.files
-                if name.startswith(LEVEL)
-            )
-            return cls(str(npz["crs"]), npz["places"], npz["angles"], (road, ground), levels)
-
-
-def part(mesh: Mesh, joined: bool = True) -> Part:
-    """Return what a mesh gives to a file: all of it but the numbers of its points.
+    It has the arrays of `_part` of each level, named ``LEVEL.NAME``, and the CRS.
 
     - `joined`: whether it shares the vertices at its border with its neighbours (`Project.joined`).
     """
-    levels = tuple((number, part(mesh.at(number), joined)) for number in mesh.numbers[1:])
-    mesh = mesh.at(0)
+    arrays: Arrays = {"crs": np.array(mesh.crs)}
+    for level in mesh.numbers:
+        arrays |= {f"{level}.{name}": values for name, values in _part(mesh.at(level), joined).items()}
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # its flags are named like no array
+    return buffer.getvalue()
+
+
+def _part(mesh: Mesh, joined: bool) -> Arrays:
+    """Return what the mesh of one level gives to a file.
+
+    - `places` ``(R, 3)``: the vertices at its rim: easting, northing, height in units of the last decimal.
+    - `angles` ``(R,)``: sums of the angles in plan of the faces around them (radians).
+    - `points0`, `points1`: of road and of ground the end of the line of each point, from its northing on.
+    - `corners0`, `corners1` ``(k, 3)``: numbers of points, from 0.
+    - `rim0`, `rim1` ``(r, 2)``: the number of each point at the rim, and its row in `places`.
+    - `limits0`, `limits1` ``(2,)``: lowest and highest height (m).
+    """
     points = mesh.vertices + np.asarray(mesh.origin, np.float64)
     rim = _rim(mesh) if joined else np.zeros(0, np.intp)
     row = np.full(len(points), -1, np.int32)
     row[rim] = np.arange(len(rim))
     places = np.rint(points[rim] * 10**DECIMALS).astype(np.int64)
-    road, ground = (_part_surface(mesh, faces, points, row) for faces in (mesh.road, ~mesh.road))
-    return Part(mesh.crs, places, _angles(mesh)[rim], (road, ground), levels)
-
-
-def _part_surface(mesh: Mesh, faces: Bools, points: Floats, row: NDArray[np.int32]) -> PartSurface:
-    used, corners = parts.part(mesh, faces)
-    east, north, height = points[used].T
-    columns = zip(north.tolist(), east.tolist(), height.tolist(), strict=True)
-    text = "".join(map(POINT_END.__mod__, columns)).encode()
-    at_rim = np.flatnonzero(row[used] >= 0).astype(np.int32)
-    rim = np.column_stack([at_rim, row[used][at_rim]])
-    limits = np.array([height.min(), height.max()] if len(used) else [np.inf, -np.inf])
-    return PartSurface(text, corners.astype(np.int32), rim, limits)
+    arrays = {"places": places, "angles": _angles(mesh)[rim]}
+    for number, faces in enumerate((mesh.road, ~mesh.road)):
+        used, corners = mesh.part(faces)
+        east, north, height = points[used].T
+        columns = zip(north.tolist(), east.tolist(), height.tolist(), strict=True)
+        text = "".join(map(POINT_END.__mod__, columns)).encode()
+        at_rim = np.flatnonzero(row[used] >= 0).astype(np.int32)
+        arrays |= {
+            f"points{number}": np.frombuffer(text, np.uint8),
+            f"corners{number}": corners,
+            f"rim{number}": np.column_stack([at_rim, row[used][at_rim]]),
+            f"limits{number}": np.array([height.min(), height.max()] if len(used) else [np.inf, -np.inf]),
+        }
+    return arrays
 
 
 def join(
     file: IO[bytes],
-    parts_of_meshes: Iterable[Part],
+    parts_of_meshes: Iterable[bytes],
     project: Project,
     folder: Path | None = None,
     compress: bool = False,
@@ -180,22 +139,23 @@ def join(
     Points are "northing easting height", absolute, in metres, rounded to 0.05 mm. Faces are counter-clockwise
     from above. A class without faces has no surface. Equal inputs give equal bytes.
 
-    - `parts_of_meshes`: in any order, all in one CRS; each is read once. Memory is least if neighbours follow
-      each other.
+    - `parts_of_meshes`: of `part`, in any order, all in one CRS; each is read once. Memory is least if
+      neighbours follow each other.
     - `folder`: folder of the temporary files, which need as much space as the uncompressed file; by default
       that of the system.
     """
     with ExitStack() as stack:
+        surfaces = dict[int, list[_Surface]]()
 
         def surfaces_of(number: int) -> list[_Surface]:
+            """Return road and ground of a level."""
             level = f" level {number}" if number else ""
-            return [
-                _Surface(name + level, meaning + level, _temporary(stack, folder), _temporary(stack, folder))
-                for name, meaning in CLASSES
-            ]
+            for name, meaning in CLASSES if number not in surfaces else ():
+                points, faces = (stack.enter_context(tempfile.TemporaryFile(dir=folder)) for _ in range(2))
+                surfaces.setdefault(number, []).append(_Surface(name + level, meaning + level, points, faces))
+            return surfaces[number]
 
-        surfaces = {0: surfaces_of(0)}
-        system = _collect(parts_of_meshes, surfaces, surfaces_of)
+        system = _collect(parts_of_meshes, surfaces_of)
         if compress:
             # Name and time of the archive are left out: equal inputs give equal bytes.
             packed = gzip.GzipFile(filename="", mode="wb", fileobj=file, compresslevel=6, mtime=0)
@@ -213,42 +173,38 @@ def join(
         file.write(b"</Surfaces>\n</LandXML>\n")
 
 
-def _temporary(stack: ExitStack, folder: Path | None) -> IO[bytes]:
-    return stack.enter_context(tempfile.TemporaryFile(dir=folder))
-
-
-def _collect(
-    parts_of_meshes: Iterable[Part],
-    surfaces: dict[int, list[_Surface]],
-    surfaces_of: Callable[[int], list[_Surface]],
-) -> str:
-    """Add the faces of all parts to the surfaces of their level; return the meshes' CRS.
-
-    - `surfaces`: road and ground of each level; those of further levels are added.
-    """
+def _collect(parts_of_meshes: Iterable[bytes], surfaces_of: Callable[[int], list[_Surface]]) -> str:
+    """Add the faces of all parts to the surfaces of their level; return the meshes' CRS."""
     system = ""
     open_vertices: dict[int, dict[Place, _OpenVertex]] = {}
-    for one in parts_of_meshes:
-        system = system or one.crs
-        if one.crs != system:
+    for data in parts_of_meshes:
+        levels = defaultdict[int, Arrays](dict)
+        with np.load(io.BytesIO(data), allow_pickle=False) as npz:
+            own_system = str(npz["crs"])
+            for level, _, name in (full.partition(".") for full in npz.files if full != "crs"):
+                levels[int(level)][name] = npz[f"{level}.{name}"]
+        system = system or own_system
+        if own_system != system:
             raise TaskError(
-                f"meshes in {crs.short(system)} and {crs.short(one.crs)} do not fit in one LandXML file;"
+                f"meshes in {crs.short(system)} and {crs.short(own_system)} do not fit in one LandXML file;"
                 " export each CRS to a file of its own"
             )
-        for level, own in ((0, one), *one.levels):
-            if level not in surfaces:
-                surfaces[level] = surfaces_of(level)
-            _add(own, surfaces[level], open_vertices.setdefault(level, {}))
-    if not any(surface.faces for surface in surfaces[0]):
+        for number, own in levels.items():
+            _add(own, surfaces_of(number), open_vertices.setdefault(number, {}))
+    if not any(surface.faces for surface in surfaces_of(0)):
         raise TaskError("no tile has a mesh with a face; choose an area with tiles that succeeded")
     return system
 
 
-def _add(own: Part, surfaces: Sequence[_Surface], open_vertices: dict[Place, _OpenVertex]) -> None:
+def _add(own: Arrays, surfaces: Sequence[_Surface], open_vertices: dict[Place, _OpenVertex]) -> None:
     """Add the faces of a part of one level to its surfaces."""
-    at_rim = _at_rim(own, open_vertices)
-    for number, (surface, faces) in enumerate(zip(surfaces, own.surfaces, strict=True)):
-        surface.add(faces, number, at_rim)
+    at_rim = list[_OpenVertex]()
+    for (x, y, z), angle in zip(own["places"].tolist(), own["angles"].tolist(), strict=True):
+        vertex = open_vertices.setdefault((x, y, z), _OpenVertex((x, y, z)))
+        vertex.angle += angle
+        at_rim.append(vertex)
+    for number, surface in enumerate(surfaces):
+        surface.add(own, number, at_rim)
     for vertex in at_rim:
         if vertex.angle > FULL_TURN:
             open_vertices.pop(vertex.place, None)
@@ -265,17 +221,7 @@ class _OpenVertex:
     """Its numbers in the surfaces of road and ground; 0 where it is not in them."""
 
 
-def _at_rim(one: Part, open_vertices: dict[Place, _OpenVertex]) -> list[_OpenVertex]:
-    """Return the vertices at the rim of a part, in its order; new ones are added to the open ones."""
-    found = []
-    for (x, y, z), angle in zip(one.places.tolist(), one.angles.tolist(), strict=True):
-        vertex = open_vertices.setdefault((x, y, z), _OpenVertex((x, y, z)))
-        vertex.angle += angle
-        found.append(vertex)
-    return found
-
-
-def _rim(mesh: Mesh) -> Indices:
+def _rim(mesh: Mesh) -> NDArray[np.intp]:
     """Return the vertices at edges with one face only."""
     faces = mesh.faces.astype(np.int64)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
@@ -310,13 +256,17 @@ class _Surface:
     low: float = np.inf
     high: float = -np.inf
 
-    def add(self, part: PartSurface, number: int, at_rim: Sequence[_OpenVertex]) -> None:
-        """Write the faces of a part, and those of their points that no part before has written."""
-        if not len(part.corners):
+    def add(self, part: Arrays, number: int, at_rim: Sequence[_OpenVertex]) -> None:
+        """Write the faces of a part, and those of their points that no part before has written.
+
+        - `number`: 0 for the road, 1 for the ground.
+        """
+        corners = part[f"corners{number}"]
+        if not len(corners):
             return
-        lines = part.points.splitlines()
+        lines = part[f"points{number}"].tobytes().splitlines()
         ids = np.zeros(len(lines), np.int64)
-        rim = [(point, at_rim[row]) for point, row in part.rim.tolist()]
+        rim = [(point, at_rim[row]) for point, row in part[f"rim{number}"].tolist()]
         for point, vertex in rim:
             ids[point] = vertex.numbers[number]
         new = np.flatnonzero(ids == 0)
@@ -324,10 +274,10 @@ class _Surface:
         for point, vertex in rim:
             vertex.numbers[number] = int(ids[point])
         _write_rows(self.points_file, POINT_START, [ids[new].tolist(), [lines[k] for k in new.tolist()]])
-        _write_rows(self.faces_file, FACE, ids[part.corners].T.tolist())
+        _write_rows(self.faces_file, FACE, ids[corners].T.tolist())
         self.points += len(new)
-        self.faces += len(part.corners)
-        low, high = part.limits.tolist()
+        self.faces += len(corners)
+        low, high = part[f"limits{number}"].tolist()
         self.low, self.high = min(self.low, low), max(self.high, high)
 
     def copy_to(self, file: IO[bytes]) -> None:

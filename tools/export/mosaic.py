@@ -161,16 +161,11 @@ def _draft(folder: Path, layer: _Layer, grid: Grid, source: Source) -> Any:
     return raster
 
 
-@dataclass(frozen=True, eq=False)
-class _Shown:
-    """What the rasters show of a tile."""
+_Shown = tuple[Surface, Bools, NDArray[np.uint8], int]
+"""What the rasters show of a tile: surface, filtered road cells on the grid of its road mask, height source.
 
-    surface: Surface
-    kept: Bools
-    """Filtered road cells, on the grid of the tile's road mask."""
-    height_source: NDArray[np.uint8]
-    level: int = 0
-    """A deck or tunnel; 0 if it is shown everywhere."""
+Last is the level if it is a deck or tunnel; 0 if it is shown everywhere.
+"""
 
 
 def _shown(tile: FinishedTile, level: int | None) -> _Shown | None:
@@ -179,26 +174,26 @@ def _shown(tile: FinishedTile, level: int | None) -> _Shown | None:
     if level is None:
         core = tile.tile.grid
         top = surface.top(*np.meshgrid(core.eastings, core.northings))
-        return _Shown(surface.highest, top_mask(clusters), top_height_source(quality, top))
+        return surface.highest, top_mask(clusters), top_height_source(quality, top), 0
     if level == 0:
-        return _Shown(surface, with_approaches(clusters).mask, quality.height_source)
+        return surface, with_approaches(clusters).mask, quality.height_source, 0
     if level not in surface.numbers:
         return None
     (own,) = (own for own in clusters.levels if own.number == level)
     height_source = dict(quality.levels)[level].height_source
-    return _Shown(surface.at(level), own.mask, height_source, level)
+    return surface.at(level), own.mask, height_source, level
 
 
 def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile, shown: _Shown) -> None:
     """Write the cells of a tile into the drafts."""
-    surface, road, core = shown.surface, tile.road, tile.tile.grid
+    (surface, kept, of_source, level), road, core = shown, tile.road, tile.tile.grid
     for part, column, line in _parts(grid, core.bounds):
         eastings, northings = part.eastings, part.northings
         outside = road.outside[_cells(road.grid, eastings, northings)]
-        is_road = shown.kept[_cells(road.grid, eastings, northings)].astype(np.uint8)
-        height_source = shown.height_source[_cells(core, eastings, northings)]
-        if shown.level:
-            beyond = ~tile.surface.covers(shown.level, *np.meshgrid(eastings, northings))
+        is_road = kept[_cells(road.grid, eastings, northings)].astype(np.uint8)
+        height_source = of_source[_cells(core, eastings, northings)]
+        if level:
+            beyond = ~tile.surface.covers(level, *np.meshgrid(eastings, northings))
             outside, is_road = outside | beyond, np.where(beyond, NO_ROAD, is_road)
             height_source = np.where(beyond, HeightSource.NONE, height_source)
         heights = surface.lattice(eastings, northings)

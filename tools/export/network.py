@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, union
-from flexroad.catalog.scan.vectors import opened
-from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.scan.vectors import file_and_layer, opened
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import types
@@ -99,31 +97,22 @@ def _read(source: Source, options: Options) -> CentreLines:
     """Return the centre lines whose boxes touch the tiles."""
     stage = source.run.config.chains[source.variant]["segment"]
     if options.roads is not None:
-        layer = _given(Path(options.roads), options.roads_layer, source.crs)
-        places = {layer: union([tile.grid.bounds for tile in source.tiles])}
+        file = _given(options.roads, source.crs)
+        places = {file: union([tile.grid.bounds for tile in source.tiles])}
         chosen = rasterise.Options()
     else:
         places = _of_catalog(source)
         chosen = stage if isinstance(stage, rasterise.Options) else rasterise.Options()
     levels = isinstance(stage, vector.Options) and stage.levels
-    parts = []
-    for (path, crs, sublayer), bounds in places.items():
-        layer_source = types.Source("roads", (path,), crs, sublayer=sublayer)
-        try:
-            parts.append(read_centre_lines(layer_source, bounds, source.crs, chosen, levels))
-        except TaskError as error:
-            raise ConfigError(str(error)) from error
-    lines = {line.points.tobytes(): line for part in parts for line in part.lines}
-    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
-    return CentreLines(tuple(lines.values()), sum(part.areas for part in parts), notes)
+    try:
+        return read_centre_lines(places, source.crs, chosen, levels)
+    except TaskError as error:
+        raise ConfigError(str(error)) from error
 
 
-Layer = tuple[Location, str | None, str | None]
-"""A vector file, the CRS that it has if it carries none, and its layer."""
-
-
-def _given(path: Path, sublayer: str | None, crs: str) -> Layer:
+def _given(roads: str, crs: str) -> types.Source:
     """Return the file that the user names."""
+    path, sublayer = file_and_layer(roads)
     if not path.is_file():
         raise ConfigError(f"--roads {path}: no such file; name a vector file of centre lines")
     try:
@@ -132,17 +121,18 @@ def _given(path: Path, sublayer: str | None, crs: str) -> Layer:
         raise ConfigError(str(error)) from error
     if not file.has_crs:
         raise ConfigError(f"--roads {path} carries no CRS; give it one with ogr2ogr -a_srs")
-    return file.path, None, sublayer
+    return types.Source("roads", (file.path,), sublayer=sublayer)
 
 
-def _of_catalog(source: Source) -> dict[Layer, Bounds]:
+def _of_catalog(source: Source) -> dict[types.Source, Bounds]:
     """Return the catalog's files of roads, each with the bounds of the tiles that list it."""
-    tiles: defaultdict[Layer, list[Bounds]] = defaultdict(list)
+    tiles = defaultdict[types.Source, list[Bounds]](list)
     for tile in source.tiles:
         for layer in tile.all_layers:
             if layer.name == "roads":
                 for path in tile.paths(layer):
-                    tiles[path, layer.crs, layer.sublayer].append(tile.grid.bounds)
+                    file = types.Source("roads", (path,), layer.crs, sublayer=layer.sublayer)
+                    tiles[file].append(tile.grid.bounds)
     if not tiles:
         raise ConfigError(
             f"the catalog of {source.run.path} has no roads: name a file of centre lines with --roads"
@@ -187,19 +177,19 @@ class CentreLines:
 
 
 def read_centre_lines(
-    source: types.Source, bounds: Bounds, crs: str, options: rasterise.Options, levels: bool = False
+    places: Mapping[types.Source, Bounds], crs: str, options: rasterise.Options, levels: bool = False
 ) -> CentreLines:
     """Return the centre lines whose boxes touch an area.
 
-    - `source`: vector files; equal lines of several files are one.
-    - `bounds`: west, south, east and north (m, in ``crs``).
+    - `places`: west, south, east and north (m, in ``crs``) by vector files; equal lines of several are one.
     - `levels`: whether to read levels. Roads below level 0 are then kept, whatever ``options.tunnels`` says.
     """
     names = (*rasterise.columns(options), *NAMES, *DIRECTIONS, JUNCTION)
     names += attributes.LEVEL_COLUMNS if levels else ()
     found: dict[bytes, CentreLine] = {}
     areas, notes = 0, list[str]()
-    for path in source.paths:
+    files = ((path, source, bounds) for source, bounds in places.items() for path in source.paths)
+    for path, source, bounds in files:
         layer = options.layer or source.sublayer
         table = read_near(Query(path, layer, options.where, names, source.crs, crs), bounds)
         part = from_table(table, options, levels)

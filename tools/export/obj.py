@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
-from flexroad.tasks.meshing.parts import texture_coordinates
 from flexroad.tasks.types import Mesh
 from flexroad.tools.export.georeference import Georeference
 
@@ -47,7 +46,7 @@ def encode(mesh: Mesh, materials: str, place: Georeference, photo: Bounds | None
     shift = np.subtract(mesh.origin, place.origin)
     blocks.append(_rows("v %.4f %.4f %.4f\n", (mesh.vertices + shift).T))
     if photo:
-        blocks.append(_rows("vt %.7f %.7f\n", texture_coordinates(mesh, photo).T))
+        blocks.append(_rows("vt %.7f %.7f\n", mesh.texture_coordinates(photo).T))
     row = "f %d/%d %d/%d %d/%d\n" if photo else "f %d %d %d\n"
     ground = np.ones(len(mesh.faces), np.bool_) if mesh.level is None else mesh.level == 0
     groups = [("road", "road", ground & mesh.road), ("terrain", "terrain", ground & ~mesh.road)]

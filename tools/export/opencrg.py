@@ -69,8 +69,11 @@ def encode(grid: HeightGrid, comment: str = "") -> bytes:
         raise TaskError(f"the road at {place} has no height: leave out roads beyond the surface")
     datum = float(np.round(grid.heights[known].mean()))
     phi = line.chord_headings
+    # In a comment ``$`` would begin a section.
+    texts = [printable(text).replace("$", "S").encode("ascii", "replace") for text in comment.splitlines()]
+    short = [text[at : at + LINE] for text in texts for at in range(0, max(1, len(text)), LINE)]
     header = HEADER.format(
-        comment="\n".join(_comment(comment)),
+        comment=b"\n".join(short).decode(),
         end_u=(len(line.x) - 1) * line.increment,
         increment=line.increment,
         right=grid.v[0],
@@ -87,10 +90,3 @@ def encode(grid: HeightGrid, comment: str = "") -> bytes:
     rows = np.column_stack([np.concatenate([phi[:1], phi]), grid.heights - datum])
     filling = np.full(-rows.size % RECORD, np.nan)
     return header.encode("ascii") + np.concatenate([rows.ravel(), filling]).astype(">f4").tobytes()
-
-
-def _comment(text: str) -> list[str]:
-    """Return the lines of a comment: ASCII, not too long, and without a ``$``, which begins a section."""
-    lines = [printable(line).replace("$", "S") for line in text.splitlines()]
-    lines = [line.encode("ascii", "replace").decode() for line in lines]
-    return [line[at : at + LINE] for line in lines for at in range(0, max(1, len(line)), LINE)]

@@ -18,6 +18,10 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats, HeightAt
 from flexroad.tools.export.reference_line import ReferenceLine
 
+MARGIN_M = 1.0
+"""Width of a grid beside the widest carriageway (m); less in narrow bends, so that the grid does not fold."""
+NONE = np.zeros((1, 5))
+"""A profile without records: it is 0."""
 TOLERANCE_M = 0.0005
 """Largest distance of a profile from the straight lines that fit the cross-sections (m)."""
 
@@ -136,13 +140,9 @@ class HeightGrid:
     """``(n, m)``, m; NaN beyond the surface, and beyond a gap in it: no row has NaN between heights."""
 
 
-def height_grid(line: ReferenceLine, height: HeightAt, margin_m: float = 1.0) -> HeightGrid:
-    """Return the heights of a surface beside a part of a line that `reference_line.usable` returns.
-
-    - `margin_m`: width beside the carriageway at its widest place (m), less in narrow bends, so that the grid
-      does not fold.
-    """
-    v = across(line, 0.25, margin_m)
+def height_grid(line: ReferenceLine, height: HeightAt) -> HeightGrid:
+    """Return the heights of a surface beside a part of a line that `reference_line.usable` returns."""
+    v = across(line, 0.25, MARGIN_M)
     heights, middle = height(*line.beside(v)), int(np.argmin(np.abs(v)))
     # Readers of OpenCRG refuse gaps in a row.
     known = np.isfinite(heights)
@@ -193,13 +193,10 @@ def _pieces(s: Floats, values: Floats, tolerance: float) -> Floats:
 
 def profile_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
     """Return how far profiles miss the heights of the carriageway: mean, largest (m); NaN if it has none."""
-    return _missed(grid, profiles.at(grid.line.s[:, None], grid.v))
-
-
-def elevation_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
-    """Return the same as `profile_error` for a reader that takes the elevation alone, across a level road."""
-    level = value_at(profiles.elevation, grid.line.s[:, None])
-    return _missed(grid, np.broadcast_to(level, grid.heights.shape))
+    missed = np.abs(profiles.at(grid.line.s[:, None], grid.v) - grid.heights)[on_carriageway(grid)]
+    if not len(missed):
+        return np.nan, np.nan
+    return float(missed.mean()), float(missed.max())
 
 
 def largest_steps(grid: HeightGrid, step: HeightAt) -> tuple[float, float]:
@@ -211,13 +208,6 @@ def largest_steps(grid: HeightGrid, step: HeightAt) -> tuple[float, float]:
     known, inside = steps[np.isfinite(steps)], steps[on_carriageway(grid)]
     everywhere, carriageway = (float(part.max()) if len(part) else np.nan for part in (known, inside))
     return everywhere, carriageway
-
-
-def _missed(grid: HeightGrid, fitted: Floats) -> tuple[float, float]:
-    missed = np.abs(fitted - grid.heights)[on_carriageway(grid)]
-    if not len(missed):
-        return np.nan, np.nan
-    return float(missed.mean()), float(missed.max())
 
 
 def on_carriageway(grid: HeightGrid) -> Bools:

@@ -14,20 +14,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 import shapely
-from pydantic import Field, field_validator
 
-from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats
 
+INCREMENT_M = 0.5
+"""Distance of the points (m); OpenCRG's consistency check wants a multiple of 1 mm."""
+MAX_OFFSET_M = 0.25
+"""Largest distance from the centre lines (m)."""
+SMOOTH_M = 30.0
+"""Shorter waves of a line are smoothed away (m)."""
+PIECE_M = 4.0
+"""Length of a cubic piece (m)."""
+MIN_LENGTH_M = 10.0
+"""Shortest road (m)."""
 SAMPLE_M = 0.25
 """Distance of the points that are smoothed (m)."""
 DIAGONAL = np.array([[0.0], [0.0], [1.0]])
 PINNED = 1e9
 """Weight of a route's first and last point: routes that meet still meet when they are smooth."""
 ATTEMPTS = ((0.8, 1.0), (0.6, 0.5), (0.4, 0.25))
-"""Share of the allowed offset that smoothing uses, and length of the pieces as a share of ``piece_m``: long
+"""Share of the allowed offset that smoothing uses, and length of the pieces as a share of `PIECE_M`: long
 pieces cut the corners of the smoothed line, so that narrow bends need shorter ones."""
 ROUNDS = 40
 WIDENING_M = 10.0
@@ -40,24 +48,6 @@ EVEN_M, QUARTERS = 0.0005, np.arange(4) / 4
 """Largest difference of length and parameter within a piece (m), and where it is measured."""
 CLOSED = 1e-10
 """Relative error of the distances between points."""
-
-
-class Options(base.Options):
-    """Smoothing and spacing of reference lines."""
-
-    increment_m: float = Field(0.5, ge=0.1, le=10, description="distance of points, a multiple of 1 mm (m)")
-    max_offset_m: float = Field(0.25, gt=0, le=5, description="largest distance from the centre lines (m)")
-    smooth_m: float = Field(30.0, gt=0, le=500, description="shorter waves of a line are smoothed away (m)")
-    piece_m: float = Field(4.0, ge=1, le=50, description="length of a cubic piece (m)")
-    min_length_m: float = Field(10.0, ge=10, description="shortest road (m)")
-
-    @field_validator("increment_m")
-    @classmethod
-    def _whole_mm(cls, increment_m: float) -> float:
-        # OpenCRG's consistency check wants it.
-        if not math.isclose(increment_m * 1000, round(increment_m * 1000), rel_tol=1e-9):
-            raise ValueError(f"increment_m {increment_m:g} is not a multiple of 0.001")
-        return increment_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,19 +133,19 @@ class ReferenceLine:
         return replace(self, s=self.s[here] - self.s[first], **cut)
 
 
-def reference_line(route: Route, options: Options) -> ReferenceLine | None:
-    """Return the reference line of a route, or None if the route is shorter than ``min_length_m``."""
+def reference_line(route: Route) -> ReferenceLine | None:
+    """Return the reference line of a route, or None if the route is shorter than `MIN_LENGTH_M`."""
     points = route.points
-    if _along(points)[-1] < options.min_length_m:
+    if _along(points)[-1] < MIN_LENGTH_M:
         return None
     for share, shorter in ATTEMPTS:
-        curve = _curve(_smoothed(points, options, share * options.max_offset_m), shorter * options.piece_m)
-        parameter = _equally_spaced(curve, options.increment_m)
+        curve = _curve(_smoothed(points, share * MAX_OFFSET_M), shorter * PIECE_M)
+        parameter = _equally_spaced(curve, INCREMENT_M)
         x, y = curve(parameter).T
         offset_m = float(shapely.distance(shapely.LineString(points), shapely.points(x, y)).max())
-        if offset_m <= options.max_offset_m:
+        if offset_m <= MAX_OFFSET_M:
             break
-    if len(parameter) - 1 < options.min_length_m / options.increment_m:
+    if len(parameter) - 1 < MIN_LENGTH_M / INCREMENT_M:
         return None
     by_x, by_y = curve(parameter, 1).T
     first = route.parts[0]
@@ -164,8 +154,8 @@ def reference_line(route: Route, options: Options) -> ReferenceLine | None:
         y=y,
         heading=np.unwrap(np.arctan2(by_y, by_x)),
         s=_lengths(curve, parameter),
-        increment=options.increment_m,
-        width=_widths(route, x, y, options.increment_m),
+        increment=INCREMENT_M,
+        width=_widths(route, x, y),
         parameter=parameter,
         curve=curve,
         offset_m=offset_m,
@@ -175,23 +165,27 @@ def reference_line(route: Route, options: Options) -> ReferenceLine | None:
     )
 
 
-def usable(line: ReferenceLine, known: Floats, options: Options) -> list[ReferenceLine]:
-    """Return the parts of a line that can be a road, without those shorter than ``min_length_m``.
+def usable(line: ReferenceLine, known: Floats) -> list[ReferenceLine]:
+    """Return the parts of a line that can be a road, without those shorter than `MIN_LENGTH_M`.
 
     A road ends where the surface ends, and before a bend with a radius of less than half its width: there its
     cross-sections would meet.
 
     - `known` ``(n,)``: heights at its points, NaN beyond the surface.
     """
-    return parts(line, np.isfinite(known) & (np.abs(line.curvature) * line.width / 2 < FOLD), options)
+    return parts(line, np.isfinite(known) & (np.abs(line.curvature) * line.width / 2 < FOLD))
 
 
-def parts(line: ReferenceLine, inside: Bools, options: Options) -> list[ReferenceLine]:
+def parts(line: ReferenceLine, inside: Bools) -> list[ReferenceLine]:
     """Return the parts of a line of which all points are ``inside``, without those that are too short."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
-    spans = edges.reshape(-1, 2) - (0, 1)
-    least = options.min_length_m / options.increment_m
-    return [line.part(int(a), int(b)) for a, b in spans if b - a >= least]
+    least = MIN_LENGTH_M / line.increment
+    return [line.part(start, end - 1) for start, end in stretches(inside) if end - 1 - start >= least]
+
+
+def stretches(places: Bools) -> list[tuple[int, int]]:
+    """Return start and end of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], places, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def _along(points: Floats) -> Floats:
@@ -206,17 +200,17 @@ def _curve(smooth: Floats, piece_m: float) -> scipy.interpolate.PPoly:
     return scipy.interpolate.CubicSpline(along[chosen], smooth[chosen], bc_type="natural")
 
 
-def _smoothed(points: Floats, options: Options, within_m: float) -> Floats:
+def _smoothed(points: Floats, within_m: float) -> Floats:
     """Return a polyline, smooth within a distance, with several points a metre.
 
     The sum of squared distances and of squared second differences is least, so that waves much longer than
-    ``smooth_m`` pass and shorter ones do not. Where the result leaves the allowed distance, weights of the
+    `SMOOTH_M` pass and shorter ones do not. Where the result leaves the allowed distance, weights of the
     points grow until it does not.
     """
     along = _along(points)
     at = np.linspace(0.0, along[-1], round(along[-1] / SAMPLE_M) + 1)
     place = np.stack([np.interp(at, along, points[:, axis]) for axis in (0, 1)], axis=1)
-    penalty = (options.smooth_m / (2 * math.pi * at[1])) ** 4 * _second_differences(len(at))
+    penalty = (SMOOTH_M / (2 * math.pi * at[1])) ** 4 * _second_differences(len(at))
     weights = np.ones(len(at))
     weights[[0, -1]] = PINNED
     for _ in range(ROUNDS):
@@ -261,10 +255,8 @@ def _lengths(curve: scipy.interpolate.PPoly, parameter: Floats) -> Floats:
     return np.asarray(total[np.searchsorted(ends, parameter)])
 
 
-def _widths(route: Route, x: Floats, y: Floats, increment: float) -> Floats:
+def _widths(route: Route, x: Floats, y: Floats) -> Floats:
     """Return the width at points of a route; steps between its parts are spread over some metres."""
     tree = shapely.STRtree([shapely.LineString(part.points) for part in route.parts])
     width = np.array([part.width_m for part in route.parts])[tree.nearest(shapely.points(x, y))]
-    return np.asarray(
-        scipy.ndimage.uniform_filter1d(width, max(1, round(WIDENING_M / increment)), mode="nearest")
-    )
+    return np.asarray(scipy.ndimage.uniform_filter1d(width, round(WIDENING_M / INCREMENT_M), mode="nearest"))

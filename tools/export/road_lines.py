@@ -70,21 +70,14 @@ ACROSS = np.linspace(-0.5, 0.5, 9)
 """Places across the carriageway at which the crossfall is measured, as shares of its width."""
 
 
-@dataclass(frozen=True, eq=False)
-class RoadLine:
-    """One road of ``n`` segments."""
+Road = tuple[ManifestRow, dict[str, NDArray[Any]]]
+"""One road of ``n`` segments: its columns in the layer ``roads``, the first one is its id, and its arrays.
 
-    road: Mapping[str, str | int | float | None]
-    """Its columns in the layer ``roads``; the first one is its id."""
-    points: Floats
-    """``(n + 1, 3)``: easting, northing, height (m)."""
-    segments: Mapping[str, Floats]
-    """Columns of the layer ``segments``, ``(n,)`` each."""
-    height_source: NDArray[np.uint8]
-    """Class of each segment by `HeightSource`, ``(n,)``."""
+These are ``points``, ``(n + 1, 3)``: easting, northing, height (m), and columns of the layer ``segments``.
+"""
 
 
-def write(path: Path, roads: Iterable[RoadLine], crs: str, date: datetime) -> None:
+def write(path: Path, roads: Iterable[Road], crs: str, date: datetime) -> None:
     """Write roads to a new GeoPackage.
 
     The layer ``roads`` has a line per road, ``segments`` a line per metre. Numbers that are not known are
@@ -94,31 +87,30 @@ def write(path: Path, roads: Iterable[RoadLine], crs: str, date: datetime) -> No
     - `crs`: CRS of the points, compound if that of the heights is known.
     - `date`: date of the data (UTC), so that equal roads give equal bytes.
     """
-    batch: list[RoadLine] = []
-    new = True
+    batch, new = list[Road](), True
     with vector_date(date):
         for road in roads:
             batch.append(road)
-            if sum(len(each.height_source) for each in batch) >= BATCH:
+            if sum(len(arrays["height_source"]) for _, arrays in batch) >= BATCH:
                 _append(path, batch, crs, new)
                 batch, new = [], False
         if batch:
             _append(path, batch, crs, new)
 
 
-def _append(path: Path, batch: list[RoadLine], crs: str, new: bool) -> None:
-    lines = shapely.linestrings(
-        np.concatenate([road.points for road in batch]),
-        indices=np.repeat(np.arange(len(batch)), [len(road.points) for road in batch]),
-    )
-    columns = {name: [road.road[name] for road in batch] for name in batch[0].road}
-    _table(path, ROADS, lines, {name: _column(values) for name, values in columns.items()}, crs, new)
-    pairs = np.concatenate([np.stack([road.points[:-1], road.points[1:]], axis=1) for road in batch])
+def _append(path: Path, batch: list[Road], crs: str, new: bool) -> None:
+    arrays = {name: [own[name] for _, own in batch] for name in batch[0][1]}
+    points = arrays.pop("points")
+    sizes = np.array([len(own) for own in points])
+    lines = shapely.linestrings(np.concatenate(points), indices=np.repeat(np.arange(len(batch)), sizes))
+    columns = {name: _column([row[name] for row, _ in batch]) for name in batch[0][0]}
+    _table(path, ROADS, lines, columns, crs, new)
+    pairs = np.concatenate([np.stack([own[:-1], own[1:]], axis=1) for own in points])
     key = next(iter(columns))
-    numbers = {name: np.concatenate([road.segments[name] for road in batch]) for name in batch[0].segments}
-    height_source = np.concatenate([road.height_source for road in batch])
+    height_source = np.concatenate(arrays.pop("height_source"))
     names = np.array([HEIGHT_SOURCE.get(HeightSource(kind)) for kind in range(len(HeightSource))], object)
-    owner = np.repeat(_column(columns[key]), [len(road.height_source) for road in batch])
+    numbers = {name: np.concatenate(values) for name, values in arrays.items()}
+    owner = np.repeat(columns[key], sizes - 1)
     values = {f"road_{key}": owner, **numbers, "height_source": names[height_source]}
     _table(path, SEGMENTS, shapely.linestrings(pairs), values, crs, new)
 
@@ -189,7 +181,7 @@ def lines_output(unit: RouteUnit, work: Work) -> TileOutput:
     height, step = unit.height(work), unit.height(work, steps=True)
     line, problem = reference_line(unit)
     known = np.empty(0) if line is None else height(line.x, line.y)
-    parts = [] if line is None else lines.parts(line, np.isfinite(known), lines.Options())
+    parts = [] if line is None else lines.parts(line, np.isfinite(known))
     rows, arrays = list[ManifestRow](), dict[str, Any]()
     for number, part in enumerate(parts):
         along = stations(part, height)
@@ -259,18 +251,15 @@ def _arrays(along: Stations, unit: RouteUnit, work: Work) -> dict[str, Any]:
     }
 
 
-def _of_route(folder: Location, row: ManifestRow) -> Iterator[RoadLine]:
+def _of_route(folder: Location, row: ManifestRow) -> Iterator[Road]:
     """Yield the roads of a route from its arrays."""
     if not row["roads"]:
         return
     with np.load(io.BytesIO(read(folder / _file(row["route"])))) as arrays:
         for number, road in enumerate(row["roads"]):
             prefix = f"{number}."
-            own = {
-                name.removeprefix(prefix): arrays[name] for name in arrays.files if name.startswith(prefix)
-            }
-            points, height_source = own.pop("points"), own.pop("height_source")
-            yield RoadLine(road, points, own, height_source)
+            own = [name for name in arrays.files if name.startswith(prefix)]
+            yield road, {name.removeprefix(prefix): arrays[name] for name in own}
 
 
 @dataclass(frozen=True, eq=False)

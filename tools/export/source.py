@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,16 +11,15 @@ import numpy as np
 from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.area import Area
 from flexroad.catalog.guard.source_files import source_stat
-from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import (
     COMPUTED_AGAIN,
-    FileStates,
     FinishedTile,
     RunPlace,
     Snapshot,
+    file_states,
     snapshots,
 )
 from flexroad.pipeline.run.record import Run
@@ -31,10 +29,7 @@ from flexroad.pipeline.worker.exports import tile_texture
 from flexroad.tasks.io.dsm_and_dtm import vertical_crs
 from flexroad.tasks.metrics.evaluate import FIGURES
 from flexroad.tasks.products.glb import Texture
-from flexroad.tools.export.aerial import Aerial
 from flexroad.tools.export.georeference import Datum, Georeference
-
-Image = lazy("PIL.Image")
 
 
 @dataclass(frozen=True)
@@ -44,46 +39,23 @@ class Options:
     datum: Datum | None = None
     """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
     compress: bool = option(False, OUTPUTS, "Compress LandXML.", name="gzip")
-    """Whether text formats of the complete run are compressed with gzip."""
     resolution_m: float | None = option(
         None, OUTPUTS, "Cell size of mosaic; default: that of the run.", "METRES", min=0.01
     )
-    """Cell size of rasters over the run (m)."""
     level: int | None = option(
         None, OUTPUTS, "Level of mosaic: 0 is the ground, also below decks; default: the highest.", "N"
     )
-    """Level of roads above roads."""
     drape: bool = option(False, OUTPUTS, "Put the orthophoto on the meshes of 3dtiles and obj.")
     """Also if the meshes of the run have none."""
     roads: str | None = option(
         None,
         INPUTS,
-        "Centre lines for crg, xodr and lines; default: the roads of the run's catalog.",
+        "Centre lines for crg, xodr and lines, FILE|layername=NAME for one layer; default: the catalog's.",
         "FILE",
     )
-    roads_layer: str | None = option(None, INPUTS, "Layer of --roads, if it has several.", "NAME")
     left_hand: bool = option(False, INPUTS, "Traffic keeps left, for xodr.")
     formats: frozenset[str] = frozenset()
     """Names of the formats that are written together: some refer to files of other formats."""
-
-
-@dataclass(frozen=True, eq=False)
-class TileItem:
-    """A finished tile whose files are made of more than its mesh, such as its photo; sent to a worker."""
-
-    tile: FinishedTile
-    fingerprint: str
-    """Name of its files by what they are made of."""
-
-    @property
-    def id(self) -> str:
-        """Id of the tile."""
-        return self.tile.id
-
-    @property
-    def label(self) -> str:
-        """Its name in messages."""
-        return self.tile.label
 
 
 def layer_state(tile: Tile, name: str) -> str:
@@ -117,11 +89,6 @@ class Source:
         return vertical_crs(self.tiles[0])
 
     @property
-    def origin(self) -> tuple[float, float]:
-        """Whole-metre easting and northing that meshes of the run are relative to."""
-        return self.run.origin
-
-    @property
     def mesh_distances(self) -> dict[str, float]:
         """The largest distances of the meshes from their surfaces (m), by column of metrics.parquet."""
         known = np.fmax.reduce([snapshot.distances for snapshot in self.snapshots])
@@ -132,16 +99,16 @@ class Source:
     @property
     def place(self) -> Georeference:
         """What local coordinates of files are relative to: the run's origin, at the height 0."""
-        return Georeference(self.crs, (*self.origin, 0.0), self.vertical)
+        return Georeference(self.crs, (*self.run.origin, 0.0), self.vertical)
 
     def finished(self) -> Iterator[FinishedTile]:
         """Yield the tiles one by one, as they were when they were selected.
 
         Only sizes and times of their files are compared, so that each format can have a pass of its own.
         """
-        files, place = FileStates(self.run), RunPlace.of(self.run)
+        state, place = file_states(self.run), RunPlace.of(self.run)
         for tile, before in zip(self.tiles, self.snapshots, strict=True):
-            current = before if files(tile) == before.files else self._checked(tile, before)
+            current = before if state(tile) == before.files else self._checked(tile, before)
             yield FinishedTile(tile, self.variant, current, place)
 
     def _checked(self, tile: Tile, before: Snapshot) -> Snapshot:
@@ -161,7 +128,6 @@ def select(
     location: Location,
     ids: Sequence[str] = (),
     bbox: Bounds | None = None,
-    variant: str | None = None,
     allow: Sequence[str] = (),
     area: Area | None = None,
     track: Track = untracked,
@@ -173,10 +139,7 @@ def select(
     - `track`: shows the progress of that.
     """
     run = Run.open(location, allow)
-    variants = run.config.export.variants
-    variant = variant or variants[0]
-    if variant not in variants:
-        raise ConfigError(f"{location} exports no variant {variant!r}; it has {', '.join(variants)}")
+    variant = run.config.export.variants[0]
     wanted = run.catalog.select(ids, bbox, area).tiles
     checked = track(snapshots(run, wanted, variant), "checking tiles", len(wanted))
     done = {tile.id: snapshot for tile, snapshot in checked if snapshot}
@@ -198,16 +161,3 @@ def texture_of(tile: FinishedTile) -> Texture | None:
         return tile_texture(with_photo.graph(tile.tile, tile.place.checksum))[0]
     except SourceChanged as error:
         raise ConfigError(f"{error.file} {error}") from error
-
-
-def aerial_of(texture: Texture, pixel_m: float) -> Aerial:
-    """Return a texture as pixels: means of its own, of which at least two fit into ``pixel_m`` (m)."""
-    west, south, east, north = texture.bounds
-    image = Image.open(io.BytesIO(texture.jpeg))
-    dx, dy = (east - west) / image.width, (north - south) / image.height
-    # Large photos would take a gigabyte as numbers.
-    factor = max(1, int(pixel_m / max(dx, dy) / 2))
-    colour = np.asarray(image.reduce(factor), np.float64)
-    rows, columns = colour.shape[:2]
-    bounds = west, north - rows * factor * dy, west + columns * factor * dx, north
-    return Aerial(bounds, colour, np.ones((rows, columns)))

@@ -18,7 +18,7 @@ from flexroad.catalog.grid import Bounds, overlap
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.surface import ExactNurbs, NurbsSurface, domain, exact
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Floats, RoadMask
 from flexroad.tools.export.georeference import Georeference
 
 VERSION = 3
@@ -250,6 +250,27 @@ def cut(surface: NurbsSurface, bounds: Bounds) -> NurbsSurface:
         A=along_v @ surface.A @ along_u.T,
         W=along_v @ surface.W @ along_u.T,
     )
+
+
+def covered(road: RoadMask) -> tuple[Bounds, float]:
+    """Return the smallest rectangle around all covered cells of a tile, and what of it is beyond the survey.
+
+    - `bounds`: west, south, east and north (m); those of the core if none of its cells is covered.
+    - `beyond_m2`: area within the bounds that is beyond the survey (m2).
+    """
+    core, inside = road.core, ~road.outside[road.grid.window(road.core)]
+    if inside.all() or not inside.any():
+        return core.bounds, float((~inside).sum() * core.cell**2)
+    rows, cols = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+    top, bottom, left, right = rows[0], rows[-1] + 1, cols[0], cols[-1] + 1
+    west, north = core.bounds[0], core.bounds[3]
+    bounds = (
+        float(west + left * core.cell),
+        float(north - bottom * core.cell),
+        float(west + right * core.cell),
+        float(north - top * core.cell),
+    )
+    return bounds, float((~inside[top:bottom, left:right]).sum() * core.cell**2)
 
 
 def patch(surface: NurbsSurface, bounds: Bounds, origin: tuple[float, float]) -> tuple[ExactNurbs, bool]:

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -45,9 +46,9 @@ ManifestRow = dict[str, Any]
 """What the files of the complete run need of a tile, as JSON values."""
 
 
-def steps_left_out(steps_m: float | None) -> str:
+def steps_left_out(steps_m: float) -> str:
     """Return the end of a line for the user about the largest step (m); empty if it is too small."""
-    if steps_m is None or steps_m < STEPS_SHOWN_M:
+    if steps_m < STEPS_SHOWN_M:
         return ""
     return f"; with kerbs and walls it differs by up to {steps_m:.2f} m, where the run has no road"
 
@@ -67,17 +68,14 @@ class Item(Protocol):
     @property
     def id(self) -> str:
         """Id of the tile, area or road; unique within an export."""
-        ...
 
     @property
     def fingerprint(self) -> str:
         """Name of the content by what it is made of."""
-        ...
 
     @property
     def label(self) -> str:
         """Its name in messages."""
-        ...
 
 
 Encode = Callable[[Any, Any], TileOutput]
@@ -145,12 +143,14 @@ def write_outputs(
     options: Any,
     executor: Executor,
     group: str = "",
+    made_of: Callable[[Any], str] = attrgetter("fingerprint"),
 ) -> Iterator[ManifestRow]:
     """Write the files of each tile that does not have them, and yield the row of each, in any order.
 
     Files of tiles of an earlier export that are not among the given ones are removed at the end.
 
     - `group`: name of what the items have in common, if a format has several kinds of them.
+    - `made_of`: returns the name of an item's content, where it depends on more than its fingerprint.
     """
     unchanged: list[ManifestRow] = []
     kept: set[str] = set()
@@ -160,7 +160,7 @@ def write_outputs(
             marker = _marker(folder, group, tile.id)
             kept.add(marker.name)
             former = _Mark.read(marker)
-            key = sha256(f"{tile.fingerprint} {version} {options}".encode()).hexdigest()
+            key = sha256(f"{made_of(tile)} {version} {options}".encode()).hexdigest()
             if former and former.holds(folder, key):
                 unchanged.append(former.row)
             else:
@@ -185,7 +185,7 @@ def figures(rows: Iterable[ManifestRow]) -> dict[str, Any]:
         for name in (name for name in LARGEST if name in row):
             largest[name] = max(row[name], largest.get(name, row[name]))
         notes.update([row["note"]] if row.get("note") else [])
-    left_out = steps_left_out(largest.get("steps_max_m"))
+    left_out = steps_left_out(largest.get("steps_max_m", 0.0))
     summary = {"summary": f"of {SMOOTH}{left_out}"} if left_out else {}
     said = [f"{count(number, 'tile')}: {note}" for note, number in sorted(notes.items())]
     return largest | summary | {"notes": said}

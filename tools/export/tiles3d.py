@@ -16,7 +16,7 @@ import numpy as np
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.types import Floats
-from flexroad.tools.export.georeference import Ellipsoidal, geocentric
+from flexroad.tools.export.georeference import Datum, Georeference, geocentric
 
 VERSION = 3
 ASSET = {"version": "1.1", "generator": "FlexRoad"}
@@ -32,8 +32,8 @@ def placed(
     uri: str,
     bounds: Bounds,
     heights: tuple[float, float],
-    origin: tuple[float, float],
-    conversion: Ellipsoidal,
+    place: Georeference,
+    datum: Datum,
 ) -> dict[str, Any]:
     """Return where a tile's mesh is on the Earth: entries of its row.
 
@@ -42,16 +42,15 @@ def placed(
     highest height above the ellipsoid (m).
 
     - `heights`: lowest and highest height of the mesh (m).
-    - `origin`: easting and northing of the run's origin (m), which the coordinates of its GLB files are
-      relative to.
+    - `place`: what the coordinates of the run's GLB files are relative to.
     """
     west, south, east, north = bounds
     low, high = heights[0] - MARGIN_M, heights[1] + MARGIN_M
     axes = np.meshgrid(np.linspace(west, east, 5), np.linspace(south, north, 5), [low, high])
     points = np.stack([axis.ravel() for axis in axes], axis=1)
-    longitude, latitude, height = conversion.geographic(*points.T)
+    longitude, latitude, height = datum.geographic(place.crs, *points.T)
     exact = geocentric(longitude, latitude, height)
-    local = points - (*origin, 0.0)
+    local = points - place.origin
     # Centred, so that the squares of large coordinates do not cost digits.
     middle, centre = local.mean(axis=0), exact.mean(axis=0)
     linear = np.linalg.lstsq(local - middle, exact - centre, rcond=None)[0].T
@@ -61,13 +60,13 @@ def placed(
     return {"uri": uri, "transform": _columns(matrix), "region": _region(longitude, latitude, height)}
 
 
-def sheet_placed(uri: str, points: Floats, conversion: Ellipsoidal) -> tuple[dict[str, Any], Floats]:
+def sheet_placed(uri: str, points: Floats, crs: str, datum: Datum) -> tuple[dict[str, Any], Floats]:
     """Return where a mesh is whose points are all converted, and its points in the frame of its tile.
 
     - result: its transform is from east, north and up at the middle of the points.
     - result ``(V, 3)``: the points in that frame (m): small numbers, which float32 holds to 0.2 mm at 4 km.
     """
-    longitude, latitude, height = conversion.geographic(*points.T)
+    longitude, latitude, height = datum.geographic(crs, *points.T)
     middle = [float(axis.min() + axis.max()) / 2 for axis in (longitude, latitude, height)]
     matrix = east_north_up(*middle)
     local = (geocentric(longitude, latitude, height) - matrix[:3, 3]) @ matrix[:3, :3]

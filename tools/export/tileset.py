@@ -20,8 +20,12 @@ from hashlib import sha256
 from typing import Any
 
 import numpy as np
+import scipy
+from numpy.typing import NDArray
 
+from flexroad.catalog.grid import Bounds
 from flexroad.catalog.ids import safe_name
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location, exists, listing, parse_location, read, remove, write
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
@@ -29,16 +33,17 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name
-from flexroad.tasks.meshing import relief
 from flexroad.tasks.meshing.normals import mesh_normals
-from flexroad.tasks.meshing.parts import highest_first
-from flexroad.tasks.meshing.relief import Relief
+from flexroad.tasks.metrics.mesh_distance import at_nodes
 from flexroad.tasks.products import glb
-from flexroad.tools.export import aerial, tiles3d
-from flexroad.tools.export.aerial import Aerial
-from flexroad.tools.export.georeference import Datum, Ellipsoidal
-from flexroad.tools.export.source import Options, Source, TileItem, aerial_of, layer_state, texture_of
+from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.export import relief, tiles3d
+from flexroad.tools.export.georeference import Datum, Georeference
+from flexroad.tools.export.relief import Relief
+from flexroad.tools.export.source import Options, Source, layer_state, texture_of
 from flexroad.tools.export.tile_outputs import ManifestRow, TileOutput, write_outputs
+
+Image = lazy("PIL.Image")
 
 RECORDS, MESHES = ".coarse", "coarse"
 """Folders of records, and of GLB files."""
@@ -55,37 +60,15 @@ NAMED = 5
 """Largest number of tiles that a note names."""
 
 
-@dataclass(frozen=True)
-class Level:
-    """How coarse meshes of one size are."""
+TILE_M = 4.0, 2.0
+"""Distance of vertices, and size of pixels, of the records of tiles, which are parts of coarse meshes."""
+LEVELS_M = ((1000.0, 16.0, 2.0), (2000.0, 32.0, 4.0), (4000.0, 64.0, 8.0))
+"""Side of the areas, distance of vertices, size of pixels of coarse meshes; each side is twice the last."""
+SAMPLES = 4
+"""Places a pixel of `of_classes` is the mean of, from west to east and from north to south."""
 
-    side_m: float
-    """Side of their areas (m)."""
-    spacing_m: float
-    """Distance of vertices (m)."""
-    pixel_m: float
-    """Size of pixels of the image (m)."""
-
-
-TILE = Level(0.0, 4.0, 2.0)
-"""Records of tiles; they are shown only as parts of coarser ones."""
-LEVELS = (Level(1000.0, 16.0, 2.0), Level(2000.0, 32.0, 4.0), Level(4000.0, 64.0, 8.0))
-"""From fine to coarse; each side is twice the one before."""
-
-
-@dataclass(frozen=True)
-class Place:
-    """What the place of a tile's mesh is computed of."""
-
-    run: str
-    crs: str
-    origin: tuple[float, float]
-    datum: Datum
-
-    @property
-    def conversion(self) -> Ellipsoidal:
-        """From the CRS and the heights of the run to WGS 84."""
-        return Ellipsoidal(self.crs, self.datum)
+Place = tuple[Georeference, Datum]
+"""What the coordinates of the run are relative to, and how its heights become those above the ellipsoid."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +76,8 @@ class Branch:
     """A coarse mesh to be written; sent to a worker."""
 
     id: str
-    level: Level
+    level: int
+    """Index in `LEVELS_M`."""
     cell: tuple[int, int]
     """Column and row of its area, in sides of the finest level."""
     parts: tuple[ManifestRow, ...]
@@ -109,7 +93,7 @@ class Branch:
     def fingerprint(self) -> str:
         """Name of the mesh by what it is made of."""
         made_of = [(row["record"], row["digest"], row["error_m"], row["photo"]) for row in self.parts]
-        return sha256(f"{self.level} {made_of}".encode()).hexdigest()
+        return sha256(f"{LEVELS_M[self.level]} {made_of}".encode()).hexdigest()
 
 
 def record(name: str, ground: Relief, image: Aerial) -> tuple[dict[str, bytes], ManifestRow]:
@@ -130,17 +114,18 @@ def record(name: str, ground: Relief, image: Aerial) -> tuple[dict[str, bytes], 
 
 def branch_output(branch: Branch, place: Place) -> TileOutput:
     """Return the GLB file of a coarse mesh, its record, and its row."""
-    folder, level = parse_location(branch.folder), branch.level
-    parts = [_read(folder, row) for row in branch.parts]
-    ground = relief.joined([part for part, _ in parts], level.spacing_m)
-    image = aerial.joined([part for _, part in parts], ground.bounds, level.pixel_m)
+    folder, (_, spacing_m, pixel_m) = parse_location(branch.folder), LEVELS_M[branch.level]
+    grounds, images = zip(*(_read(folder, row) for row in branch.parts), strict=True)
+    ground = relief.joined(grounds, spacing_m)
+    image = joined(images, ground.bounds, pixel_m)
     # Neighbours of the same level differ by less than twice the error.
-    sheet = relief.sheet(ground, max(2 * ground.error_m, level.pixel_m))
+    sheet = relief.sheet(ground, max(2 * ground.error_m, pixel_m))
     uri = f"{MESHES}/{branch.id.removeprefix(PREFIX)}{glb.NAME}"
-    placed, local = tiles3d.sheet_placed(uri, sheet.points, place.conversion)
+    (georeference, datum), points = place, sheet.points
+    placed, local = tiles3d.sheet_placed(uri, points, georeference.crs, datum)
     photo = any(row["photo"] for row in branch.parts)
-    data = glb.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY), photo)
-    error_m = max(ground.error_m, SHARP * level.pixel_m, *(row["error_m"] for row in branch.parts))
+    data = relief.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY), photo)
+    error_m = max(ground.error_m, SHARP * pixel_m, *(row["error_m"] for row in branch.parts))
     files, referred = record(branch.id, ground, image)
     row = row_of(branch.id, branch.cell, placed, error_m, photo) | {"vertical_m": ground.error_m}
     return TileOutput({uri: data, **files}, row | referred)
@@ -193,15 +178,15 @@ def write_tilesets(
     Returns the entry ``notes`` of the manifest: tiles without the orthophoto that was wanted.
     """
     assert options.datum is not None  # the command checks it
-    place = Place(str(source.run.path), source.crs, source.origin, options.datum)
-    leaves = (_leaf(tile, options.drape) for tile in tiles)
-    encode = partial(leaf_output, drape=options.drape)
-    nodes = [Node(row) for row in write_outputs(leaves, folder, VERSION, encode, place, executor)]
+    place = source.place, options.datum
+    encode, made_of = partial(leaf_output, drape=options.drape), partial(_made_of, drape=options.drape)
+    rows = write_outputs(tiles, folder, VERSION, encode, place, executor, made_of=made_of)
+    nodes = [Node(row) for row in rows]
     nodes.sort(key=lambda node: str(node.row["id"]))
     bare = [node.row["id"] for node in nodes if node.row["bare"]]
     children, written = [], set[str]()
     for block in blocks(nodes, folder, place, executor):
-        column, line = _cell(block, len(LEVELS) - 1)
+        column, line = _cell(block, len(LEVELS_M) - 1)
         name, entry = f"blocks/{column}_{line}.json", block.entry()
         volume = entry["boundingVolume"]
         write(folder / name, _encoded(tiles3d.tileset(entry, tiles3d.extent_m(volume["region"]))))
@@ -223,7 +208,7 @@ def write_tilesets(
 def blocks(nodes: Sequence[Node], folder: Location, place: Place, executor: Executor) -> list[Node]:
     """Write the coarse meshes above tiles; return the coarsest, one per area of the last level."""
     raised = list(nodes)
-    for number in range(len(LEVELS)):
+    for number in range(len(LEVELS_M)):
         raised = _raised(raised, number, folder, place, executor)
     return raised
 
@@ -242,13 +227,13 @@ def _raised(
     below: dict[str, tuple[Node, ...]] = {}
     branches: list[Branch] = []
     for cell, parts in sorted(areas.items()):
-        if len(parts) == 1 and (parts[0].children or number + 1 < len(LEVELS)):
+        if len(parts) == 1 and (parts[0].children or number + 1 < len(LEVELS_M)):
             raised += parts
             continue
-        name = f"{PREFIX}{LEVELS[number].side_m:.0f}_{cell[0]}_{cell[1]}"
+        name = f"{PREFIX}{LEVELS_M[number][0]:.0f}_{cell[0]}_{cell[1]}"
         below[name] = tuple(parts)
         rows = tuple(part.row for part in parts)
-        branches.append(Branch(name, LEVELS[number], parts[0].row["cell"], rows, str(folder)))
+        branches.append(Branch(name, number, parts[0].row["cell"], rows, str(folder)))
     for row in write_outputs(branches, folder, VERSION, branch_output, place, executor, f"level{number}"):
         raised.append(Node(row, below[row["id"]]))
     return sorted(raised, key=lambda node: _cell(node, number))
@@ -260,10 +245,10 @@ def _cell(node: Node, number: int) -> tuple[int, int]:
     return column >> number, line >> number
 
 
-def _leaf(tile: FinishedTile, drape: bool) -> TileItem:
+def _made_of(tile: FinishedTile, drape: bool) -> str:
     own, photo = _choice(tile, drape)
     state = layer_state(tile.tile, "dop") if photo else ""
-    return TileItem(tile, f"{tile.fingerprint} {tile.snapshot.fingerprint} {own} {state}")
+    return f"{tile.fingerprint} {tile.snapshot.fingerprint} {own} {state}"
 
 
 def _choice(tile: FinishedTile, drape: bool) -> tuple[bool, bool]:
@@ -272,44 +257,143 @@ def _choice(tile: FinishedTile, drape: bool) -> tuple[bool, bool]:
     return textured or not drape, textured or drape
 
 
-def leaf_output(leaf: TileItem, place: Place, drape: bool) -> TileOutput:
+def leaf_output(tile: FinishedTile, place: Place, drape: bool) -> TileOutput:
     """Return the GLB file of a tile, a record for coarse meshes, and its row.
 
     With ``drape`` its mesh has the orthophoto, even if that of the run has none.
     """
-    tile = leaf.tile
     own, draped = _choice(tile, drape)
     mesh, grid, texture = tile.mesh, tile.tile.grid, texture_of(tile) if draped else None
     points = mesh.vertices + mesh.origin
     heights = float(points[:, 2].min()), float(points[:, 2].max())
     name = safe_name(tile.id)
     uri = f"tiles/{name}{glb.NAME}"
-    placed = tiles3d.placed(uri, grid.bounds, heights, place.origin, place.conversion)
-    pixel_m = TILE.pixel_m
-    ground = relief.of_mesh(points, highest_first(mesh), TILE.spacing_m)
+    placed = tiles3d.placed(uri, grid.bounds, heights, *place)
+    spacing_m, pixel_m = TILE_M
+    ground = relief.of_mesh(points, relief.highest_first(mesh), spacing_m)
     colours = glb.ROAD_SRGB, glb.TERRAIN_SRGB
-    image = aerial.of_classes(points, mesh.faces, mesh.road, colours, ground.bounds, pixel_m)
+    image = of_classes(points, mesh.faces, mesh.road, colours, ground.bounds, pixel_m)
     if texture:
-        photo = aerial.joined([aerial_of(texture, pixel_m)], ground.bounds, pixel_m)
+        photo = joined([aerial_of(texture, pixel_m)], ground.bounds, pixel_m)
         image = replace(photo, share=image.share)
     files, referred = record(name, ground, image)
-    side = LEVELS[0].side_m
+    side = LEVELS_M[0][0]
     west, south, east, north = grid.bounds
     cell = math.floor((west + east) / 2 / side), math.floor((south + north) / 2 / side)
     row = row_of(tile.id, cell, placed, 0.0, bool(texture)) | {"bare": draped and not texture}
-    return TileOutput({uri: _glb(tile, own, place, texture), **files}, row | referred)
+    return TileOutput({uri: _glb(tile, own, place[0].origin, texture), **files}, row | referred)
 
 
-def _glb(tile: FinishedTile, own: bool, place: Place, texture: glb.Texture | None) -> bytes:
+def _glb(
+    tile: FinishedTile, own: bool, origin: tuple[float, float, float], texture: glb.Texture | None
+) -> bytes:
     """Return the GLB file of the run, or a new one if the run has none that fits."""
-    file = TileProducts.of(parse_location(place.run), tile.id).file(file_name(tile.id, tile.variant, GLB))
+    folder = TileProducts.of(parse_location(tile.place.path), tile.id)
+    file = folder.file(file_name(tile.id, tile.variant, GLB))
     if (own or not texture) and exists(file):
         data = read(file)
         tile.check_unchanged()
         return data
     normals = mesh_normals(tile.mesh, tile.surface)
-    return glb.encode(tile.mesh, (*place.origin, 0.0), texture, normals, tile.id)
+    return glb.encode(tile.mesh, origin, texture, normals, tile.id)
 
 
 def _encoded(content: dict[str, Any]) -> bytes:
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+
+
+@dataclass(frozen=True, eq=False)
+class Aerial:
+    """An image of the ground, row 0 in the north."""
+
+    bounds: Bounds
+    """West, south, east and north of its outer edges (m)."""
+    colour: Floats
+    """Red, green and blue, 0 to 255, ``(h, w, 3)``."""
+    share: Floats
+    """Share of each pixel that is known, 0 to 1, ``(h, w)``; the colour of one of 0 has no meaning."""
+
+    def complete(self) -> NDArray[np.uint8]:
+        """Return the colours, ``(h, w, 3)``; an unknown pixel has that of the nearest known one."""
+        row, column = scipy.ndimage.distance_transform_edt(
+            self.share == 0, return_distances=False, return_indices=True
+        )
+        return np.asarray(np.rint(self.colour[row, column]), np.uint8)
+
+
+def of_classes(
+    points: Floats,
+    faces: NDArray[np.int32],
+    road: Bools,
+    colours: tuple[Sequence[int], Sequence[int]],
+    bounds: Bounds,
+    pixel_m: float,
+) -> Aerial:
+    """Return an image of a mesh with one colour for road and one for terrain.
+
+    - `colours`: red, green and blue of road and of terrain, 0 to 255.
+    - `pixel_m`: largest size of a pixel (m).
+    """
+    rows, columns = shape(bounds, pixel_m)
+    west, south, east, north = bounds
+    fine = rows * SAMPLES, columns * SAMPLES
+    half_x, half_y = (east - west) / fine[1] / 2, (north - south) / fine[0] / 2
+    centres = west + half_x, south + half_y, east - half_x, north - half_y
+    covered, paved = (np.isfinite(at_nodes(points, kept, centres, fine)) for kept in (faces, faces[road]))
+
+    def mean(mask: Bools) -> Floats:
+        return np.asarray(mask.reshape(rows, SAMPLES, columns, SAMPLES).mean(axis=(1, 3)))
+
+    share = mean(covered)
+    part = (mean(paved) / np.where(share > 0, share, 1.0))[..., None]
+    colour = part * np.asarray(colours[0], float) + (1 - part) * np.asarray(colours[1], float)
+    return Aerial(bounds, colour, share)
+
+
+def joined(parts: Sequence[Aerial], bounds: Bounds, pixel_m: float) -> Aerial:
+    """Return one image of several over some bounds; where they overlap, the mean of them."""
+    rows, columns = shape(bounds, pixel_m)
+    west, south, east, north = bounds
+    x, y = np.linspace(west, east, columns + 1), np.linspace(south, north, rows + 1)[::-1]
+    colour, weight = np.zeros((rows, columns, 3)), np.zeros((rows, columns))
+    for part in parts:
+        height, width = part.share.shape
+        across = _common(np.linspace(part.bounds[0], part.bounds[2], width + 1), x)
+        along = _common(-np.linspace(part.bounds[3], part.bounds[1], height + 1), -y)
+        # A part covers few of the pixels.
+        row, column = (np.flatnonzero(lengths.any(axis=1)) for lengths in (along, across))
+        along, across = along[row], across[column].T
+        place = np.ix_(row, column)
+        weight[place] += along @ part.share @ across
+        known = part.share[..., None] * part.colour
+        colour[place] += np.stack([along @ known[..., band] @ across for band in range(3)], axis=-1)
+    area = (east - west) * (north - south) / (rows * columns)
+    colour /= np.where(weight > 0, weight, 1.0)[..., None]
+    return Aerial(bounds, colour, np.minimum(weight / area, 1.0))
+
+
+def shape(bounds: Bounds, pixel_m: float) -> tuple[int, int]:
+    """Return rows and columns of the smallest image with pixels of this size or less (m)."""
+    west, south, east, north = bounds
+    rows, columns = (max(1, int(np.ceil(length / pixel_m - 1e-6))) for length in (north - south, east - west))
+    return rows, columns
+
+
+def _common(parts: Floats, pixels: Floats) -> Floats:
+    """Return the common length of each interval of pixels with each one of parts; ascending edges."""
+    low = np.maximum(pixels[:-1, None], parts[None, :-1])
+    high = np.minimum(pixels[1:, None], parts[None, 1:])
+    return np.asarray(np.maximum(high - low, 0.0))
+
+
+def aerial_of(texture: glb.Texture, pixel_m: float) -> Aerial:
+    """Return a texture as pixels: means of its own, of which at least two fit into ``pixel_m`` (m)."""
+    west, south, east, north = texture.bounds
+    image = Image.open(io.BytesIO(texture.jpeg))
+    dx, dy = (east - west) / image.width, (north - south) / image.height
+    # Large photos would take a gigabyte as numbers.
+    factor = max(1, int(pixel_m / max(dx, dy) / 2))
+    colour = np.asarray(image.reduce(factor), np.float64)
+    rows, columns = colour.shape[:2]
+    bounds = west, north - rows * factor * dy, west + columns * factor * dx, north
+    return Aerial(bounds, colour, np.ones((rows, columns)))

@@ -15,8 +15,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo, end_for_steps
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.points import LARGEST_STEP_M, STEP_REMEDY, length_text
-from flexroad.pipeline.run.sampler import RunSampler
+from flexroad.pipeline.run.sampler import LARGEST_STEP_M, STEP_REMEDY, RunSampler, length_text
 from flexroad.tools.lift.driver import lift as lift_file
 from flexroad.tools.lift.types import Options
 
@@ -26,6 +25,7 @@ app = group()
 @app.command(cls=Command)
 @options.with_options
 def lift(
+    ctx: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Road network or features without heights.")],
     path: options.Run,
     output: Annotated[
@@ -64,7 +64,6 @@ def lift(
         bool,
         typer.Option("--allow-steps", help="End with exit code 0 although the tiles below do not meet."),
     ] = False,
-    allow: options.Allow = None,
 ) -> None:
     """Write a road network or features with heights of a run.
 
@@ -77,7 +76,7 @@ def lift(
     if report is None and (grade, crossfall) != (None, None):
         raise ConfigError("places above limits are written beside the report; give --report FILE.csv")
     wanted = replace(wanted, grade_limit=grade, crossfall_limit=crossfall)
-    ground = RunSampler.open(path, allow=allow or (), earlier=True)
+    ground = RunSampler.open(path, allow=options.allowed(ctx), earlier=True)
     result = lift_file(ground, file, output, wanted, crs, offset, report)
     echo(f"{output}: {result.summary}")
     if result.earlier:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -14,18 +12,20 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 import shapely
 
+from flexroad.catalog.guard.open_vector import GEOPACKAGES, SQLITE
 from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, InputRejected, head
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import made_folder, output_file
 from flexroad.catalog.storage.paths import write
 from flexroad.catalog.storage.scratch import ScratchFolder
-from flexroad.catalog.text import count, no_formula
+from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import passing
-from flexroad.pipeline.run.points import length_text
-from flexroad.pipeline.run.sampler import RunSampler, required_crs
+from flexroad.pipeline.run.sampler import RunSampler, length_text
+from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import flag_names
 from flexroad.tools.lift import flatgeobuf, geojson, geopackage, opendrive, osm, shapefile, sumo, xml_text
@@ -41,7 +41,7 @@ XML_FORMATS: dict[str, ModuleType] = {"OpenDRIVE": opendrive, "net": sumo, "osm"
 NOUNS: dict[ModuleType, str] = {opendrive: "road", sumo: "edge", osm: "way"}
 """What a row of the report is; of other formats, a feature."""
 VECTORS: tuple[ModuleType, ...] = (geopackage, geojson, flatgeobuf, shapefile)
-"""Formats of features. Their heights have the steps beside roads, ``begins`` tells one by its first bytes."""
+"""Formats of features. Their heights have the steps beside roads."""
 KINDS = (
     "OpenDRIVE (.xodr), a network of SUMO (.net.xml), OSM (.osm), a GeoPackage, GeoJSON, FlatGeobuf or "
     "Shapefile"
@@ -62,8 +62,6 @@ class LiftedFile:
     """What became of a file."""
 
     rows: tuple[Lifted, ...]
-    files: tuple[Path, ...]
-    """The files written."""
     earlier: int
     """Number of tiles whose heights are of earlier sources or options."""
     noun: str
@@ -164,26 +162,24 @@ def lift(
             place = Frame(place.crs, *offset)
         if place.crs is None:
             raise TaskError("carries no CRS; give it with --crs, such as --crs EPSG:25832")
-        in_run = RunSurface(
-            ground, plan_crs(place.crs), place, required_crs(ground), module in VECTORS, crs is not None
-        )
+        in_run = RunSurface(ground, plan_crs(place.crs), place, module in VECTORS, crs is not None)
         with made_folder(out.absolute().parent), ScratchFolder(out.absolute().parent) as scratch:
             with _named(out, Path(scratch)):
                 rows = tuple(module.lift(source, Path(scratch, out.name), in_run, options))
             in_run.require_heights()
-            files = _move(Path(scratch), out)
-            _remove_parts(out, files)
+            _move(Path(scratch), out)
     except (TaskError, InputRejected) as error:
         raise ConfigError(f"{source} {error}") from error
     if report is not None:
-        files += _write_report(rows, report, in_run)
+        _write_report(rows, report, in_run)
     seen = in_run.seen
-    return LiftedFile(rows, files, len(seen.earlier), NOUNS.get(module, "feature"), options, seen.tile_step_m)
+    return LiftedFile(rows, len(seen.earlier), NOUNS.get(module, "feature"), options, seen.tile_step_m)
 
 
 def _format(source: Path) -> ModuleType:
     """Return the module of a file's format, told by its first bytes."""
-    first = head(source).removeprefix(b"\xef\xbb\xbf").lstrip()
+    data = head(source)
+    first = data.removeprefix(b"\xef\xbb\xbf").lstrip()
     if first[:1] == b"<" or first[:2] == b"\x1f\x8b":
         name = xml_text.root_name(source)
         if name in XML_FORMATS:
@@ -191,11 +187,16 @@ def _format(source: Path) -> ModuleType:
         if name == "osmChange":
             raise TaskError("is a list of changes (osmChange); give the complete file (.osm)")
         raise TaskError(f"has the root element {name or 'none'}; give {KINDS}")
-    for module in VECTORS:
-        if module.begins(head(source)):
-            return module
+    if data.startswith(SQLITE) and data[68:72] in GEOPACKAGES:
+        return geopackage
+    if first[:1] == b"{":
+        return geojson
+    if data.startswith(b"fgb\x03"):
+        return flatgeobuf
+    if data.startswith(b"\0\0\x27\x0a"):
+        return shapefile
     for begin, said in PACKED.items():
-        if begin in head(source)[:64]:
+        if begin in data[:64]:
             raise TaskError(f"{said.format(file=shlex.quote(str(source)))}")
     raise TaskError(
         f"is of no known format; give {KINDS}; convert others, such as DXF, with ogr2ogr NEW.gpkg FILE"
@@ -245,37 +246,30 @@ def _named(out: Path, scratch: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror or str(error), str(out)) from error
 
 
-def _move(scratch: Path, out: Path) -> tuple[Path, ...]:
-    """Move the files that a format has written into their places; the one that was asked for is the last."""
+def _move(scratch: Path, out: Path) -> None:
+    """Move the files that a format has written into their places; the one that was asked for is the last.
+
+    Parts of a Shapefile that has been replaced are removed if the new one has none: old indices.
+    """
     made = sorted(path for path in scratch.iterdir() if path.is_file() and not path.name.startswith("."))
     made.sort(key=lambda path: path.name == out.name)
-    files = list[Path]()
     for path in made:
-        target = out.parent / path.name
-        path.replace(output_file(target))
-        files.append(target)
-    return tuple(files)
-
-
-def _remove_parts(out: Path, files: Sequence[Path]) -> None:
-    """Remove the parts of a Shapefile that has been replaced, of which the new one has none: old indices."""
+        path.replace(output_file(out.parent / path.name))
     if out.suffix.lower() == shapefile.SUFFIXES[0]:
+        names = {path.name for path in made}
         for end in SHAPEFILE_PARTS:
             part = out.with_suffix(end)
-            if part not in files and part.is_file():
+            if part.name not in names and part.is_file():
                 part.unlink()
 
 
-def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> tuple[Path, ...]:
-    """Write the table, and the places above limits if there are any; return the files."""
-    text = io.StringIO(newline="")
-    table = csv.DictWriter(text, list(_row(Lifted(""))), lineterminator="\n")
-    table.writeheader()
-    table.writerows({name: no_formula(value) for name, value in _row(row).items()} for row in rows)
-    write(report, text.getvalue().encode())
+def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> None:
+    """Write the table, and the places above limits if there are any."""
+    table = pd.DataFrame(map(_row, rows), columns=list(_row(Lifted(""))), dtype=object)
+    write(report, csv_text(table).encode())
     steep = [(row.id, place) for row in rows for place in row.steep]
     if not steep:
-        return (report,)
+        return
     east, north = in_run.to_run(
         np.array([place.x for _, place in steep]), np.array([place.y for _, place in steep])
     )
@@ -287,11 +281,9 @@ def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> t
     }
     height = np.nan_to_num(found.ground)
     frame = geopandas.GeoDataFrame(columns, geometry=shapely.points(east, north, height), crs=in_run.run_crs)
-    places = report.with_suffix(PLACES)
     with ScratchFolder() as folder:
         frame.to_file(Path(folder, "places.gpkg"), layer="places", driver="GPKG", engine="pyogrio")
-        write(places, Path(folder, "places.gpkg").read_bytes())
-    return report, places
+        write(report.with_suffix(PLACES), Path(folder, "places.gpkg").read_bytes())
 
 
 def _row(row: Lifted) -> dict[str, str | int | float]:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog.guard.open_vector import ERRORS, layer_info, vector_name
 from flexroad.catalog.lazy import lazy
-from flexroad.pipeline.run.points import Heights
+from flexroad.catalog.text import reason
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.compiled import compiled
+from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import Bits, passed
 from flexroad.tasks.roads import attributes
 from flexroad.tasks.types import Bools, Floats
@@ -22,6 +27,7 @@ from flexroad.tools.lift.network import ANY, Numbers, along, filled, of_levels
 from flexroad.tools.lift.shapes import POINT, POLYGON, Shape
 from flexroad.tools.lift.types import POINTS, Lifted, Options, RunSurface, Steep
 
+pyogrio = lazy("pyogrio")
 if TYPE_CHECKING:
     import pandas as pd
 else:
@@ -46,6 +52,18 @@ class Feature:
     shape: Shape | None
     wanted: int = int(ANY)
     """Number of its level, or `ANY`."""
+
+
+def vector_info(source: Path) -> dict[str, Any]:
+    """Return what pyogrio knows of the layer of a file."""
+    try:
+        name = vector_name(source)
+        with warnings.catch_warnings():
+            # M of a Shapefile is read without GDAL.
+            warnings.filterwarnings("ignore", "Measured")
+            return layer_info(name, str(pyogrio.list_layers(name)[0, 0]))
+    except ERRORS as error:
+        raise TaskError(f"cannot be read: {reason(error)}") from error
 
 
 def level_columns(names: Iterable[str]) -> list[str]:
@@ -146,16 +164,7 @@ class _Paths:
     def of_features(self, first: int, last: int) -> _Paths:
         """Return the paths of some features."""
         start, end = np.searchsorted(self.feature, [first, last])
-        own = slice(start, end)
-        return _Paths(
-            self.values[own],
-            self.east[own],
-            self.north[own],
-            self.path[own],
-            self.feature[own] - first,
-            self.pieces[own],
-            self.length[own],
-        )
+        return _Paths(**{each.name: getattr(self, each.name)[start:end] for each in fields(self)})
 
 
 def _near(run: RunSurface, east: Floats, north: Floats, on: NDArray[np.intp]) -> Bools:
@@ -222,7 +231,6 @@ class _Path:
     start: int
     end: int
     code: int
-    z: bool
     m: bool
 
     def of(self, values: Any) -> Any:
@@ -253,7 +261,7 @@ def _group(
     starts, first = samples.path_starts.tolist(), 0
     own = list[list[_Path]]()
     for feature in features:
-        kinds = [kind[:3] for kind in feature.shape.all_paths()] if feature.shape else []
+        kinds = [(code, m) for code, _, m, _ in feature.shape.all_paths()] if feature.shape else []
         ends = pairwise(starts[first : first + len(kinds) + 1])
         own.append([_Path(start, end, *kind) for (start, end), kind in zip(ends, kinds, strict=True)])
         first += len(kinds)

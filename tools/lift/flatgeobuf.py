@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexroad.catalog.guard.open_vector import ERRORS, layer_info, vector_name
+from flexroad.catalog.guard.open_vector import ERRORS, vector_name
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import reason
 from flexroad.tasks.errors import TaskError
@@ -20,6 +20,7 @@ from flexroad.tools.lift.features import (
     level_columns,
     lifted,
     percent_columns,
+    vector_info,
     wanted_levels,
     with_zero,
 )
@@ -37,27 +38,14 @@ KINDS = NAMES[POINT : COLLECTION + 1]
 """Types of layers that GDAL writes with z; those of layers with several types it does not."""
 
 
-def begins(data: bytes) -> bool:
-    """Return whether a file begins like a FlatGeobuf."""
-    return data.startswith(b"fgb\x03")
-
-
-def _info(source: Path) -> dict[str, Any]:
-    try:
-        name = vector_name(source)
-        return layer_info(name, str(pyogrio.list_layers(name)[0, 0]))
-    except ERRORS as error:
-        raise TaskError(f"cannot be read: {reason(error)}") from error
-
-
 def frame(source: Path) -> Frame:
     """Return the CRS in the header."""
-    return Frame(_info(source)["crs"])
+    return Frame(vector_info(source)["crs"])
 
 
 def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
     """Copy a file with heights; yield the rows of the report."""
-    info, rows, failures = _info(source), list[Lifted](), list[Exception]()
+    info, rows, failures = vector_info(source), list[Lifted](), list[Exception]()
     kind = info["geometry_type"]
     if kind not in KINDS and kind.removesuffix(" Z") not in KINDS:
         raise TaskError(

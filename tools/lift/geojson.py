@@ -47,11 +47,6 @@ DIGITS = 9
 """Decimals of the coordinates of new vertices: 0.1 mm in degrees."""
 
 
-def begins(data: bytes) -> bool:
-    """Return whether a file begins like JSON."""
-    return data.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
-
-
 def frame(source: Path) -> Frame:
     """Return the CRS of a file: longitude and latitude if it names none."""
     vector_name(source)
@@ -59,26 +54,20 @@ def frame(source: Path) -> Frame:
         if CRS.search(text) is None:
             return Frame(DEGREES)
     with _opened(source) as file:
-        for piece in _pieces(file):
-            if isinstance(piece, _Member) and piece.name == "crs":
-                return Frame(_crs(piece.value))
+        reader = _Reader(file)
+        for _ in _pieces(reader):
+            if reader.crs:
+                return Frame(reader.crs[0])
     return Frame(DEGREES)
-
-
-def _crs(value: Any) -> str | None:
-    """Return the CRS that a member ``crs`` names; None if it says that there is none."""
-    properties = value.get("properties") if isinstance(value, dict) else None
-    name = properties.get("name") if isinstance(properties, dict) else None
-    return str(name) if name else None
 
 
 def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
     """Copy a file with heights; yield the rows of the report."""
     with _opened(source) as file, out.open("w", encoding="latin1", newline="") as copy:
         batch, size, first = list[_Item | str](), 0, 0
-        for piece in _pieces(file):
-            batch.append(piece.text if isinstance(piece, _Member) else piece)
-            size += len(piece.text)
+        for piece in _pieces(_Reader(file)):
+            batch.append(piece)
+            size += len(piece if isinstance(piece, str) else piece.text)
             if size > BATCH_BYTES or len(batch) >= 2 * BATCH_FEATURES:
                 yield from _written(batch, first, copy, run, options)
                 first += sum(isinstance(piece, _Item) for piece in batch)
@@ -89,15 +78,6 @@ def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator
 def _opened(path: Path) -> TextIO:
     # Each byte is a character, so that a text in any encoding that has ASCII is copied as it is.
     return path.open(encoding="latin1", newline="")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Member:
-    """A stretch of text: a member of the outermost object with what is before it, or what is between."""
-
-    text: str
-    name: str = ""
-    value: Any = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,22 +181,21 @@ def _path(positions: Any) -> Floats:
 
 def _coordinates(item: _Item, shape: Shape) -> list[tuple[int, int, str]]:
     """Return the edits that replace the coordinates of the geometry of an item."""
-    if "geometry" not in item.members:
-        geometry, offset = {name: place[1:] for name, place in item.members.items()}, 0
-    else:
-        _, offset, _ = item.members["geometry"]
-        geometry = {name: place[1:] for name, place in _object(item.text, offset)[0].items()}
-    return _edits(item.text, geometry, shape)
+    members = item.members
+    if "geometry" in members:
+        members, _ = _object(item.text, members["geometry"][1])
+    return _edits(item.text, members, shape)
 
 
-def _edits(text: str, geometry: dict[str, tuple[int, int]], shape: Shape) -> list[tuple[int, int, str]]:
+def _edits(text: str, members: dict[str, tuple[Any, int, int]], shape: Shape) -> list[tuple[int, int, str]]:
     if shape.code != COLLECTION:
-        return [(*geometry["coordinates"], json.dumps(_lists(shape), allow_nan=False))]
-    edits, at = list[tuple[int, int, str]](), geometry["geometries"][0] + 1
+        _, start, end = members["coordinates"]
+        return [(start, end, json.dumps(_lists(shape), allow_nan=False))]
+    edits, at = list[tuple[int, int, str]](), members["geometries"][1] + 1
     for part in shape.parts:
         at = SPACE.match(text, at).end()  # type: ignore[union-attr]
-        members, end = _object(text, at)
-        edits += _edits(text, {name: place[1:] for name, place in members.items()}, part)
+        own, end = _object(text, at)
+        edits += _edits(text, own, part)
         at = SPACE.match(text, end).end() + 1  # type: ignore[union-attr]
     return edits
 
@@ -255,6 +234,8 @@ class _Reader:
 
     def __init__(self, file: TextIO) -> None:
         self.file, self.text, self.at, self.ended = file, "", 0, False
+        self.crs: list[str | None] = []
+        """What the members ``crs`` of the outermost object name; None if one says that there is none."""
 
     def more(self) -> bool:
         """Read on; return whether there was more."""
@@ -332,19 +313,18 @@ def _object(text: str, at: int) -> tuple[dict[str, tuple[Any, int, int]], int]:
     return members, at
 
 
-def _pieces(file: TextIO) -> Iterator[_Member | _Item]:
-    """Yield a file as members and features; joined, their texts are the file."""
-    reader = _Reader(file)
+def _pieces(reader: _Reader) -> Iterator[_Item | str]:
+    """Yield a file as features and the text between them; joined, these are the file."""
     reader.more()
     if reader.text.startswith("\xef\xbb\xbf"):
-        yield _Member(reader.until(3))
+        yield reader.until(3)
     if not _is_collection(reader):
-        yield _Member(reader.until(SPACE.match(reader.text, reader.at).end()))  # type: ignore[union-attr]
+        yield reader.until(SPACE.match(reader.text, reader.at).end())  # type: ignore[union-attr]
         yield reader.item()
     else:
         yield from _collection(reader)
     while reader.at < len(reader.text) or reader.more():
-        yield _Member(reader.until(len(reader.text)))
+        yield reader.until(len(reader.text))
 
 
 def _is_collection(reader: _Reader) -> bool:
@@ -356,32 +336,36 @@ def _is_collection(reader: _Reader) -> bool:
             return first is None or first[1] == "features"
 
 
-def _collection(reader: _Reader) -> Iterator[_Member | _Item]:
+def _collection(reader: _Reader) -> Iterator[_Item | str]:
     _, end = reader.taken(_sign("{"))
-    yield _Member(reader.until(end))
+    yield reader.until(end)
     sign = ","
     while sign == ",":
         name, end = reader.taken(_key)
         if name == "features" and reader.text[end : end + 1] == "[":
-            yield _Member(reader.until(end + 1))
+            yield reader.until(end + 1)
             yield from _items(reader)
         else:
             before = reader.until(end)
             value, end = reader.taken(DECODER.raw_decode)
-            yield _Member(before + reader.until(end), name, value)
+            if name == "crs":
+                properties = value.get("properties") if isinstance(value, dict) else None
+                named = properties.get("name") if isinstance(properties, dict) else None
+                reader.crs.append(str(named) if named else None)
+            yield before + reader.until(end)
         sign, end = reader.taken(_sign(",}"))
-        yield _Member(reader.until(end))
+        yield reader.until(end)
 
 
-def _items(reader: _Reader) -> Iterator[_Member | _Item]:
+def _items(reader: _Reader) -> Iterator[_Item | str]:
     """Yield the features of a collection, and the text between them."""
     sign, end = reader.taken(_first_of_list)
-    yield _Member(reader.until(end))
+    yield reader.until(end)
     while sign != "]":
         yield reader.item()
         sign, end = reader.taken(_sign(",]"))
         space = SPACE.match(reader.text, end).end()  # type: ignore[union-attr]
-        yield _Member(reader.until(space if sign == "," else end))
+        yield reader.until(space if sign == "," else end)
 
 
 def _first_of_list(text: str, at: int) -> tuple[str, int]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.guard.open_vector import GEOPACKAGES, SQLITE, vector_name
+from flexroad.catalog.guard.open_vector import vector_name
 from flexroad.catalog.guard.vector_contents import quoted
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift.features import (
@@ -37,11 +37,6 @@ ENVELOPES = (0, 32, 48, 48, 64)
 """Size of the envelope of a geometry by its number in the flags."""
 UNDEFINED = (0, -1, 99999)
 """Numbers of coordinate systems that say nothing."""
-
-
-def begins(data: bytes) -> bool:
-    """Return whether a file begins like a GeoPackage."""
-    return data.startswith(SQLITE) and data[68:72] in GEOPACKAGES
 
 
 @dataclass(frozen=True)
@@ -212,16 +207,12 @@ def _shape(row: tuple[Any, ...], layer: _Layer) -> Shape | None:
     try:
         if not isinstance(blob, bytes) or blob[:2] != b"GP":
             raise TaskError("has a geometry that is none of a GeoPackage; repair the file with ogr2ogr")
-        return of_wkb(blob[_header_size(blob) :])
+        number = blob[3] >> 1 & 7 if len(blob) > 3 else len(ENVELOPES)
+        if number >= len(ENVELOPES):
+            raise TaskError("has a damaged geometry; repair the file with ogr2ogr")
+        return of_wkb(blob[8 + ENVELOPES[number] :])
     except TaskError as error:
         raise TaskError(f"(feature {row[0]} of the layer {layer.table}) {error}") from error
-
-
-def _header_size(blob: bytes) -> int:
-    number = blob[3] >> 1 & 7 if len(blob) > 3 else len(ENVELOPES)
-    if number >= len(ENVELOPES):
-        raise TaskError("has a damaged geometry; repair the file with ogr2ogr")
-    return 8 + ENVELOPES[number]
 
 
 def _blob(old: bytes, shape: Shape) -> bytes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats
+from flexroad.tools.export.reference_line import stretches
 from flexroad.tools.lift.types import Steep
 
 STEP_M = 0.5
@@ -97,12 +97,6 @@ def steepest(
     found = [] if limit is None else stretches(values > limit)
     most = [start + int(np.argmax(values[start:end])) for start, end in found]
     return tuple(Steep(kind, float(values[at]), float(x[at]), float(y[at])) for at in most)
-
-
-def stretches(places: Bools) -> list[tuple[int, int]]:
-    """Return start and end of each run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], places, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in pairwise(edges)][::2]
 
 
 @compiled()

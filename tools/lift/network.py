@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.roads.attributes import OSM_TAGS, level_numbers
 from flexroad.tasks.types import Floats
-from flexroad.tools.lift.lines import stretches
+from flexroad.tools.export.reference_line import stretches
 
 ANY = np.int8(-128)
 """A wanted level that is not known."""
@@ -101,16 +101,18 @@ def of_levels(heights: Heights, numbers: Numbers) -> Floats:
     return z
 
 
+def levels_of(heights: Heights, sign: int) -> list[int]:
+    """Return the numbers of the levels of n points that have a sign: those of bridges or of tunnels."""
+    rows = zip(heights.numbers, heights.z, strict=True)
+    return [number for number, row in rows if number * sign > 0 and np.isfinite(row).any()]
+
+
 def level_of(heights: Heights, number: int) -> int | None:
     """Return the level of a bridge or tunnel at n points; None if none of them has one of its kind.
 
     Sources may number the decks of one place differently, so the nearest number of the same sign counts.
     """
-    own = [
-        each
-        for each, row in zip(heights.numbers, heights.z, strict=True)
-        if each * number > 0 and np.isfinite(row).any()
-    ]
+    own = levels_of(heights, number)
     return min(own, key=lambda each: (abs(each - number), abs(each))) if own else None
 
 

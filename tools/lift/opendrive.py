@@ -12,11 +12,11 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.export.profiles import Profiles, cubic_pieces, value_at
+from flexroad.tools.export.profiles import NONE, Profiles, cubic_pieces, value_at
 from flexroad.tools.lift import plan_view, road_profiles, xml_text
 from flexroad.tools.lift.lines import steepest
 from flexroad.tools.lift.network import (
@@ -29,11 +29,12 @@ from flexroad.tools.lift.network import (
     along,
     complete,
     filled,
+    levels_of,
     of_levels,
 )
 from flexroad.tools.lift.plan_view import numbers
-from flexroad.tools.lift.road_profiles import AHEAD_M, NONE, CrossSections
-from flexroad.tools.lift.types import Frame, HeightsAt, Lifted, Options, with_heights
+from flexroad.tools.lift.road_profiles import AHEAD_M, CrossSections
+from flexroad.tools.lift.types import NO_POINTS, Frame, HeightsAt, Lifted, Options, with_heights
 from flexroad.tools.lift.xml_text import Part
 
 ALONG_M, LEAST_ALONG = 1.0, 4
@@ -116,19 +117,16 @@ class Road:
 
 def frame(source: Path) -> Frame:
     """Return where the coordinates of a file are: its ``geoReference`` and ``offset``."""
-    with xml_text.opened(source) as file:
-        for part in xml_text.parts(file, {"header", "road"}):
-            if isinstance(part, bytes):
-                continue
-            if part.element.tag == "road":
-                break
-            text = " ".join((part.element.findtext("geoReference") or "").split())
-            offset = part.element.find("offset")
-            try:
-                moved = [0.0] * 4 if offset is None else numbers(offset, *"xyz", "hdg", missing=0.0)
-            except TaskError as error:
-                raise TaskError(f"{error}; correct its header") from error
-            return Frame(text or None, moved[0], moved[1], z=moved[2], turn=moved[3])
+    for part in xml_text.elements(source, {"header", "road"}):
+        if part.element.tag == "road":
+            break
+        text = " ".join((part.element.findtext("geoReference") or "").split())
+        offset = part.element.find("offset")
+        try:
+            moved = [0.0] * 4 if offset is None else numbers(offset, *"xyz", "hdg", missing=0.0)
+        except TaskError as error:
+            raise TaskError(f"{error}; correct its header") from error
+        return Frame(text or None, *moved)
     return Frame(None)
 
 
@@ -138,12 +136,9 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
     with xml_text.opened(source) as file, xml_text.written(out) as copy:
         parts = map(_read, xml_text.parts(file, {"road"}))
         for part, found in with_heights(
-            parts, lambda each: each.places() if isinstance(each, Road) else None, heights
+            parts, lambda each: each.places() if isinstance(each, Road) else NO_POINTS, heights
         ):
-            if isinstance(part, Road):
-                assert found is not None
-                part = _lifted(part, found, options, of_links)
-            text, row = part
+            text, row = _lifted(part, found, options, of_links) if isinstance(part, Road) else part
             copy.write(text)
             if row is not None:
                 yield row
@@ -225,7 +220,9 @@ def _lifted(road: Road, heights: Heights, options: Options, of_links: _Linked) -
     flat, tolerance, ends = options.beyond == "flat", options.tolerance_m, NOWHERE
     if flat and not np.isfinite(sections.line).all():
         ends = of_links.network.ends(road.nodes, beyond=True)
-    elevation = road_profiles.elevation(sections, road.elevation, flat, tolerance, ends)
+    elevation = road_profiles.profile(
+        sections, sections.line, sections.grade, road.elevation, flat, tolerance, ends
+    )
     across = road_profiles.superelevation(sections, road.superelevation, flat, tolerance)
     if elevation is None or across is None:
         text, length = road.part.text, float(road.s[-1])
@@ -269,11 +266,7 @@ def _wanted(road: Road, line: Heights) -> tuple[Numbers, Bools, float]:
     for kind, start, end in road.structures:
         here = (road.s >= start) & (road.s <= end)
         side = 1 if kind == "bridge" else -1
-        own = [
-            number
-            for number, z in zip(line.numbers, line.z, strict=True)
-            if number * side > 0 and np.isfinite(z[here]).any()
-        ]
+        own = levels_of(line[here], side)
         if len(own) == 1:
             wanted[here] = own[0]
         elif not own:
@@ -297,18 +290,16 @@ class _Linked:
     def network(self) -> Network:
         """The solved network."""
         network = Network(guessed=self.guessed)
-        with xml_text.opened(self._source) as file:
-            parts = map(_read, xml_text.parts(file, {"road"}))
-            lines = (part for part in parts if isinstance(part, Road))
-            for road, found in with_heights(lines, Road.middle_and_line, self._heights):
-                assert found is not None
-                middle, line = found[: len(road.s)], found[len(road.s) :]
-                wanted, joined, _ = _wanted(road, middle)
-                network.note(road.id, road.nodes, middle, wanted)
-                z = of_levels(line, along(middle, wanted)[1])
-                network.note_open(road.nodes, road.s, np.where(joined, np.nan, z))
-                for own, other in road.links:
-                    network.join(own, other)
+        roads = map(_read, xml_text.elements(self._source, {"road"}))
+        lines = (road for road in roads if isinstance(road, Road))
+        for road, found in with_heights(lines, Road.middle_and_line, self._heights):
+            middle, line = found[: len(road.s)], found[len(road.s) :]
+            wanted, joined, _ = _wanted(road, middle)
+            network.note(road.id, road.nodes, middle, wanted)
+            z = of_levels(line, along(middle, wanted)[1])
+            network.note_open(road.nodes, road.s, np.where(joined, np.nan, z))
+            for own, other in road.links:
+                network.join(own, other)
         network.decide()
         return network
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.text import shown
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
@@ -64,12 +64,10 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
 def _names(source: Path) -> tuple[str, str]:
     """Return where a file has its coordinates."""
     local = False
-    with xml_text.opened(source) as file:
-        for part in xml_text.parts(file, {"node"}):
-            if isinstance(part, Part):
-                if np.isfinite(_place(part.element, DEGREES)).all():
-                    return DEGREES
-                local = local or bool(np.isfinite(_place(part.element, LOCAL)).all())
+    for part in xml_text.elements(source, {"node"}):
+        if np.isfinite(_place(part.element, DEGREES)).all():
+            return DEGREES
+        local = local or bool(np.isfinite(_place(part.element, LOCAL)).all())
     return LOCAL if local else DEGREES
 
 
@@ -136,28 +134,25 @@ class _Streets:
     def read(cls, source: Path, names: tuple[str, str]) -> _Streets:
         ids, values = array("q"), array("d")
         ways = list[tuple[str, NDArray[np.int64], int, bool]]()
-        with xml_text.opened(source) as file:
-            for part in xml_text.parts(file, {"node", "way"}):
-                if isinstance(part, bytes):
-                    continue
-                element = part.element
-                if element.tag == "node":
-                    ids.append(_id(element.get("id")))
-                    ele = next((tag.get("v") for tag in element.iter("tag") if tag.get("k") == "ele"), None)
-                    values.extend((*_place(element, names), _number(ele)))
-                else:
-                    tags = _tags(element)
-                    refs = np.array([_id(node.get("ref")) for node in element.iter("nd")], np.int64)
-                    ways.append((element.get("id", ""), refs, tagged_level(tags), "highway" in tags))
+        for part in xml_text.elements(source, {"node", "way"}):
+            element = part.element
+            if element.tag == "node":
+                ids.append(_id(element.get("id")))
+                ele = next((tag.get("v") for tag in element.iter("tag") if tag.get("k") == "ele"), None)
+                values.extend((*_place(element, names), _number(ele)))
+            else:
+                tags = _tags(element)
+                refs = np.array([_id(node.get("ref")) for node in element.iter("nd")], np.int64)
+                ways.append((element.get("id", ""), refs, tagged_level(tags), "highway" in tags))
         own, table = np.array(ids, np.int64), np.array(values).reshape(-1, 3)
         x, y, before = (np.where(np.isfinite(column), column, np.nan) for column in table.T)
         streets = any(row for *_, row in ways)
-        order = np.argsort(own, kind="stable")
-        found = [
-            _Way(name, _find(own, order, refs), level, row or not streets)
-            for name, refs, level, row in ways
-            if len(own) and len(refs) > 1 and (row or level or not streets)
-        ]
+        order, found = np.argsort(own, kind="stable"), list[_Way]()
+        for name, refs, level, row in ways:
+            if len(own) and len(refs) > 1 and (row or level or not streets):
+                index = order[np.minimum(np.searchsorted(own, refs, sorter=order), len(own) - 1)]
+                nodes = np.where(own[index] == refs, index, -1)
+                found.append(_Way(name, nodes, level, row or not streets))
         return cls(own, x, y, before, found, streets, names == DEGREES, np.full(len(own), np.nan))
 
     def find_heights(self, heights: HeightsAt) -> None:
@@ -190,7 +185,6 @@ class _Streets:
         """Yield each way with the points along it and their heights on all levels."""
         pairs = ((way, self._line(way)) for way in ways)
         for (way, line), found in with_heights(pairs, lambda each: (each[1].x, each[1].y), heights):
-            assert found is not None
             yield way, line, found
 
     def _line(self, way: _Way) -> Line:
@@ -231,13 +225,6 @@ class _Streets:
 
 def _ends(way: _Way) -> tuple[Node, Node]:
     return int(way.nodes[0]), int(way.nodes[-1])
-
-
-def _find(ids: NDArray[np.int64], order: Indices, refs: NDArray[np.int64]) -> Indices:
-    """Return the indices of nodes by their ids, -1 for those that are missing."""
-    place = np.minimum(np.searchsorted(ids, refs, sorter=order), len(ids) - 1)
-    index = order[place]
-    return np.where(ids[index] == refs, index, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,4 +329,4 @@ def _with_ele(part: Part, z: float) -> bytes:
     for tag in part.element.iter("tag"):
         if tag.get("k") == "ele":
             return part.replaced([part.with_attributes(tag, {"v": f"{z:.3f}"})])
-    return part.replaced([part.with_child(f'<tag k="ele" v="{z:.3f}"/>')])
+    return part.replaced([part.with_child(part.element, f'<tag k="ele" v="{z:.3f}"/>')])

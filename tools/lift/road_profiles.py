@@ -15,14 +15,12 @@ import numpy as np
 
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.export.profiles import cubic_pieces, straight_lines
-from flexroad.tools.lift.lines import stretches
+from flexroad.tools.export.reference_line import stretches
 from flexroad.tools.lift.network import NOWHERE, Ends, filled
 from flexroad.tools.lift.xml_text import Part
 
 AHEAD_M = 0.05
 """Distance over which the slope of a surface is taken (m)."""
-NONE = np.zeros((1, 5))
-"""A profile without records: it is 0."""
 STEEPEST = 0.5
 """Largest slope across a road (m/m): where the surface is steeper, a step or the end of a deck is beneath."""
 LEAST_ACROSS_M = 0.25
@@ -85,17 +83,6 @@ def cross_sections(
     return CrossSections(s, t, z, inside, line, grade, joined)
 
 
-def elevation(
-    sections: CrossSections, old: Floats, flat: bool, tolerance: float, ends: Ends = NOWHERE
-) -> Floats | None:
-    """Return the pieces of the elevation, ``(k, 5)``; None if the road has no ground.
-
-    - `old`: the pieces that it had, which stay beyond the ground.
-    - `flat`: whether it goes on level there instead, or to ``ends``: heights of the nodes, NaN if not known.
-    """
-    return _profile(sections, sections.line, sections.grade, old, flat, tolerance, ends)
-
-
 def superelevation(sections: CrossSections, old: Floats, flat: bool, tolerance: float) -> Floats | None:
     """Return the pieces of the superelevation, ``(k, 5)``, radians; None if the road has no ground."""
     inside = sections.inside & np.isfinite(sections.z)
@@ -111,10 +98,10 @@ def superelevation(sections: CrossSections, old: Floats, flat: bool, tolerance: 
     elif known.any():
         angle[known] = 0.0
     reach = float(np.abs(sections.t).max(initial=1.0))
-    return _profile(sections, angle, _slopes(s, angle), old, flat, tolerance / max(reach, 1.0))
+    return profile(sections, angle, _slopes(s, angle), old, flat, tolerance / max(reach, 1.0))
 
 
-def _profile(
+def profile(
     sections: CrossSections,
     values: Floats,
     slopes: Floats,
@@ -123,7 +110,12 @@ def _profile(
     tolerance: float,
     ends: Ends = NOWHERE,
 ) -> Floats | None:
-    """Return pieces along the whole road: of the surface where it is, else level or as they were."""
+    """Return pieces along the whole road, ``(k, 5)``; None if it has no ground.
+
+    - `values`, `slopes` ``(n,)``: of the surface.
+    - `old`: the pieces that it had, which stay beyond the ground.
+    - `flat`: whether it goes on level there instead, or to ``ends``: heights of the nodes, NaN if not known.
+    """
     s, known = sections.s, np.isfinite(values)
     both = known[:-1] & known[1:]
     if not both.any():
@@ -214,9 +206,7 @@ def _replaced(road: Part, name: str, old: Sequence[str], body: str, around: str)
     assert element is not None
     place = road.inside(element)
     if place is None:
-        start, end = road.start_tag(element)
-        head = road.text[start:end].removesuffix(b"/>").rstrip()
-        return [(start, end, head + f">{body}{around}</{name}>".encode("ascii"))] if body else []
+        return [road.with_child(element, body + around)] if body else []
     edits = [(place[0], place[0], body.encode("ascii"))]
     for child in element:
         if child.tag in old:

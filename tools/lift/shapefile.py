@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import shutil
 import struct
-import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
@@ -18,7 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from flexroad.catalog.guard.open_vector import ERRORS, in_its_encoding, layer_info, vector_name
+from flexroad.catalog.guard.open_vector import ERRORS, in_its_encoding, vector_name
 from flexroad.catalog.guard.source_files import SHAPEFILE_PARTS
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import reason
@@ -31,6 +30,7 @@ from flexroad.tools.lift.features import (
     level_columns,
     lifted,
     percent_columns,
+    vector_info,
     wanted_levels,
     with_zero,
 )
@@ -55,24 +55,9 @@ _Record = tuple[int, bytes]
 """Number and data of a geometry of the file."""
 
 
-def begins(data: bytes) -> bool:
-    """Return whether a file begins like a Shapefile."""
-    return data.startswith(b"\0\0\x27\x0a")
-
-
 def frame(source: Path) -> Frame:
     """Return the CRS in the ``.prj``."""
-    return Frame(_info(source)["crs"])
-
-
-def _info(source: Path) -> dict[str, Any]:
-    """Return what pyogrio knows of a file; it warns of M, which is read here."""
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Measured")
-            return layer_info(vector_name(source), source.stem)
-    except ERRORS as error:
-        raise TaskError(f"cannot be read: {reason(error)}") from error
+    return Frame(vector_info(source)["crs"])
 
 
 def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator[Lifted]:
@@ -164,7 +149,7 @@ def _records(file: BinaryIO) -> Iterator[_Record]:
 
 def _levels(source: Path, first: int, count: int) -> list[int]:
     """Return the levels of some features."""
-    columns = level_columns(_info(source)["fields"])
+    columns = level_columns(vector_info(source)["fields"])
     if not columns:
         return wanted_levels({}, count)
     try:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from flexroad.catalog.text import shown
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.flagged import passed
 from flexroad.tasks.types import Floats
@@ -44,12 +44,10 @@ DIGITS = 3
 
 def frame(source: Path) -> Frame:
     """Return where the coordinates of a network are, by its element ``location``."""
-    with xml_text.opened(source) as file:
-        for part in xml_text.parts(file, {"location"}):
-            if isinstance(part, Part):
-                x, y, z = _offset(part.element)
-                crs = (part.element.get("projParameter") or "").strip()
-                return Frame(None if crs in NO_PROJECTION else crs, -x, -y, -z)
+    for part in xml_text.elements(source, {"location"}):
+        x, y, z = _offset(part.element)
+        crs = (part.element.get("projParameter") or "").strip()
+        return Frame(None if crs in NO_PROJECTION else crs, -x, -y, -z)
     return Frame(None)
 
 
@@ -124,28 +122,17 @@ class _Shape:
         return " ".join(parts)
 
 
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """An edge or a junction."""
-
-    part: Part
-    shapes: tuple[_Shape, ...]
-
-    @property
-    def points(self) -> tuple[Floats, Floats]:
-        lines = [shape.line for shape in self.shapes]
-        x, y = ([getattr(line, name) for line in lines] or [np.zeros(0)] for name in "xy")
-        return np.concatenate(x), np.concatenate(y)
+_Piece = tuple[bytes | Part, list[_Shape]]
+"""An edge or a junction with its shapes; all other text has none."""
 
 
 def _places(source: Path) -> dict[str, str]:
     """Return ``x,y`` of each junction, as the file has it."""
     places = dict[str, str]()
-    with xml_text.opened(source) as file:
-        for part in xml_text.parts(file, {"junction"}):
-            if isinstance(part, Part) and part.element.get("type") != "internal":
-                x, y = (part.element.get(name, "") for name in "xy")
-                places[part.element.get("id", "")] = f"{x},{y}"
+    for part in xml_text.elements(source, {"junction"}):
+        if part.element.get("type") != "internal":
+            x, y = (part.element.get(name, "") for name in "xy")
+            places[part.element.get("id", "")] = f"{x},{y}"
     return places
 
 
@@ -177,6 +164,12 @@ def _offset(location: ET.Element) -> tuple[float, float, float]:
     return x, y, z
 
 
+def _points(piece: _Piece) -> tuple[Floats, Floats]:
+    lines = [shape.line for shape in piece[1]]
+    x, y = (np.concatenate([np.zeros(0), *(getattr(line, name) for line in lines)]) for name in "xy")
+    return x, y
+
+
 @dataclass(frozen=True, eq=False)
 class _Copy:
     """A copy of a network with heights."""
@@ -193,36 +186,31 @@ class _Copy:
         """Write the copy; yield the rows of the report."""
         with xml_text.opened(source) as file, xml_text.written(out) as copy:
             pieces = map(self._piece, xml_text.parts(file, {"edge", "junction"}))
-            found = with_heights(
-                pieces, lambda each: None if isinstance(each, bytes) else each.points, self.heights
-            )
-            for piece, heights in found:
-                if isinstance(piece, bytes) or heights is None:
-                    assert isinstance(piece, bytes)
-                    copy.write(piece)
+            for (part, shapes), heights in with_heights(pieces, _points, self.heights):
+                if isinstance(part, bytes):
+                    copy.write(part)
                     continue
-                text, row = self._lifted(piece, heights)
+                text, row = self._lifted(part, shapes, heights)
                 copy.write(text)
                 if row is not None:
                     yield row
 
-    def _piece(self, part: bytes | Part) -> bytes | _Piece:
-        """Return an edge or junction with its shapes, all other text as it is."""
+    def _piece(self, part: bytes | Part) -> _Piece:
         if isinstance(part, bytes):
-            return part
+            return part, []
         if part.path != ("net",):
-            return part.text
+            return part.text, []
         element = part.element
         shapes = _of_edge(element, self.places) if element.tag == "edge" else _of_junction(element)
-        return _Piece(part, tuple(shape for shape in shapes if shape is not None))
+        return part, [shape for shape in shapes if shape is not None]
 
-    def _lifted(self, piece: _Piece, heights: Heights) -> tuple[bytes, Lifted | None]:
+    def _lifted(self, part: Part, shapes: list[_Shape], heights: Heights) -> tuple[bytes, Lifted | None]:
         """Return an edge or junction with heights, and the row of an edge."""
-        element = piece.part.element
+        element = part.element
         level = tagged_level({each.get("key", ""): each.get("value", "") for each in element.iter("param")})
         own = level_of(heights, level) if level else None
         edits, lanes, start = dict[ET.Element, dict[str, str]](), list[Lifted](), 0
-        for shape in piece.shapes:
+        for shape in shapes:
             end = start + len(shape.line.s)
             here = heights[start:end]
             z, numbers = self._heights(element, shape, here, own)
@@ -241,8 +229,7 @@ class _Copy:
                 row = self._row(shape, taken, index, numbers)
                 flags = passed(here.flags_on(numbers))
                 lanes.append(replace(row, without_ground_m=without, flags=flags))
-        edited = [piece.part.with_attributes(each, values) for each, values in edits.items()]
-        text = piece.part.replaced(edited)
+        text = part.replaced(part.with_attributes(each, values) for each, values in edits.items())
         if not lanes or element.get("function"):
             return text, None
         name = element.get("id", "")

@@ -15,8 +15,7 @@ from flexroad.catalog import Bounds
 from flexroad.catalog.crs import in_plan, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.pipeline.config.options import METHOD, OUTPUTS, option
-from flexroad.pipeline.run.points import Heights, to_crs
-from flexroad.pipeline.run.sampler import RunSampler
+from flexroad.pipeline.run.sampler import Heights, RunSampler, required_crs, to_crs
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
@@ -24,6 +23,8 @@ HeightsAt = Callable[[Floats, Floats], Heights]
 """Heights at x and y, ``(n,)`` each, in the coordinates of the file."""
 NEAR_M = 5.0
 """Distance up to which consecutive points are of one line (m); lines have a height every metre or less."""
+NO_POINTS = np.zeros(0), np.zeros(0)
+"""Of a part that needs no heights, for `with_heights`."""
 POINTS = 500_000
 """Number of points of a batch: some 200 MB with their heights and what they belong to."""
 T = TypeVar("T")
@@ -62,7 +63,6 @@ class RunSurface:
     ground: RunSampler
     crs: str
     place: Frame
-    run_crs: str
     steps: bool
     given: bool
     """Whether the user gave the CRS."""
@@ -77,6 +77,11 @@ class RunSurface:
                 f"has the layer {layer} without a CRS; give it with --crs, such as --crs EPSG:25832"
             )
         return replace(self, crs=plan_crs(crs))
+
+    @cached_property
+    def run_crs(self) -> str:
+        """The CRS of the run."""
+        return required_crs(self.ground)
 
     @cached_property
     def bounds(self) -> Bounds:
@@ -225,36 +230,26 @@ class Lifted:
 
 
 def with_heights(
-    parts: Iterable[T], points: Callable[[T], tuple[Floats, Floats] | None], heights: HeightsAt
-) -> Iterator[tuple[T, Heights | None]]:
+    parts: Iterable[T], points: Callable[[T], tuple[Floats, Floats]], heights: HeightsAt
+) -> Iterator[tuple[T, Heights]]:
     """Yield each part, in its order, with the heights of its points: a run reads each tile once per batch.
 
-    - `points`: returns x and y of the points of a part, ``(n,)`` each; None if it needs no heights.
+    - `points`: returns x and y of the points of a part, ``(n,)`` each.
     """
-    batch, size = list[tuple[T, tuple[Floats, Floats] | None]](), 0
+    batch, size = list[tuple[T, Floats, Floats]](), 0
     for part in parts:
-        batch.append((part, points(part)))
-        own = batch[-1][1]
-        size += 1 if own is None else 1 + len(own[0])
+        batch.append((part, *points(part)))
+        size += 1 + len(batch[-1][1])
         if size >= POINTS:
             yield from _answered(batch, heights)
             batch, size = [], 0
-    yield from _answered(batch, heights)
+    if batch:
+        yield from _answered(batch, heights)
 
 
-def _answered(
-    batch: list[tuple[T, tuple[Floats, Floats] | None]], heights: HeightsAt
-) -> Iterator[tuple[T, Heights | None]]:
-    asked = [own for _, own in batch if own is not None]
-    if not asked:
-        yield from ((part, None) for part, _ in batch)
-        return
-    x, y = (np.concatenate(values) for values in zip(*asked, strict=True))
-    found, start = heights(x, y), 0
-    for part, own in batch:
-        if own is None:
-            yield part, None
-        else:
-            end = start + len(own[0])
-            yield part, found[start:end]
-            start = end
+def _answered(batch: list[tuple[T, Floats, Floats]], heights: HeightsAt) -> Iterator[tuple[T, Heights]]:
+    parts, x, y = zip(*batch, strict=True)
+    found, start = heights(np.concatenate(x), np.concatenate(y)), 0
+    for part, own in zip(parts, x, strict=True):
+        yield part, found[start : start + len(own)]
+        start += len(own)

@@ -57,14 +57,14 @@ class Part:
             return None
         return first, self.text.rindex(b"</", first, self.spans[element][1])
 
-    def with_child(self, text: str) -> tuple[int, int, bytes]:
-        """Return the edit that adds a text before the end of the element."""
-        place = self.inside(self.element)
+    def with_child(self, element: ET.Element, text: str) -> tuple[int, int, bytes]:
+        """Return the edit that adds a text before the end of an element."""
+        place = self.inside(element)
         if place is not None:
             return place[1], place[1], text.encode("ascii")
-        start, end = self.start_tag(self.element)
+        start, end = self.start_tag(element)
         head = self.text[start:end].removesuffix(b"/>").rstrip()
-        return start, end, head + b">" + text.encode("ascii") + b"</" + str(self.element.tag).encode() + b">"
+        return start, end, head + f">{text}</{element.tag}>".encode("ascii")
 
     def replaced(self, edits: Iterable[tuple[int, int, bytes]]) -> bytes:
         """Return the text with some stretches replaced: start, end and new text of each.
@@ -94,15 +94,9 @@ class Part:
         return start, end, tag
 
 
-@contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
+def opened(path: Path) -> BinaryIO:
     """Open a file to read; one whose name ends in ``.gz`` is unpacked as it is read."""
-    with path.open("rb") as file:
-        if path.suffix.lower() != ".gz":
-            yield file
-            return
-        with gzip.GzipFile(fileobj=file) as unpacked:
-            yield cast("BinaryIO", unpacked)
+    return cast("BinaryIO", gzip.open(path)) if path.suffix.lower() == ".gz" else path.open("rb")
 
 
 @contextmanager
@@ -154,6 +148,14 @@ def parts(file: BinaryIO, names: Collection[str]) -> Iterator[bytes | Part]:
         raise _broken(error) from error
     except (OSError, EOFError, zlib.error) as error:
         raise TaskError(f"cannot be read: {reason(error)}") from error
+
+
+def elements(path: Path, names: Collection[str]) -> Iterator[Part]:
+    """Yield the elements of some names of a file."""
+    with opened(path) as file:
+        for part in parts(file, names):
+            if isinstance(part, Part):
+                yield part
 
 
 def _broken(error: expat.ExpatError) -> TaskError:

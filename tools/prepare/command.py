@@ -1,15 +1,16 @@
-"""``flexroad prepare ...``: make rasters and a catalog from points, meshes and photographs."""
+"""``flexroad prepare``: make rasters and a catalog from points, meshes and photographs."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
+from flexroad.catalog.scan.inputs import TITLES, recognised
 from flexroad.catalog.storage.outputs import made_folder
 from flexroad.catalog.storage.paths import check_writable
 from flexroad.catalog.text import count
@@ -18,9 +19,9 @@ from flexroad.pipeline.cli.catalogs import after_catalog
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.signals import INTERRUPTED
 from flexroad.pipeline.cli.stdio import echo
-from flexroad.pipeline.config.options import GROUND, RECONSTRUCTION, option
+from flexroad.pipeline.config.options import MESH, PHOTOS, POINTS, RASTERS, option
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor
+from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.prepare import from_mesh, from_odm, from_photos, from_points
@@ -29,34 +30,57 @@ from flexroad.tools.prepare.output import check_replaced, disk_errors
 from flexroad.tools.prepare.photos import mvs_cpu, sfm
 from flexroad.tools.prepare.points import ground_filter, morphological
 from flexroad.tools.prepare.points.to_rasters import Options
-from flexroad.tools.prepare.raster_writer import PreparedDataset
 
-app = group("prepare", "Make rasters and a catalog of points, meshes or photographs.")
+app = group()
+
+NOT_OF_PHOTOS = ("crs", "height_unit")
+"""Options that photographs do not have: their tags give both."""
 
 
 @dataclass(frozen=True)
-class _RasterOptions:
-    """How points become rasters, as far as all commands have it; None keeps the default of the method."""
+class _Options:
+    """How ground is found, and the sizes of photographs; None keeps the default of the method."""
 
+    ground: Literal["auto", "classes", "filter", "morphological"] = option(
+        "auto", POINTS, "How ground is identified; auto: by classes if all files have them, else by filter."
+    )
+    ground_class: list[int] | None = option(None, POINTS, "Classes of ground; default: 2.", "N")
+    bridge_class: list[int] | None = option(
+        None, POINTS, "Classes of bridge decks; default: 17; 26 in the Dutch AHN.", "N"
+    )
     slope: float | None = option(
         None,
-        GROUND,
+        RASTERS,
         "Ground filter: steepest slope of the ground; 0.35 is 35 %, the slope filter's default.",
         "NUMBER",
         min=0,
     )
     radius_m: float | None = option(
-        None, GROUND, "Ground filter: search radius in m, half the widest roof.", "METRES", min=1
+        None, RASTERS, "Ground filter: search radius in m, half the widest roof.", "METRES", min=1
+    )
+    image_size: int | None = option(
+        None, PHOTOS, "Longest side of images for feature detection, in pixels.", "N", min=320
+    )
+    stereo_size: int | None = option(
+        None, PHOTOS, "Longest side of images for dense stereo, in pixels.", "N", min=320
     )
 
-    def of(self, **more: Any) -> Options:
-        """Return the options for making rasters, with more of them; None keeps a default."""
+    def of_rasters(self) -> Options:
+        """Return the options for making rasters."""
         given = _given(slope=self.slope, radius_m=self.radius_m)
-        if more.get("ground") == "morphological":
-            more["morphological"] = morphological.Options(**given)
-        else:
-            more["filter"] = ground_filter.Options(**given)
-        return Options(**_given(**more))
+        classes = _given(ground_classes=self.ground_class, bridge_classes=self.bridge_class)
+        if self.ground == "morphological":
+            return Options(ground="morphological", morphological=morphological.Options(**given), **classes)
+        return Options(ground="filter", filter=ground_filter.Options(**given), **classes)
+
+    def of_photos(self, photos: from_photos.PhotosOptions) -> from_photos.PhotosOptions:
+        """Return the options of photographs with the sizes."""
+        return replace(
+            photos,
+            sfm=sfm.Options(**_given(image_size=self.image_size)),
+            stereo=mvs_cpu.Options(**_given(size=self.stereo_size)),
+            **_given(patchmatch_size=self.stereo_size),
+        )
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -64,182 +88,83 @@ def _given(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def _executor(workers: int | None) -> Executor:
-    return SerialExecutor() if workers == 1 else DaskExecutor(workers)
-
-
 def _log(line: str) -> None:
     echo(line, err=True)
 
 
 @contextlib.contextmanager
-def _held(out: Path) -> Iterator[None]:
-    """Make the output folder, check that it can be written, and hold its lock; no empty one is left."""
+def _making(out: Path) -> Iterator[None]:
+    """Make the output folder and hold its lock; a failure or an interruption leaves no files behind."""
     check_replaced(out)
-    with contextlib.ExitStack() as stack:
-        with disk_errors(out):
-            stack.enter_context(made_folder(out))
-            check_writable(out)
-        stack.enter_context(run_lock(out, lambda line: _log(f"note: {line}")))
-        yield
-
-
-def _run(out: Path, make: Callable[[], PreparedDataset]) -> None:
-    """Run a command and print its result; an interruption leaves no files behind."""
     try:
-        with _held(out):
-            dataset = make()
+        with contextlib.ExitStack() as stack:
+            with disk_errors(out):
+                stack.enter_context(made_folder(out))
+                check_writable(out)
+            stack.enter_context(run_lock(out, lambda line: _log(f"note: {line}")))
+            yield
     except TaskError as error:
         raise ConfigError(str(error)) from error
     except KeyboardInterrupt:
         echo("interrupted; nothing was written", err=True)
         raise typer.Exit(INTERRUPTED) from None
+
+
+def _check_options(ctx: typer.Context, kind: str, source: Path) -> None:
+    """Refuse options that are for another kind of input."""
+    for param in ctx.command.params:
+        heading = getattr(param, "rich_help_panel", None)
+        is_other = heading in (POINTS, MESH, PHOTOS) and heading.lower() != kind
+        if is_other or (kind == "photos" and param.name in NOT_OF_PHOTOS):
+            given = ctx.get_parameter_source(param.name)
+            if given is not None and given.name != "DEFAULT":
+                raise ConfigError(f"{param.opts[0]} has no effect on {TITLES[kind]} ({source}); leave it out")
+
+
+@app.command(cls=Command)
+@options.with_options
+def prepare(
+    ctx: typer.Context,
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="INPUT",
+            help="LAS, LAZ or COPC files; OBJ, PLY or glTF with textures or coloured vertices; overlapping "
+            "photographs with GNSS tags; folders of them; or a project folder of OpenDroneMap.",
+        ),
+    ],
+    output: options.OutputFolder,
+    *,
+    chosen: _Options,
+    mesh_options: from_mesh.MeshOptions,
+    photos_options: from_photos.PhotosOptions,
+    workers: options.Workers = None,
+    common: PrepareOptions,
+) -> None:
+    """Make rasters and a catalog of points, meshes or photographs.
+
+    Points of a mesh are sampled on it. Photographs are reconstructed as a mesh. Of an OpenDroneMap project
+    its own rasters are taken, else its textured mesh, else its points.
+    """
+    kind, paths = recognised(inputs)
+    if kind == "odm":
+        kind, paths = from_odm.found(paths[0])
+    _check_options(ctx, kind, paths[0])
+    rasters = chosen.of_rasters()
+    executor = SerialExecutor() if workers == 1 else DaskExecutor(workers)
+    with _making(output):
+        if kind == "odm":
+            dataset = from_odm.prepare_odm(paths[0], output, common, rasters, _log)
+        elif kind == "mesh":
+            dataset = from_mesh.prepare_mesh(paths[0], output, common, mesh_options, rasters, executor, _log)
+        elif kind == "points":
+            dataset = from_points.prepare_points(
+                paths, output, common, rasters, executor, _log, chosen.ground
+            )
+        else:
+            sizes = chosen.of_photos(photos_options)
+            dataset = from_photos.prepare_photos(paths, output, common, sizes, rasters, executor, _log)
     for note in dataset.notes:
-        echo(f"note: {note}", err=True)
+        _log(f"note: {note}")
     echo(f"{count(dataset.tiles, 'tile')} in {dataset.catalog}")
     echo(after_catalog(dataset.catalog))
-
-
-@app.command("points", cls=Command)
-@options.with_options
-def prepare_points(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILE", help="LAS, LAZ or COPC files, or folders of them.")
-    ],
-    output: options.OutputFolder,
-    *,
-    ground: Annotated[
-        Literal["auto", "classes", "filter", "morphological"],
-        typer.Option(
-            rich_help_panel=GROUND,
-            help="How ground is identified; auto: by classes if all files have them, else by filter.",
-        ),
-    ] = "auto",
-    ground_class: Annotated[
-        list[int] | None,
-        typer.Option(metavar="N", rich_help_panel=GROUND, help="Classes of ground; default: 2."),
-    ] = None,
-    bridge_class: Annotated[
-        list[int] | None,
-        typer.Option(
-            metavar="N",
-            rich_help_panel=GROUND,
-            help="Classes of bridge decks; default: 17; 26 in the Dutch AHN.",
-        ),
-    ] = None,
-    rasters: _RasterOptions,
-    workers: options.Workers = None,
-    common: PrepareOptions,
-) -> None:
-    """Make rasters of laser scans and other point clouds.
-
-    They are DSM, DTM, bridge decks and orthophoto.
-    """
-    options = rasters.of(
-        ground=ground if ground == "morphological" else None,
-        ground_classes=ground_class,
-        bridge_classes=bridge_class,
-    )
-    _run(
-        output,
-        lambda: from_points.prepare_points(files, output, common, options, _executor(workers), _log, ground),
-    )
-
-
-@app.command("mesh", cls=Command)
-@options.with_options
-def prepare_mesh(
-    file: Annotated[
-        Path, typer.Argument(metavar="MESH", help="OBJ, PLY or glTF with textures or coloured vertices.")
-    ],
-    output: options.OutputFolder,
-    mesh_options: from_mesh.MeshOptions,
-    rasters: _RasterOptions,
-    *,
-    workers: options.Workers = None,
-    common: PrepareOptions,
-) -> None:
-    """Make rasters of a textured mesh, as in the paper.
-
-    They are made from sampled points, and from its texture seen from above.
-    """
-    options = rasters.of(ground="filter")
-    _run(
-        output,
-        lambda: from_mesh.prepare_mesh(file, output, common, mesh_options, options, _executor(workers), _log),
-    )
-
-
-@app.command("odm", cls=Command)
-@options.with_options
-def prepare_odm(
-    project: Annotated[Path, typer.Argument(metavar="PROJECT", help="Project folder of OpenDroneMap.")],
-    output: options.OutputFolder,
-    mesh_options: Annotated[from_mesh.MeshOptions, "density"],
-    rasters: _RasterOptions,
-    *,
-    workers: options.Workers = None,
-    common: PrepareOptions,
-) -> None:
-    """Take or make the rasters of an OpenDroneMap project.
-
-    Its own rasters are taken, else they are made of its textured mesh, else of its points.
-    """
-    options = rasters.of(ground="filter")
-    _run(
-        output,
-        lambda: from_odm.prepare_odm(
-            project, output, common, mesh_options, options, _executor(workers), _log
-        ),
-    )
-
-
-@app.command("photos", cls=Command)
-@options.with_options
-def prepare_photos(
-    images: Annotated[
-        list[Path],
-        typer.Argument(metavar="IMAGE", help="Overlapping photographs with GNSS tags, or folders."),
-    ],
-    output: options.OutputFolder,
-    photos_options: from_photos.PhotosOptions,
-    rasters: _RasterOptions,
-    *,
-    image_size: Annotated[
-        int | None,
-        typer.Option(
-            min=320,
-            metavar="N",
-            rich_help_panel=RECONSTRUCTION,
-            help="Longest side of images for feature detection, in pixels.",
-        ),
-    ] = None,
-    stereo_size: Annotated[
-        int | None,
-        typer.Option(
-            min=320,
-            metavar="N",
-            rich_help_panel=RECONSTRUCTION,
-            help="Longest side of images for dense stereo, in pixels.",
-        ),
-    ] = None,
-    workers: options.Workers = None,
-    common: PrepareOptions,
-) -> None:
-    """Reconstruct an area from overlapping photographs.
-
-    The steps are cameras, dense stereo, a Poisson mesh, and rasters as with `mesh`.
-    """
-    photos_options = replace(
-        photos_options,
-        sfm=sfm.Options(**_given(image_size=image_size)),
-        stereo=mvs_cpu.Options(**_given(size=stereo_size)),
-        **_given(patchmatch_size=stereo_size),
-    )
-    options = rasters.of(ground="filter")
-    _run(
-        output,
-        lambda: from_photos.prepare_photos(
-            images, output, common, photos_options, options, _executor(workers), _log
-        ),
-    )

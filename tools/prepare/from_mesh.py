@@ -1,4 +1,4 @@
-"""``flexroad prepare mesh``: rasters of a textured mesh, from points sampled on its surface.
+"""``flexroad prepare``: rasters of a textured mesh, from points sampled on its surface.
 
 With a road mask, the ground truth of the paper's DSC3D section is made, too. The paper says that the DTM is
 refined "via our ECSRC algorithm" and that "road masks, enhanced through ECSRC", take "ground truth terrain
@@ -29,7 +29,7 @@ from scipy.ndimage import label
 from flexroad.catalog import Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.to_metres import MetricTransform
-from flexroad.pipeline.config.options import INPUTS, RASTERS, option
+from flexroad.pipeline.config.options import MESH, option
 from flexroad.pipeline.execute import Executor
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
@@ -66,19 +66,19 @@ ECSRC = ecsrc.Options(keep_largest=None)
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """The options that only ``prepare mesh`` has."""
+    """The options that only meshes have."""
 
     up: Literal["y", "z"] | None = option(
-        None, INPUTS, "The mesh's upward axis; default: y in glTF, z elsewhere."
+        None, MESH, "The mesh's upward axis; default: y in glTF, z elsewhere."
     )
     offset: Offset | None = option(
-        None, INPUTS, "Position of the mesh's origin; default: from its sidecar file.", "E N H"
+        None, MESH, "Position of the mesh's origin; default: from its sidecar file.", "E N H"
     )
     """Easting, northing and height (m)."""
-    density: float = option(25.0, RASTERS, "Sampled points per m2 of the mesh's surface.", "NUMBER", min=0.1)
+    density: float = option(25.0, MESH, "Sampled points per m2 of the mesh's surface.", "NUMBER", min=0.1)
     seed: int = 0
     """Random seed of the sampling."""
-    dop: bool = option(True, RASTERS, "Make no orthophoto.")
+    dop: bool = option(True, MESH, "Make no orthophoto.")
     refine: bool = True
     """Whether the DTM is refined by ECSRC, as in the paper."""
 

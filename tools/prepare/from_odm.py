@@ -1,4 +1,4 @@
-"""``flexroad prepare odm``: rasters from an OpenDroneMap project.
+"""``flexroad prepare``: rasters from an OpenDroneMap project.
 
 Uses the project's surface model and orthophoto; without a surface model its textured mesh; without a mesh
 its point cloud.
@@ -21,15 +21,11 @@ from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import bounds_in
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
-from flexroad.catalog.scan.rasters import date_of
-from flexroad.catalog.scan.valid_cells import color_kinds
+from flexroad.catalog.scan.rasters import color_kinds, date_of
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import Executor
 from flexroad.tasks import memory
 from flexroad.tasks.types import Floats, Orthophoto
-from flexroad.tools.prepare.from_mesh import MeshOptions, prepare_mesh
-from flexroad.tools.prepare.from_points import prepare_points
 from flexroad.tools.prepare.options import SMALLER, PrepareOptions, prepared_grid, written
 from flexroad.tools.prepare.points import ground_filter, tin, to_rasters
 from flexroad.tools.prepare.raster_writer import PreparedDataset, RasterWriter
@@ -47,39 +43,28 @@ FILTER_BYTES = 200
 """Memory of the ground filter per cell of a window and its rim (bytes); measured."""
 
 
+def found(folder: Path) -> tuple[str, list[Path]]:
+    """Return what rasters of a project are made of, and where it is: ``odm`` is its own surface model."""
+    for name in (*MESHES, *CLOUDS) if not (folder / DSM).is_file() else ():
+        if (folder / name).is_file():
+            return "mesh" if name in MESHES else "points", [folder / name]
+    return "odm", [folder]
+
+
 def prepare_odm(
-    folder: Path,
-    out: Path,
-    common: PrepareOptions,
-    mesh_options: MeshOptions,
-    options: to_rasters.Options,
-    executor: Executor,
-    log: Callable[[str], None],
-) -> PreparedDataset:
-    """Make the rasters and the catalog of an area from an OpenDroneMap project folder.
-
-    - `folder`: the project: the folder that contains ``odm_dem``, ``odm_orthophoto``, ``odm_texturing``.
-    - `mesh_options`: options of meshes; used if the project has no surface model.
-    - `options`: ground filter and voids if there is no ``dtm.tif``; all options for a mesh or points.
-    """
-    if (folder / DSM).is_file():
-        return _from_rasters(folder, out, common, options, log)
-    for name in MESHES:
-        if (folder / name).is_file():
-            return prepare_mesh(folder / name, out, common, mesh_options, options, executor, log)
-    for name in CLOUDS:
-        if (folder / name).is_file():
-            return prepare_points([folder / name], out, common, options, executor, log)
-    candidates = ", ".join((DSM, *MESHES, *CLOUDS))
-    raise ConfigError(
-        f"{folder} has none of {candidates}; give the folder of a finished OpenDroneMap project, "
-        "made with its option --dsm"
-    )
-
-
-def _from_rasters(
     folder: Path, out: Path, common: PrepareOptions, options: to_rasters.Options, log: Callable[[str], None]
 ) -> PreparedDataset:
+    """Make the rasters and the catalog of an area from the surface model of an OpenDroneMap project.
+
+    - `folder`: the project: the folder that contains ``odm_dem`` and ``odm_orthophoto``.
+    - `options`: ground filter and voids if there is no ``dtm.tif``.
+    """
+    if not (folder / DSM).is_file():
+        candidates = ", ".join((DSM, *MESHES, *CLOUDS))
+        raise ConfigError(
+            f"{folder} has none of {candidates}; give the folder of a finished OpenDroneMap project, "
+            "made with its option --dsm"
+        )
     check_roads(common)
     has_dtm, photo = (folder / DTM).is_file(), folder / PHOTO
     frame, bounds, date = _frame(folder / DSM, common)

@@ -1,4 +1,4 @@
-"""``flexroad prepare photos``: rasters from overlapping photographs, via a mesh as in the paper.
+"""``flexroad prepare``: rasters from overlapping photographs, via a mesh as in the paper.
 
 GNSS tags -> poses and sparse points -> dense cloud -> Poisson mesh -> rasters as of any other mesh.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.scan.inputs import files_of
 from flexroad.catalog.text import some
-from flexroad.pipeline.config.options import INPUTS, option
+from flexroad.pipeline.config.options import PHOTOS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.tasks import TaskError
@@ -34,7 +35,6 @@ from flexroad.tools.prepare.roads import check_roads
 
 cv2 = lazy("cv2")
 
-SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 ON_GPU, ON_CPU = "PatchMatch on the GPU", "semi-global matching on the CPU, as pycolmap has no GPU"
 PIXELS_PER_CELL = 4
 """Width of the smallest useful cell, in pixels of the depth maps."""
@@ -46,10 +46,10 @@ MERGED_AT_ONCE = 5_000_000
 
 @dataclass(frozen=True)
 class PhotosOptions:
-    """The options that only ``prepare photos`` has."""
+    """The options that only photographs have."""
 
     control: Path | None = option(
-        None, INPUTS, "Ground control, CSV: image,x_px,y_px,easting,northing,height.", "FILE"
+        None, PHOTOS, "Ground control, CSV: image,x_px,y_px,easting,northing,height.", "FILE"
     )
     """A column ``name`` is optional."""
     control_crs: str | None = None
@@ -95,7 +95,9 @@ def prepare_photos(
     """
     check_roads(common)
     sfm.colmap()
-    files = _files(images)
+    files = files_of(images, "photos")
+    if strange := [file for file in files if not file.is_file()]:
+        raise ConfigError(f"{strange[0]} is not a file; leave it out")
     placed = place_photos([read_shot(path) for path in files], common.to_crs)
     control = photos_options.control and read_control(
         photos_options.control, placed, photos_options.control_crs
@@ -133,23 +135,6 @@ def prepare_photos(
         )
         published = publish_mesh(mesh, source, out, common, mesh_options, options, executor, log)
     return published.with_notes(*notes)
-
-
-def _files(images: Iterable[Path]) -> list[Path]:
-    files: dict[Path, None] = {}
-    for path in images:
-        if not path.exists():
-            raise ConfigError(f"{path} does not exist")
-        inside = (
-            sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
-        )
-        if not inside:
-            raise ConfigError(f"{path} has no photographs ({', '.join(SUFFIXES)})")
-        strange = next((file for file in inside if not file.is_file()), None)
-        if strange is not None:
-            raise ConfigError(f"{strange} is not a file; leave it out")
-        files.update(dict.fromkeys(inside))
-    return list(files)
 
 
 def _cameras(placed: PlacedPhotos) -> str:

@@ -1,4 +1,4 @@
-"""``flexroad prepare points``: DSM, DTM, bridge decks and orthophoto from point clouds."""
+"""``flexroad prepare``: DSM, DTM, bridge decks and orthophoto from point clouds."""
 
 from __future__ import annotations
 

@@ -55,10 +55,12 @@ class PrepareOptions:
         None, INPUTS, "Unit of heights if the CRS has none; default: that of the plan."
     )
     roads: Path | None = option(
-        None, INPUTS, "Roads: polygons, a raster or a mesh, for the mask; or lines.", "FILE"
+        None,
+        INPUTS,
+        "Roads: polygons, a raster or a mesh, for the mask; or lines; FILE|layername=NAME for one layer.",
+        "FILE",
     )
     """A mesh is projected vertically; lines make no mask."""
-    roads_layer: str | None = option(None, INPUTS, "Layer of --roads, if the file has several.", "NAME")
     roads_where: str | None = option(None, INPUTS, "SQL condition on --roads: \"class = 'road'\".", "SQL")
     tile_size_m: float = option(250, RASTERS, "Side of a tile in m; a smaller area is one tile.", "METRES")
     min_cover: float = MIN_COVER

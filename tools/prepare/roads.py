@@ -21,9 +21,9 @@ from flexroad.catalog.crs_checks import angle_fault
 from flexroad.catalog.guard.open_raster import ERRORS, open_raster
 from flexroad.catalog.guard.open_vector import encoding_note, in_its_encoding, vector_name
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.scan.valid_cells import read_valid
-from flexroad.catalog.scan.vectors import VectorFile, layers, listed, opened
-from flexroad.catalog.text import count
+from flexroad.catalog.scan.inputs import MESHES
+from flexroad.catalog.scan.rasters import read_valid
+from flexroad.catalog.scan.vectors import VectorFile, file_and_layer, one_layer, opened
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import memory
@@ -38,7 +38,6 @@ from flexroad.tools.prepare.raster_writer import RasterWriter
 geopandas = lazy("geopandas")
 pyogrio = lazy("pyogrio")
 
-MESHES = (".obj", ".ply", ".glb", ".gltf")
 AREAS = ("Polygon", "MultiPolygon")
 RASTER_BYTES = 4
 """Memory that reading a raster takes, as a multiple of its values: masked, compared and copied."""
@@ -48,14 +47,14 @@ LINES = ("LineString", "MultiLineString")
 
 def check_roads(common: PrepareOptions) -> None:
     """Check the roads before the work that precedes their use; a mesh is only checked to exist."""
-    path = common.roads
-    if path is None:
+    if common.roads is None:
         return
+    path, layer = file_and_layer(common.roads)
     if not path.exists():
         raise ConfigError(f"--roads {path} does not exist")
-    if path.suffix.lower() in MESHES or _is_raster(path) or _osm(path, common.roads_layer):
+    if path.suffix.lower() in MESHES or _is_raster(path) or _osm(path, layer):
         return
-    _read(path, common.roads_layer, common.roads_where, rows=1)
+    _read(path, layer, common.roads_where, rows=1)
 
 
 def add_roads(writer: RasterWriter, common: PrepareOptions) -> bool:
@@ -65,17 +64,18 @@ def add_roads(writer: RasterWriter, common: PrepareOptions) -> bool:
     """
     if common.roads is None:
         return False
+    path, layer = file_and_layer(common.roads)
     notes = list[str]()
-    mask = burn(common.roads, common.roads_layer, common.roads_where, writer.grid, notes.append)
+    mask = burn(path, layer, common.roads_where, writer.grid, notes.append)
     if mask is not None:
         writer.write("road_mask", writer.grid, mask)
-    vectors = _vectors(common.roads, common.roads_layer)
+    vectors = _vectors(path, layer)
     if vectors is not None:
         if mask is None:
             # The catalog has the layer.
             chosen = f", where: {json.dumps(common.roads_where)}" if common.roads_where else ""
             notes.append(
-                f"{common.roads} has lines, so no road mask is made; run with a configuration that has "
+                f"{path} has lines, so no road mask is made; run with a configuration that has "
                 f"segment: {{method: vector{chosen}}}"
             )
         writer.attach_roads(vectors, *notes)
@@ -176,7 +176,7 @@ def _features(
     if kinds:
         raise ConfigError(
             f"{path} has {kinds[0]}s, but roads must be polygons or lines; select a layer with "
-            "--roads-layer, or features with --roads-where"
+            "FILE|layername=NAME, or features with --roads-where"
         )
     if not set(features.geom_type) & set(LINES):
         return features
@@ -195,16 +195,8 @@ def _read(path: Path, layer: str | None, where: str | None, rows: int | None = N
     """Return the features of a layer; ``rows`` limits their number."""
     try:
         file = vector_name(path)
-        found = layers(path)
-        names = list(found)
-        if layer is None and len(names) > 1:
-            raise ConfigError(
-                f"--roads {path} has {count(len(names), 'layer')}: {listed(found)}; "
-                "name one with --roads-layer"
-            )
-        if layer is not None and layer not in names:
-            raise ConfigError(f"--roads {path} has no layer {layer!r}; it has {listed(found)}")
-        read = partial(geopandas.read_file, file, layer=layer or names[0], where=where, rows=rows)
+        layer = one_layer(f"--roads {path}", path, layer)
+        read = partial(geopandas.read_file, file, layer=layer, where=where, rows=rows)
         features, encoding = in_its_encoding(read)
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, ValueError, OSError) as error:
         raise ConfigError(
@@ -216,6 +208,6 @@ def _read(path: Path, layer: str | None, where: str | None, rows: int | None = N
         raise ConfigError(f"--roads {path} {angles}; declare its CRS with ogr2ogr -a_srs")
     if features.empty:
         condition = f" where {where}" if where else ""
-        raise ConfigError(f"{path} has no feature{condition} in layer {layer or names[0]!r}")
+        raise ConfigError(f"{path} has no feature{condition} in layer {layer!r}")
     features.attrs[ENCODING] = encoding
     return features

@@ -14,7 +14,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo, echo_document
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
 from flexroad.pipeline.run.record import Run
 from flexroad.tools.report import write_report
 
@@ -23,6 +23,7 @@ app = group()
 
 @app.command(cls=Command)
 def report(
+    ctx: typer.Context,
     path: options.Run,
     form: Annotated[
         Literal["md", "csv", "html"],
@@ -45,7 +46,6 @@ def report(
             rich_help_panel=INPUTS,
         ),
     ] = None,
-    allow: options.Allow = None,
 ) -> None:
     """Write a report on a run: failures, places, figures.
 
@@ -55,7 +55,8 @@ def report(
         given = "--compare" if compared else "--viewer"
         raise ConfigError(f"{given} is for --format html only; add that, or leave out {given}")
     others = (None if other is None else parse_location(other) for other in (viewer, compared))
-    written = write_report(Run.open(path, allow or ()), form, StepProgress(Console(stderr=True)), *others)
+    run = Run.open(path, options.allowed(ctx))
+    written = write_report(run, form, step_progress(Console(stderr=True)), *others)
     if form != "html":
         echo_document(read(written).decode())
     echo(f"written to {written}", err=True)

@@ -19,8 +19,16 @@ from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import TileState, needs_look
 from flexroad.pipeline.store.tables import METRICS, level_rows, metrics_frame, read_metrics
 from flexroad.tasks.errors import MeshFault
-from flexroad.tools.report.steps import EdgeSteps, Results, add_results, edge_steps
+from flexroad.tools.report.steps import Results, add_results, edge_steps
 
+MAIN = "Mean over tiles"
+WORST_ROADS = "Worst tiles by road L2"
+WORST_ESTIMATES = "Worst tiles by error estimate, without ground truth"
+HELD_OUT = "Error estimates at withheld squares"
+MESHES = "Meshes"
+STEPS = "Steps between neighbouring tiles"
+LARGEST_STEPS = "Largest steps between neighbouring tiles"
+"""Titles of tables."""
 FIGURES = {
     "l2_road_m": "L2 road (m)",
     "l2_terrain_m": "L2 terrain (m)",
@@ -45,7 +53,7 @@ WITH_ROADS = "with roads"
 WORST = 10
 """Rows in the tables of the worst tiles."""
 MESH_COLUMNS = ["method", "meshes", "faces", "meshes with faults", "result"]
-MESHES = (
+MESH_MEANING = (
     "A mesh has no fault if all numbers are finite, all faces have an area and look up, no faces overlap in "
     "plan, edges meet at vertices only, and no vertex is unused or there twice. A tile that has a mesh with "
     "faults is failed; the faces are those of the other meshes."
@@ -105,26 +113,8 @@ class Content:
     """The variant that is exported first."""
     reference: str
     """What the figures were measured against, in one paragraph."""
-    main: pd.DataFrame
-    """The paper's figures per variant, mean over tiles."""
-    median: pd.DataFrame
-    """The same figures, median over tiles."""
-    further: pd.DataFrame
-    """Further figures per variant, mean over tiles."""
-    strata: pd.DataFrame
-    """The main table per stratum; empty if the catalog has no strata."""
-    worst: pd.DataFrame
-    """Tiles with the highest road L2 of the exported variant."""
-    quality: pd.DataFrame
-    """Error estimates and height source per variant, mean over tiles; empty if the run has none."""
-    worst_estimates: pd.DataFrame
-    """Tiles with the highest error estimate of the exported variant; needs no ground truth."""
-    meshes: pd.DataFrame
-    """Result of the check of the meshes, per variant."""
-    steps: EdgeSteps
-    """Steps between the surfaces of neighbouring tiles."""
-    failures: pd.DataFrame
-    """One row per failed tile: stage, error, message and file."""
+    tables: dict[str, tuple[pd.DataFrame, str]]
+    """Table and explanation by title, in the order of the page; what the run has no figures for is empty."""
     versions: dict[str, str]
     config: str
     tiles: tuple[str, ...]
@@ -133,10 +123,6 @@ class Content:
     """Whether another process is computing tiles of the run."""
     results: Results = field(default_factory=dict)
     """Where the surfaces of the finished tiles are in the store."""
-    levels: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """Decks and tunnels of the exported variant; empty if no tile has some."""
-    held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """Second fits beside the squares withheld from them, per variant; empty if nothing was withheld."""
 
 
 def gather(run: Run, track: Track = untracked) -> Content:
@@ -160,6 +146,7 @@ def gather(run: Run, track: Track = untracked) -> Content:
         [(f.tile_id, f.stage, f.kind, f.message, f.file) for f in counts.failures],
         columns=["tile", "stage", "error", "message", "file"],
     )
+    steps, largest_steps, which = edge_steps(run, results, track)
     return Content(
         title=f"FlexRoad: {run.config.name} over {count(counts.tiles, 'tile')}",
         state=_state(counts),
@@ -168,18 +155,21 @@ def gather(run: Run, track: Track = untracked) -> Content:
         rows=rows,
         variant=exported,
         reference=_reference(run, set(done.tile_id)),
-        main=_over_tiles(done, variants, FIGURES, "mean"),
-        median=_over_tiles(done, variants, FIGURES, "median"),
-        further=_over_tiles(done, variants, FURTHER, "mean"),
-        strata=_per_stratum(done, variants),
-        worst=_worst(done, exported),
-        quality=over_tiles(done, variants),
-        levels=decks_and_tunnels(of_levels, exported),
-        held_out=held_out(done, variants),
-        worst_estimates=highest_error_estimates(done, exported, WORST),
-        meshes=mesh_checks(rows, run.config.chains),
-        steps=edge_steps(run, results, track=track),
-        failures=failures,
+        tables={
+            MAIN: (_over_tiles(done, variants, FIGURES, "mean"), ""),
+            "Median over tiles": (_over_tiles(done, variants, FIGURES, "median"), ""),
+            "Further figures, mean over tiles": (_over_tiles(done, variants, FURTHER, "mean"), ""),
+            "Per stratum, mean over tiles": (_per_stratum(done, variants), ""),
+            WORST_ROADS: (_worst(done, exported), ""),
+            WORST_ESTIMATES: (highest_error_estimates(done, exported, WORST), ESTIMATE_MEANING),
+            "Error estimates and height source, mean over tiles": (over_tiles(done, variants), ""),
+            "Decks and tunnels": (decks_and_tunnels(of_levels, exported), DECKS_MEANING),
+            HELD_OUT: (held_out(done, variants), HOLDOUT),
+            MESHES: (mesh_checks(rows, run.config.chains), MESH_MEANING),
+            STEPS: (steps, which),
+            LARGEST_STEPS: (largest_steps.head(10), ""),
+            "Failures": (failures, ""),
+        },
         versions=run.versions,
         config=yaml.safe_dump(run.config.raw, sort_keys=False),
         tiles=tuple(dict.fromkeys(done.tile_id)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from pathlib import Path
@@ -16,7 +16,7 @@ from markupsafe import Markup
 from flexroad.catalog.text import printable
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.quality.flagged import Place
-from flexroad.tools.report.content import DECKS_MEANING, ESTIMATE_MEANING, HOLDOUT, MESHES, Content
+from flexroad.tools.report.content import MAIN, Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
 """A number as text, with its interval if it has one."""
@@ -25,8 +25,8 @@ MARKUP = re.compile(r"[\\`*|~$]|<(?=[A-Za-z/!?])|^>|(?<![^\W_])_|_(?![^\W_])|\](
 ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 """Written for characters that some programs take for HTML also after a backslash."""
 
-MAIN = "Mean over tiles"
-WORST_ESTIMATES = "Worst tiles by error estimate, without ground truth"
+Section = tuple[str, pd.DataFrame, str]
+"""Title, table, and explanation or an empty text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,7 @@ def markdown_page(content: Content) -> str:
     """Return the report as Markdown."""
     left_out = [f"The catalog {marked(line)}." for line in content.counts.left_out]
     parts = [f"# {marked(content.title)}", content.state + ".", *left_out, marked(content.reference)]
-    for title, table, line in sections(content):
-        parts += [f"## {title}", *([line] if line else []), markdown(table)]
+    parts += markdown_sections(sections(content))
     versions = marked(", ".join(f"{name} {version}" for name, version in content.versions.items()))
     fence = "`" * max(3, 1 + max(map(len, re.findall("`+", content.config)), default=0))
     config = _without_controls(content.config)
@@ -56,7 +55,7 @@ def markdown_page(content: Content) -> str:
 
 def csv_page(content: Content) -> str:
     """Return the main table as CSV, unrounded."""
-    return csv_text(content.main)
+    return csv_text(content.tables[MAIN][0])
 
 
 def template(name: str, *folders: Path) -> jinja2.Template:
@@ -76,24 +75,9 @@ def inline(picture: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 
 
-def sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
-    """Return title, table and explanation of every table that is not empty."""
-    named = (
-        (MAIN, content.main, ""),
-        ("Median over tiles", content.median, ""),
-        ("Further figures, mean over tiles", content.further, ""),
-        ("Per stratum, mean over tiles", content.strata, ""),
-        ("Worst tiles by road L2", content.worst, ""),
-        (WORST_ESTIMATES, content.worst_estimates, ESTIMATE_MEANING),
-        ("Error estimates and height source, mean over tiles", content.quality, ""),
-        ("Decks and tunnels", content.levels, DECKS_MEANING),
-        ("Error estimates at withheld squares", content.held_out, HOLDOUT),
-        ("Meshes", content.meshes, MESHES),
-        ("Steps between neighbouring tiles", content.steps.check, content.steps.note),
-        ("Largest steps between neighbouring tiles", content.steps.edges.head(10), ""),
-        ("Failures", content.failures, ""),
-    )
-    return (section for section in named if len(section[1]))
+def sections(content: Content) -> list[Section]:
+    """Return every table that is not empty."""
+    return [(title, *entry) for title, entry in content.tables.items() if len(entry[0])]
 
 
 def are_numbers(table: pd.DataFrame) -> list[bool]:
@@ -130,6 +114,12 @@ def _without_controls(value: object) -> object:
 def marked(text: str) -> str:
     """Return a text in Markdown that shows as it is."""
     return MARKUP.sub(lambda found: ENTITIES.get(found[0], f"\\{found[0]}"), printable(text))
+
+
+def markdown_sections(parts: Iterable[Section]) -> Iterator[str]:
+    """Yield the headings, explanations and tables of a page as Markdown texts."""
+    for title, table, line in parts:
+        yield from (f"## {marked(title)}", *([line] if line else []), markdown(table))
 
 
 def markdown(table: pd.DataFrame) -> str:

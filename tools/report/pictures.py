@@ -1,4 +1,4 @@
-"""The pictures of a report: maps and mesh views of its tiles, as WebP.
+"""The pictures of a report as WebP: maps and mesh views of its tiles, and the relief of all of them.
 
 Meshes are drawn in a child process, because VTK ends its process if OpenGL is missing.
 """
@@ -6,27 +6,30 @@ Meshes are drawn in a child process, because VTK ends its process if OpenGL is m
 from __future__ import annotations
 
 import io
+import math
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from flexroad.catalog import Tile
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.finished import FinishedTile
+from flexroad.pipeline.run.finished import FinishedTile, RunPlace
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, peek_statuses, untracked
 from flexroad.tasks.metrics.mesh_distance import drape
 from flexroad.tasks.quality.estimate import compare
-from flexroad.tasks.types import Mesh
-from flexroad.tools.report.content import Content
+from flexroad.tasks.types import Floats, Mesh, RoadMask, Surface
+from flexroad.tools.report.content import WORST_ESTIMATES, WORST_ROADS, Content
 from flexroad.tools.report.pages import TilePictures
 from flexroad.tools.report.render import (
     _small,
@@ -36,15 +39,27 @@ from flexroad.tools.report.render import (
     height_source_picture,
     hillshade,
     log,
+    sunlight,
 )
+from flexroad.tools.report.steps import Results
 
 MOST = 24
 """Largest number of tiles of which all are shown; of larger runs only the worst are shown."""
-QUALITY = 80
-"""Quality of the WebP pictures, which take a quarter of the bytes of PNG."""
+QUALITY, RELIEF_QUALITY = 80, 62
+"""Quality of the WebP pictures, which take a quarter of the bytes of PNG, and that of the relief."""
 NO_MESH = "No 3D view: no usable OpenGL library (on Debian: apt-get install libegl1)."
 CHILD_START_S, CHILD_MESH_S = 60.0, 15.0
 """Time limit of the child process: a fixed part, plus a part per mesh (s)."""
+PIXELS = 2_000_000
+"""Pixels of the relief of all tiles."""
+SIDE_PX = (6, 320)
+"""Smallest and largest side of the part of one tile in it."""
+EXAGGERATION = 2.0
+"""Factor of the slopes; terrain without buildings is flat."""
+LEVEL, ROAD = 226, 92
+"""Grey of level ground and of roads."""
+OPACITY = 0.78
+"""Opacity of roads over the relief."""
 
 
 def tile_pictures(
@@ -76,7 +91,11 @@ def tile_pictures(
 def _shown(content: Content) -> list[str]:
     if len(content.tiles) <= MOST:
         return list(content.tiles)
-    return list(dict.fromkeys([*content.worst_estimates["tile"], *content.worst["tile"]]))
+    return list(
+        dict.fromkeys(
+            name for title in (WORST_ESTIMATES, WORST_ROADS) for name in content.tables[title][0]["tile"]
+        )
+    )
 
 
 def webp(picture: bytes, width_px: int | None = None) -> bytes:
@@ -177,3 +196,67 @@ def _draw_in_child(folder: Path, seconds: float) -> str:
         return f"VTK ended with signal {-child.returncode}; is OpenGL (libegl1 or libosmesa6) installed?"
     lines = child.stderr.strip().splitlines()
     return lines[-1] if child.returncode and lines else ""
+
+
+@dataclass(frozen=True)
+class _Relief:
+    """The background of the map: one picture with the tiles side by side, in squares of equal size."""
+
+    webp: bytes
+    side_px: int
+    """Side of the square of a tile."""
+    columns: int
+    """Squares in a row of the picture."""
+    places: dict[str, int]
+    """Number of the square of each tile by id, row by row from the top left."""
+
+
+def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = untracked) -> _Relief | None:
+    """Draw the surfaces of tiles as a shaded relief with their roads; None if none is in the store.
+
+    - `tiles`: the tiles to draw; those whose surface is not in the store are left out.
+    """
+    tiles = list(tiles)
+    if not tiles:
+        return None
+    side = min(max(math.isqrt(PIXELS // len(tiles)), SIDE_PX[0]), SIDE_PX[1])
+    columns = math.isqrt(len(tiles) - 1) + 1
+    picture = np.zeros((side * math.ceil(len(tiles) / columns), side * columns, 2), np.uint8)
+    place, stored = RunPlace.of(run), results.get(run.config.export.variants[0], {})
+    places: dict[str, int] = {}
+    for tile in track(tiles, "drawing the map", len(tiles)):
+        if tile.id not in stored or not (found := place.stored(*stored[tile.id])):
+            continue
+        row, column = divmod(len(places), columns)
+        square = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]
+        square[:] = _square(*found, side)
+        places[tile.id] = len(places)
+    if not places:
+        return None
+    buffer = io.BytesIO()
+    Image.fromarray(picture, "LA").convert("RGBA").save(buffer, "webp", quality=RELIEF_QUALITY, method=4)
+    return _Relief(buffer.getvalue(), side, columns, places)
+
+
+def _square(surface: Surface, road: RoadMask, side: int) -> NDArray[np.uint8]:
+    """Return grey and opacity of one tile, ``(side, side, 2)``; pixels are not square if the tile is not."""
+    grid = road.core
+    step_x, step_y = grid.width * grid.cell / side, grid.height * grid.cell / side
+    # One pixel beyond each edge, so that the shading goes on across tiles.
+    beyond: Floats = np.arange(-1.0, side + 1.0) + 0.5
+    east: Floats = np.asarray(grid.west + beyond * step_x)
+    north: Floats = np.asarray(grid.north - beyond * step_y)
+    height = surface.lattice(east, north)
+    to_south, to_east = np.gradient(EXAGGERATION * height, step_y, step_x)
+    light = sunlight(np.asarray(to_east), np.asarray(to_south))
+    grey = np.clip(LEVEL * light, 0.35 * LEVEL, 255.0)[1:-1, 1:-1]
+    share, outside = (_resampled(cells, road, side) for cells in (road.mask, road.outside))
+    grey = grey + OPACITY * share * (ROAD - grey)
+    visible = np.isfinite(grey) & (outside < 0.5)
+    return np.dstack([np.where(visible, np.nan_to_num(grey), LEVEL), 255 * visible]).astype(np.uint8)
+
+
+def _resampled(cells: NDArray[np.bool_], road: RoadMask, side: int) -> Floats:
+    """Return the share of True cells in each pixel."""
+    core = np.ascontiguousarray(cells[road.grid.window(road.core)], np.float32)
+    return np.asarray(cv2.resize(core, (side, side), interpolation=cv2.INTER_AREA), np.float64)

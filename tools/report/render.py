@@ -95,7 +95,7 @@ def _parts_picture(height: Floats, parts: Sequence[tuple[str, Bools, str]], grid
     grey = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*height.shape, 3))
     rgb = _shaded(grey, height, grid.cell)
     for _, mask, colour in parts:
-        rgb = _laid_over(rgb, mask, colour, OVERLAY)
+        rgb = np.where(mask[..., None], (1 - OVERLAY) * rgb + OVERLAY * np.array(to_rgb(colour)), rgb)
     figure, axes = _map(rgb, grid)
     entries = [
         Patch(color=colour, alpha=OVERLAY, label=f"{name}\n{mask.sum() * grid.cell**2:,.0f} m²")
@@ -206,11 +206,6 @@ def sunlight(east: Floats, south: Floats) -> Floats:
     sun_east, sun_north = math.sin(azimuth) * math.cos(altitude), math.cos(azimuth) * math.cos(altitude)
     facing = (math.sin(altitude) - sun_east * east + sun_north * south) / np.sqrt(1 + east**2 + south**2)
     return np.asarray(facing / math.sin(altitude))
-
-
-def _laid_over(rgb: Floats, mask: Bools, colour: str, opacity: float) -> Floats:
-    """Blend a colour into the cells of a mask."""
-    return np.where(mask[..., None], (1 - opacity) * rgb + opacity * np.array(to_rgb(colour)), rgb)
 
 
 def _map(

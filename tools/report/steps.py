@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -18,7 +17,7 @@ from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
+from flexroad.pipeline.run.status import TileStatus, Track, untracked
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 Results = dict[str, dict[str, tuple[str, str]]]
@@ -35,14 +34,6 @@ def add_results(results: Results, status: TileStatus) -> None:
             results.setdefault(variant, {})[graph.tile.id] = stages["fit"], stages["segment"]
 
 
-def find_results(run: Run, tiles: Iterable[Tile]) -> Results:
-    """Return the results of those tiles that are finished; checks each of them."""
-    results: Results = {}
-    for status in peek_statuses(run, tiles):
-        add_results(results, status)
-    return results
-
-
 MEAN, LARGEST, ON_ROAD, ANGLE = "mean step (m)", "largest step (m)", "on road, mean (m)", "largest angle (°)"
 COLUMNS = ["variant", "tile", "neighbour", MEAN, LARGEST, ON_ROAD, ANGLE]
 CHECK = ["variant", "edges", MEAN, LARGEST, ANGLE, "result"]
@@ -52,32 +43,18 @@ KEPT = 1024
 """Tiles whose surfaces are kept in memory until their other neighbours are compared."""
 
 
-@dataclass(frozen=True, eq=False)
-class EdgeSteps:
-    """Steps at the shared edges of the finished tiles of a run."""
-
-    check: pd.DataFrame
-    """One row per exported variant: columns `CHECK`; empty if no two neighbours are done."""
-    edges: pd.DataFrame
-    """One row per edge where the surfaces do not meet: columns `COLUMNS`, largest steps first."""
-    note: str
-    """Which tiles were compared; empty if all."""
-
-
 def edge_steps(
-    run: Run, results: Results | None = None, most: int = MOST, track: Track = untracked
-) -> EdgeSteps:
-    """Return the steps per exported variant and pair of neighbours.
+    run: Run, results: Results, track: Track = untracked
+) -> tuple[pd.DataFrame, pd.DataFrame, str]:
+    """Return the steps at the shared edges of finished tiles; surfaces missing from the store are left out.
 
-    - `run`: the run; pairs whose surfaces are not in its store are left out.
-    - `results`: the results of all finished tiles; by default the tiles to be compared are checked.
-    - `most`: largest number of tiles compared with their neighbours.
+    - result: one row per exported variant, columns `CHECK`, empty if no two neighbours are done; one row per
+      edge where the surfaces do not meet, columns `COLUMNS`, largest steps first; and which tiles were
+      compared, empty if all.
     """
     tiles = run.catalog.usable
-    every = math.ceil(len(tiles) / most)
+    every = math.ceil(len(tiles) / MOST)
     pairs = list(_pairs(tiles, every))
-    if results is None:
-        results = find_results(run, {tile.id: tile for pair in pairs for tile in pair}.values())
     rows = [
         row
         for variant in run.config.export.variants
@@ -89,15 +66,12 @@ def edge_steps(
     check = [_checked(run, str(variant), part) for variant, part in table.groupby("variant", sort=False)]
     apart = table[(table[LARGEST] != 0) | (table[ANGLE] != 0)]
     note = f"Of one tile in {every}, against its neighbours in the east and north." if every > 1 else ""
-    return EdgeSteps(
-        pd.DataFrame(check, columns=CHECK),
-        apart.sort_values(LARGEST, ascending=False, ignore_index=True),
-        note,
-    )
+    apart = apart.sort_values(LARGEST, ascending=False, ignore_index=True)
+    return pd.DataFrame(check, columns=CHECK), apart, note
 
 
 def _checked(run: Run, variant: str, edges: pd.DataFrame) -> tuple[str, int, float, float, float, str]:
-    """Return the row of a variant in the table `EdgeSteps.check`."""
+    """Return the row of a variant in the table of `CHECK`."""
     largest, angle = float(edges[LARGEST].max()), float(edges[ANGLE].max())
     result = "tiles are fitted independently"
     if has_borders(run.config.chains[variant]["fit"]):
@@ -158,7 +132,9 @@ def _step(
     step = np.abs(a.height(east, north) - b.height(east, north))
     angle = _angle_deg(a.normal(east, north), b.normal(east, north))
     on_road = inside & road.mask[cells]
-    return _mean(step[inside]), _largest(step[inside]), _mean(step[on_road]), _largest(angle[inside])
+    # Other than max, fmax leaves out NaN, and is NaN if there is nothing else.
+    largest, turn = (float(np.fmax.reduce(values[inside], initial=math.nan)) for values in (step, angle))
+    return _mean(step[inside]), largest, _mean(step[on_road]), turn
 
 
 def _angle_deg(a: Floats, b: Floats) -> Floats:
@@ -170,8 +146,3 @@ def _angle_deg(a: Floats, b: Floats) -> Floats:
 def _mean(values: Floats) -> float:
     values = values[np.isfinite(values)]
     return float(values.mean()) if values.size else math.nan
-
-
-def _largest(values: Floats) -> float:
-    values = values[np.isfinite(values)]
-    return float(values.max()) if values.size else math.nan

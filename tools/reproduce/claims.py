@@ -107,7 +107,7 @@ def check(claim: Claim, means: Means, dataset: str = GEROD) -> Verdict:
     - `dataset`: the paper's dataset that the run is compared with; claims about other datasets are not
       tested.
     """
-    paper = [_paper(claim, name) for name in claim.variants]
+    paper = [published(name, claim.dataset).value(claim.figure) for name in claim.variants]
     if claim.dataset != dataset or not means.variants.issuperset(claim.variants):
         printed = _ordered(claim.figure, paper) if claim.quoted is None else percent(paper[1] / paper[0])
         return Verdict(claim, printed, "–", "–", NOT_TESTED)
@@ -172,13 +172,6 @@ def _share(verdict: str, paper: float, resampled: Floats) -> float:
 
 def _if_certain(verdict: str, share: float) -> str:
     return verdict if verdict == NOT_TESTED or 100 * share >= LEVEL else NOT_DECIDED
-
-
-def _paper(claim: Claim, variant: str) -> float:
-    row = published(variant, claim.dataset)
-    if row is None:
-        raise KeyError(variant)
-    return row.value(claim.figure)
 
 
 def _ordered(figure: str, values: list[float]) -> str:

@@ -25,6 +25,7 @@ Output = Annotated[
 
 @app.command(cls=Command)
 def tables(
+    ctx: typer.Context,
     path: options.Run,
     output: Output,
     true: Annotated[
@@ -66,32 +67,31 @@ def tables(
             rich_help_panel=INPUTS,
         ),
     ] = None,
-    allow: options.Allow = None,
 ) -> None:
     """Write the paper's tables and claims beside the values of a run.
 
     They are Markdown, LaTeX, CSV and HTML.
     """
     folders = (true, dsc3d, dsc3d_true, literal, dsm)
-    runs = [Run.open(folder, allow or ()) if folder else None for folder in folders]
-    for written in write_comparison(Run.open(path, allow or ()), runs[0], output, *runs[1:]):
+    runs = [Run.open(folder, options.allowed(ctx)) if folder else None for folder in folders]
+    for written in write_comparison(Run.open(path, options.allowed(ctx)), runs[0], output, *runs[1:]):
         echo(str(written))
 
 
 @app.command(cls=Command)
 def figures(
+    ctx: typer.Context,
     path: options.Run,
     output: Output,
     tile: Annotated[
         str | None,
         typer.Option(metavar="ID", help="Tile of the maps; default: the one with the median road L2."),
     ] = None,
-    allow: options.Allow = None,
 ) -> None:
     """Draw the paper's figures from a run.
 
     They are PDF and PNG, small WebP pictures, and a page of captions.
     """
-    for note in write_figures(Run.open(path, allow or ()), output, tile):
+    for note in write_figures(Run.open(path, options.allowed(ctx)), output, tile):
         echo(f"note: {note}", err=True)
     echo(f"figures in {output / 'figures.md'}")

@@ -20,15 +20,9 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tools.reproduce import tile_figures
-from flexroad.tools.reproduce.layout import FLEXROAD, PATH, STRATA, STYLE, TRUTH, FigureFile, new_figure, save
+from flexroad.tools.reproduce.layout import FLEXROAD, PATH, STRATA, STYLE, TRUTH, Captioned, new_figure, save
 from flexroad.tools.reproduce.metrics_data import collect
-from flexroad.tools.reproduce.tile_view import (
-    Roles,
-    changes,
-    read_tile_view,
-    roles_of,
-    typical_tile,
-)
+from flexroad.tools.reproduce.tile_view import changes, read_tile_view, roles_of, typical_tile
 
 SWEEPS: dict[str, tuple[str, ...]] = {
     "Control grid": ("fit.control_points",),
@@ -39,47 +33,41 @@ SWEEPS: dict[str, tuple[str, ...]] = {
 BINS = 12
 
 
-def write_figures(
-    run: Run, folder: Path, tile_id: str | None = None, roles: Roles | None = None
-) -> list[str]:
+def write_figures(run: Run, folder: Path, tile_id: str | None = None) -> list[str]:
     """Draw every figure whose variants are in the run, and write ``figures.md`` with the captions.
 
     - `folder`: folder for NAME.pdf, NAME.png, NAME.webp and figures.md.
     - `tile_id`: the tile of the maps, renders and profile; by default the tile with the median road L2.
-    - `roles`: which variant is which method; by default derived from the variants' options.
     - result: one line per figure that could not be drawn, with the reason.
     """
-    roles = roles or roles_of(run.config)
+    roles = roles_of(run.config)
+    full = roles["full"]
     data = collect(run)
     rows = read_metrics(run.path)
     # As in the tables: only tiles with every variant.
     done = rows[rows.tile_id.isin(data.tiles.index[data.tiles.complete])]
+    page, missing = [data.line, "# Figures"], []
     with rc_context(STYLE):
-        view = read_tile_view(run, tile_id or typical_tile(done, roles.full), roles)
-        files = [
-            tile_figures.road_profile(view, roles),
-            tile_figures.error_maps(view, roles),
-            tile_figures.ablation_renders(view, roles),
-            trade_off(run.config, roles.full, done),
-            dataset(statistics(run, roles.full, done)),
-        ]
-        missing = [f"no figure {file.name}: {file.missing}" for file in files if file.figure is None]
-        for file in files:
-            if file.figure is not None:
-                save(file.figure, folder, file.name)
-    write(folder / "figures.md", _page(data.line, files).encode())
+        view = read_tile_view(run, tile_id or typical_tile(done, full), roles)
+        drawn = {
+            "road_profile": tile_figures.road_profile(view),
+            "error_and_smoothness": tile_figures.error_maps(view),
+            "ablation_renders": tile_figures.ablation_renders(view),
+            "trade_off": trade_off(run.config, full, done),
+            "dataset": dataset(statistics(run, full, done)),
+        }
+        for name, (caption, figure) in drawn.items():
+            if isinstance(figure, str):
+                missing.append(f"no figure {name}: {figure}")
+                page.append(f"No figure `{name}`: {figure}")
+            else:
+                save(figure, folder, name)
+                page.append(f"![{name}]({name}.png)\n\n{caption}")
+    write(folder / "figures.md", ("\n\n".join(page) + "\n").encode())
     return missing
 
 
-def _page(data: str, files: list[FigureFile]) -> str:
-    parts = [data, "# Figures"]
-    for file in files:
-        image = f"![{file.name}]({file.name}.png)\n\n{file.caption}"
-        parts.append(image if file.figure is not None else f"No figure `{file.name}`: {file.missing}")
-    return "\n\n".join(parts) + "\n"
-
-
-def trade_off(config: Config, full: str, done: pd.DataFrame) -> FigureFile:
+def trade_off(config: Config, full: str, done: pd.DataFrame) -> Captioned:
     """Make the figure: road L2 over road MAD, mean over tiles, for each sweep in the run."""
     sweeps = {title: sweep(config.chains, full, options) for title, options in SWEEPS.items()}
     sweeps = {title: labels for title, labels in sweeps.items() if len(labels) > 1}
@@ -89,13 +77,12 @@ def trade_off(config: Config, full: str, done: pd.DataFrame) -> FigureFile:
         "lower is more accurate."
     )
     if not sweeps:
-        missing = (
+        return caption, (
             "no variant changes only the control grid, the degree or the sampling; `--config ablation` has "
             "such variants"
         )
-        return FigureFile("trade_off", caption, None, missing)
     means = done.groupby("variant")[["mad_road_deg", "l2_road_m"]].mean()
-    return FigureFile("trade_off", caption, draw_trade_off(means, sweeps, full))
+    return caption, draw_trade_off(means, sweeps, full)
 
 
 def sweep(chains: Mapping[str, Chain], full: str, options: tuple[str, ...]) -> dict[str, str]:
@@ -104,10 +91,11 @@ def sweep(chains: Mapping[str, Chain], full: str, options: tuple[str, ...]) -> d
     - result: label by variant, ordered by the options' values; empty if the methods of the full pipeline lack
       one of the options.
     """
-    if not all(hasattr(chains[full][stage], name) for stage, _, name in (o.partition(".") for o in options)):
+    split = [option.split(".") for option in options]
+    if not all(hasattr(chains[full][stage], name) for stage, name in split):
         return {}
     values = {
-        variant: tuple(_value(chain, option) for option in options)
+        variant: tuple(getattr(chain[stage], name) for stage, name in split)
         for variant, chain in chains.items()
         if changes(chain, chains[full]) <= set(options)
     }
@@ -117,11 +105,6 @@ def sweep(chains: Mapping[str, Chain], full: str, options: tuple[str, ...]) -> d
         variant: " / ".join(map(_text, distinct[variant]))
         for variant in sorted(distinct, key=distinct.__getitem__)
     }
-
-
-def _value(chain: Chain, option: str) -> Any:
-    stage, name = option.split(".")
-    return getattr(chain[stage], name)
 
 
 def _text(value: Any) -> str:
@@ -184,14 +167,14 @@ def statistics(run: Run, full: str, done: pd.DataFrame) -> pd.DataFrame:
     return table.reset_index(drop=True)
 
 
-def dataset(table: pd.DataFrame) -> FigureFile:
+def dataset(table: pd.DataFrame) -> Captioned:
     """Make the figure: tiles per stratum, and histograms of road share and height range."""
     caption = (
         f"The {len(table)} tiles: number per stratum, road share by the evaluation mask, and height range "
         "of the DSM, houses and trees included. Dashed: the means, "
         f"{table.road_percent.mean():.1f}% and {table.height_range_m.mean():.1f} m."
     )
-    return FigureFile("dataset", caption, draw_dataset(table))
+    return caption, draw_dataset(table)
 
 
 def draw_dataset(table: pd.DataFrame) -> Figure:
@@ -202,7 +185,9 @@ def draw_dataset(table: pd.DataFrame) -> Figure:
     order = [*STRATA, *sorted(set(named) - set(STRATA))]
     groups = {name or "tiles": named[name] for name in order if name in named}
     rectangles = bars.bar(
-        list(groups), [len(part) for part in groups.values()], color=[_colour(name) for name in groups]
+        list(groups),
+        [len(part) for part in groups.values()],
+        color=[STRATA.get(name, STRATA[""]) for name in groups],
     )
     bars.bar_label(rectangles, fontsize=7)
     bars.set_ylabel("tiles")
@@ -214,16 +199,18 @@ def draw_dataset(table: pd.DataFrame) -> Figure:
     return figure
 
 
-def _colour(name: str) -> str:
-    return STRATA.get(name, STRATA[""])
-
-
 def _histogram(
     axes: Axes, table: pd.DataFrame, groups: dict[str, pd.DataFrame], column: str, label: str
 ) -> None:
     edges = list(np.histogram_bin_edges(table[column].dropna(), BINS))
     parts: Any = [part[column].dropna() for part in groups.values()]
-    axes.hist(parts, edges, stacked=True, label=list(groups), color=[_colour(name) for name in groups])
+    axes.hist(
+        parts,
+        edges,
+        stacked=True,
+        label=list(groups),
+        color=[STRATA.get(name, STRATA[""]) for name in groups],
+    )
     mean = table[column].mean()
     axes.axvline(mean, color=PATH, linestyle="--", linewidth=0.9)
     axes.set_title(f"mean {mean:.1f}", color=PATH)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -55,17 +54,8 @@ LEAST = 1e-9
 """Replaces zeros, which have no logarithm."""
 
 
-@dataclass(frozen=True, eq=False)
-class FigureFile:
-    """A figure with its file name and caption, or the reason why it was not drawn."""
-
-    name: str
-    """Name of the files, without suffix."""
-    caption: str
-    figure: Figure | None
-    """None if it was not drawn."""
-    missing: str = ""
-    """Why it was not drawn."""
+Captioned = tuple[str, Figure | str]
+"""A caption, and the figure or the reason why it was not drawn."""
 
 
 def new_figure(height_in: float) -> Figure:

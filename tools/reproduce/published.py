@@ -28,8 +28,6 @@ class Row:
 
     def value(self, figure: str) -> float:
         """Return a figure by its column name in metrics.parquet."""
-        if figure not in FIGURES:
-            raise KeyError(figure)
         return float(getattr(self, figure))
 
 
@@ -74,10 +72,10 @@ BASE = TABLE_II[0].variant
 """The variant that the ablation's changes are relative to."""
 
 
-def published(variant: str, dataset: str = GEROD) -> Row | None:
-    """Return a variant's row, from Table II if it is in both tables; None if it is in neither."""
+def published(variant: str, dataset: str = GEROD) -> Row:
+    """Return a variant's row, from Table II if it is in both tables."""
     rows = TABLE_I_DSC3D if dataset == DSC3D else (*TABLE_II, *TABLE_I)
-    return next((row for row in rows if row.variant == variant), None)
+    return next(row for row in rows if row.variant == variant)
 
 
 class Claim(NamedTuple):

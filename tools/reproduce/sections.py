@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from flexroad.catalog.text import count
 from flexroad.tools.report.content import FIGURES
+from flexroad.tools.report.pages import Section
 from flexroad.tools.reproduce.claims import (
     HELD,
     LEVEL,
@@ -51,16 +51,6 @@ REASONS = {
 """Why a change of the benchmark has another sign than the paper's, by variant and figure."""
 
 
-@dataclass(frozen=True, eq=False)
-class Section:
-    """One table of the page with its heading."""
-
-    title: str
-    table: pd.DataFrame
-    line: str = ""
-    """The data of the table, if not the page's main data."""
-
-
 def side_by_side(
     name: str, rows: tuple[Row, ...], ours: Mapping[str, Means], line: str = ""
 ) -> Iterator[Section]:
@@ -85,7 +75,7 @@ def side_by_side(
                 table[f"{label}, difference"] = [
                     format_difference(a - b, figure) for a, b in zip(values, paper, strict=True)
                 ]
-        yield Section(f"{name}: {label_without_unit(figures[0]).split()[0]}", table, line)
+        yield f"{name}: {label_without_unit(figures[0]).split()[0]}", table, line
 
 
 def numbers(name: str, rows: tuple[Row, ...], classes: str, means: Means, data: str) -> pd.DataFrame:
@@ -106,14 +96,8 @@ def verdicts_table(verdicts: Mapping[str, list[Verdict]]) -> pd.DataFrame:
     """Return claims with their verdicts: all columns for the first run, two columns for each other run."""
     first, *others = verdicts.values()
     table = pd.DataFrame(
-        {
-            "claim": [v.claim.text for v in first],
-            "section": [v.claim.where for v in first],
-            "paper": [v.paper for v in first],
-            "ours": [v.ours for v in first],
-            "certainty": [v.certainty for v in first],
-            "verdict": [v.verdict for v in first],
-        }
+        [(v.claim.text, v.claim.where, v.paper, v.ours, v.certainty, v.verdict) for v in first],
+        columns=["claim", "section", "paper", "ours", "certainty", "verdict"],
     )
     for name, other in zip(list(verdicts)[1:], others, strict=True):
         table[f"ours, {name}"] = [v.ours for v in other]
@@ -151,45 +135,15 @@ def _with_interval(means: Means, variant: str, figure: str) -> str:
     return f"{mean} [{low_text}, {high_text}]"
 
 
-class _Change(NamedTuple):
-    """One cell of Table II as a change from the full pipeline, and ours."""
-
-    row: Row
-    figure: str
-    paper: float
-    """The paper's ratio to the full pipeline."""
-    ours: float
-    verdict: str
-    """`HELD`, `WEAKER`, `STRONGER` or `NOT_HELD`, by the rule for claims."""
-    certain: bool
-    """Whether enough resamples of the tiles give this verdict."""
-
-
-def changes(rows: tuple[Row, ...], means: Means) -> list[_Change]:
-    """Return the changes of Table II that exceed `LEAST` in the paper."""
-    base = next(row for row in rows if row.variant == BASE)
-    scored = []
-    for row in rows:
-        for figure in FIGURES_SCORED:
-            paper = row.value(figure) / base.value(figure)
-            if row is base or abs(paper - 1) <= LEAST:
-                continue
-            ours, resampled = means.ratio(row.variant, BASE, figure)
-            verdict = strength(ours, paper)
-            if verdict != NOT_TESTED:
-                certain = decided(verdict, paper, resampled)
-                scored.append(_Change(row, figure, paper, ours, verdict, certain))
-    return scored
-
-
 def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
     """Return the counts of the changes by figure, and the list of those that are opposite or flat."""
-    scored = changes(rows, means)
+    scored, opposite = _changes(rows, means)
     if not scored:
         return ()
-    counts = pd.DataFrame([_counts(f"{label_without_unit(f)}", [c for c in scored if c.figure == f])
-                           for f in FIGURES_SCORED] + [_counts("all", scored)])  # fmt: skip
-    verdicts = Counter(change.verdict for change in scored)
+    labels = [label_without_unit(figure) for figure in FIGURES_SCORED]
+    parts = {label: [change for change in scored if change[0] == label] for label in labels}
+    counts = pd.DataFrame([_counts(name, part) for name, part in (parts | {"all": scored}).items()])
+    verdicts = Counter(verdict for _, verdict, _ in scored)
     kinds = ", ".join(f"{verdicts[kind]} {name}" for kind, name in KINDS.items())
     line = (
         f"{len(scored)} changes of L2 and MAD by more than {LEAST:.0%} in the paper: {kinds}. Within: the "
@@ -197,44 +151,61 @@ def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
         "above; opposite or flat: no change or one of the other sign. Not decided: of these, the changes for "
         f"which fewer than {LEVEL}% of the resamples give the same answer."
     )
-    sections = [Section("Table II: how close the changes are", counts, line)]
-    opposite = [change for change in scored if change.verdict == NOT_HELD]
+    sections = [("Table II: how close the changes are", counts, line)]
     if opposite:
-        table = pd.DataFrame([_opposite(change) for change in opposite])
-        sections.append(Section("Table II: changes that are opposite or flat", table))
+        sections.append(("Table II: changes that are opposite or flat", pd.DataFrame(opposite), ""))
     return tuple(sections)
 
 
-def _counts(name: str, scored: list[_Change]) -> dict[str, str]:
-    verdicts = Counter(change.verdict for change in scored)
-    undecided = sum(not change.certain for change in scored)
+def _changes(rows: tuple[Row, ...], means: Means) -> tuple[list[tuple[str, str, bool]], list[dict[str, str]]]:
+    """Return the changes that exceed `LEAST` in the paper, and the rows of the table of opposite ones.
+
+    Of each change: the figure's label, the verdict by the rule for claims, and whether enough resamples of
+    the tiles give it.
+    """
+    base = next(row for row in rows if row.variant == BASE)
+    scored, opposite = [], []
+    for row in rows:
+        for figure in FIGURES_SCORED:
+            label, paper = label_without_unit(figure), row.value(figure) / base.value(figure)
+            if row is base or abs(paper - 1) <= LEAST:
+                continue
+            ours, resampled = means.ratio(row.variant, BASE, figure)
+            verdict = strength(ours, paper)
+            if verdict != NOT_TESTED:
+                scored.append((label, verdict, decided(verdict, paper, resampled)))
+            if verdict == NOT_HELD:
+                reason = REASONS.get((row.variant, figure), "–")
+                cells = {
+                    "variant": row.label,
+                    "figure": label,
+                    "paper": percent(paper),
+                    "ours": percent(ours),
+                }
+                opposite.append(cells | {"reason": reason})
+    return scored, opposite
+
+
+def _counts(name: str, scored: list[tuple[str, str, bool]]) -> dict[str, str]:
+    verdicts = Counter(verdict for _, verdict, _ in scored)
+    undecided = sum(not certain for _, _, certain in scored)
     cells = {"figure": name, "changes": len(scored)}
     cells |= {column: verdicts[kind] for kind, column in KINDS.items()} | {NOT_DECIDED: undecided}
     return {column: str(value) for column, value in cells.items()}
 
 
-def _opposite(change: _Change) -> dict[str, str]:
-    return {
-        "variant": change.row.label,
-        "figure": label_without_unit(change.figure),
-        "paper": percent(change.paper),
-        "ours": percent(change.ours),
-        "reason": REASONS.get((change.row.variant, change.figure), "–"),
-    }
-
-
 def literal_column(data: MetricsData) -> dict[str, Means]:
     """Return the means of the literal run by the name of its column; empty without such a run."""
-    return {_name(data): _means(data.literal)} if data.literal else {}
+    return {_name(data, data.literal): _means(data.literal)} if data.literal else {}
 
 
 def literal_notes(data: MetricsData) -> Iterator[str]:
     """Yield the note that explains the second column, if there is one."""
     if data.literal:
         yield (
-            f"The column “{_name(data)}” has the paper read literally: the points S(u, v) lie in space where "
-            "the weights move them, weights are positive without bounds, and the last step of the fit is its "
-            f"result (configs/literal.yaml). {data.literal.line} It was not tuned."
+            f"The column “{_name(data, data.literal)}” has the paper read literally: the points S(u, v) lie "
+            "in space where the weights move them, weights are positive without bounds, and the last step "
+            f"of the fit is its result (configs/literal.yaml). {data.literal.line} It was not tuned."
         )
 
 
@@ -266,7 +237,7 @@ def literal_sections(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Secti
         for name, means in columns.items():
             distances = distances_of(rows, means, relative=kind == "changes")
             table[f"{kind}, {name}"] = [_factor(row) for row in (*distances, distances.ravel())]
-    yield Section(
+    yield (
         "Table II: factors from the paper",
         table,
         f"Typical factor between the paper and us over L2 and MAD of road and terrain, on "
@@ -285,7 +256,7 @@ def road_sections(rows: tuple[Row, ...], means: Means, data: MetricsData) -> Ite
         table[f"{FIGURES[ROAD_L2]}, ours by the {name}"] = [
             _with_interval(column, row.variant, ROAD_L2) for row in rows
         ]
-    yield Section(
+    yield (
         "L2 on roads by the reference and by the DSM",
         table,
         "The same meshes and the same road mask, measured against the reference, and against the DSM where "
@@ -324,8 +295,6 @@ def _means(data: MetricsData) -> Means:
     return bootstrap(data.part(data.classes[0]))
 
 
-def _name(data: MetricsData) -> str:
-    if not data.literal:
-        raise ValueError("no literal run")
-    tiles, all_tiles = (int(part.tiles.complete.sum()) for part in (data.literal, data))
+def _name(data: MetricsData, literal: MetricsData) -> str:
+    tiles, all_tiles = (int(part.tiles.complete.sum()) for part in (literal, data))
     return "literal" if tiles == all_tiles else f"literal ({tiles} tiles)"

@@ -31,11 +31,11 @@ from flexroad.tools.reproduce.layout import (
     PLANE,
     RAW,
     TRUTH,
-    FigureFile,
+    Captioned,
     drawable,
     new_figure,
 )
-from flexroad.tools.reproduce.tile_view import Result, Roles, TileView, missing_roles, vehicle_trajectory
+from flexroad.tools.reproduce.tile_view import Result, TileView, missing_roles, vehicle_trajectory
 
 MOST_ERROR_M = 0.5
 """Limit of the error axis of the profile (m)."""
@@ -47,7 +47,7 @@ CLOSE_M = 120.0
 """Side of the square that is drawn (m); on a complete tile the details would be too small."""
 
 
-def road_profile(view: TileView, roles: Roles) -> FigureFile:
+def road_profile(view: TileView) -> Captioned:
     """Make the figure: map of the path, heights along it and their errors."""
     row, col = vehicle_trajectory(view.street)
     caption = (
@@ -56,17 +56,17 @@ def road_profile(view: TileView, roles: Roles) -> FigureFile:
         f"differences from {view.against} (bottom, cut off at {MOST_ERROR_M:g} m). Peaks of the DSM are "
         "objects on or above the road."
     )
-    missing = missing_roles((("Plane", roles.plane),)) or ("" if row.size > 1 else "the tile has no road")
-    if missing or roles.plane is None:
-        return FigureFile("road_profile", caption, None, missing)
+    missing = missing_roles(view, {"Plane": "plane"}) or ("" if row.size > 1 else "the tile has no road")
+    if missing:
+        return caption, missing
     rasters = {
         "truth": view.truth,
         "raw DSM": view.dsm,
-        "Plane": view.results[roles.plane].height,
-        "FlexRoad": view.results[roles.full].height,
+        "Plane": view.results["plane"].height,
+        "FlexRoad": view.results["full"].height,
     }
     heights = {label: along(raster, row, col) for label, raster in rasters.items()}
-    return FigureFile("road_profile", caption, draw_profile(view, row, col, heights))
+    return caption, draw_profile(view, row, col, heights)
 
 
 def along(raster: Floats, row: Floats, col: Floats) -> Floats:
@@ -140,27 +140,25 @@ def _frame_profile(upper: Axes, lower: Axes, at: Floats, heights: dict[str, Floa
         axes.set_xlim(0, at[-1])
 
 
-def error_maps(view: TileView, roles: Roles) -> FigureFile:
+def error_maps(view: TileView) -> Captioned:
     """Make the figure: vertical error per cell above mean angle per face, for the three methods."""
-    methods = (("Plane", roles.plane), ("RGT", roles.rgt), ("FlexRoad", roles.full))
-    missing = missing_roles(methods)
+    methods = {"Plane": "plane", "RGT": "rgt", "FlexRoad": "full"}
     caption = (
         f"{view}: vertical distance to {view.against} per cell (top) and mean angle of each face to its "
         "neighbours (bottom) for Plane, RGT and FlexRoad. Both scales are logarithmic; values outside a "
         "scale have the colour of its end. The titles give the tile's means, as in the run's table."
     )
-    columns = {label: variant for label, variant in methods if variant is not None}
-    return FigureFile("error_and_smoothness", caption, None if missing else draw_maps(view, columns), missing)
+    return caption, missing_roles(view, methods) or draw_maps(view, methods)
 
 
 def draw_maps(view: TileView, columns: dict[str, str]) -> Figure:
-    """Draw one column of two maps per variant; `columns` gives the variant of each label."""
+    """Draw one column of two maps per method; `columns` gives the role of each label."""
     figure = new_figure(4.6)
     axes = figure.subplots(2, len(columns), sharex=True, sharey=True, squeeze=False)
     artists: list[tuple[AxesImage, Collection]] = []
-    for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
-        result = view.results[variant]
-        artists.append((_errors(upper, view, variant), _angles(lower, result, view.grid)))
+    for (upper, lower), (label, role) in zip(axes.T, columns.items(), strict=True):
+        result = view.results[role]
+        artists.append((_errors(upper, view, role), _angles(lower, result, view.grid)))
         m = result.metrics
         upper.set_title(f"{label}\nroad {m.l2_road_m:.3f} m, terrain {m.l2_terrain_m:.3f} m")
         lower.set_title(f"road {m.mad_road_deg:.2f}°, terrain {m.mad_terrain_deg:.2f}°")
@@ -172,9 +170,9 @@ def draw_maps(view: TileView, columns: dict[str, str]) -> Figure:
     return figure
 
 
-def _errors(axes: Axes, view: TileView, variant: str) -> AxesImage:
+def _errors(axes: Axes, view: TileView, role: str) -> AxesImage:
     size = (0.0, view.grid.width * view.grid.cell, 0.0, view.grid.height * view.grid.cell)
-    error = drawable(view.error(variant))
+    error = drawable(view.error(role))
     return axes.imshow(
         error, cmap=ERROR_COLOURS, norm=ERROR_NORM, extent=size, origin="upper", interpolation="nearest"
     )
@@ -210,26 +208,22 @@ def _frame_maps(axes: np.ndarray, grid: Grid) -> None:
         panel.set_xlabel("m east")
 
 
-def ablation_renders(view: TileView, roles: Roles) -> FigureFile:
+def ablation_renders(view: TileView) -> Captioned:
     """Make the figure: oblique views of the three meshes. Needs OpenGL."""
-    methods = (("w/o NURBS", roles.wo_nurbs), ("w/o ECSRC", roles.wo_ecsrc), ("FlexRoad in full", roles.full))
+    methods = {"w/o NURBS": "wo_nurbs", "w/o ECSRC": "wo_ecsrc", "FlexRoad in full": "full"}
     caption = (
         f"{view}: meshes without NURBS, without ECSRC and of the full pipeline, coloured by their vertical "
         f"distance to {view.against} as in the error maps. The square of {CLOSE_M:g} m is the one in which "
         "ECSRC drops the largest area of the road mask; on the complete tile it drops "
         f"{view.dropped.sum() * view.grid.cell**2:,.0f} m²."
     )
-    columns = {label: variant for label, variant in methods if variant is not None}
-    missing = missing_roles(methods)
-    if missing:
-        return FigureFile("ablation_renders", caption, None, missing)
-    meshes = {variant: view.results[variant].mesh for variant in columns.values()}
-    colours = {variant: vertex_colours(view, variant) for variant in columns.values()}
+    if missing := missing_roles(view, methods):
+        return caption, missing
+    meshes = {label: view.results[role].mesh for label, role in methods.items()}
+    colours = {label: vertex_colours(view, role) for label, role in methods.items()}
     pictures = render_meshes(meshes, colours, busiest(view.dropped, view.grid), SIZE_PX)
-    images = {label: png for label, variant in columns.items() if (png := pictures[variant]) is not None}
-    if len(images) < len(columns):
-        return FigureFile("ablation_renders", caption, None, NO_MESH)
-    return FigureFile("ablation_renders", caption, draw_renders(images))
+    images = {label: png for label, png in pictures.items() if png is not None}
+    return caption, NO_MESH if len(images) < len(methods) else draw_renders(images)
 
 
 def busiest(dropped: Bools, grid: Grid) -> Bounds:
@@ -242,11 +236,11 @@ def busiest(dropped: Bools, grid: Grid) -> Bounds:
     return west, north - n * grid.cell, west + n * grid.cell, north
 
 
-def vertex_colours(view: TileView, variant: str) -> NDArray[np.uint8]:
+def vertex_colours(view: TileView, role: str) -> NDArray[np.uint8]:
     """Return the colour of the error in the cell under each vertex, ``(V, 3)``, red, green and blue."""
-    mesh = view.results[variant].mesh
+    mesh = view.results[role].mesh
     row, col = view.grid.cells(mesh.vertices[:, 0] + mesh.origin[0], mesh.vertices[:, 1] + mesh.origin[1])
-    error = drawable(view.error(variant)[row, col])
+    error = drawable(view.error(role)[row, col])
     colours = colormaps[ERROR_COLOURS].with_extremes(bad=UNKNOWN)
     return np.asarray(colours(ERROR_NORM(error), bytes=True)[:, :3])
 

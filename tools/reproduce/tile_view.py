@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,37 +31,23 @@ SIDE = 0.5
 """Shift to the right, as a fraction of the distance from the middle of the road to its edge."""
 
 
-@dataclass(frozen=True)
-class Roles:
-    """Names of the variants by method; None if the run has no such variant."""
-
-    full: str
-    """FlexRoad, the full pipeline, which the others are compared with."""
-    plane: str | None = None
-    rgt: str | None = None
-    wo_nurbs: str | None = None
-    wo_ecsrc: str | None = None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all variants in use."""
-        names = (self.full, self.plane, self.rgt, self.wo_nurbs, self.wo_ecsrc)
-        return tuple(name for name in names if name is not None)
+Roles = dict[str, str]
+"""Names of the variants by method: ``full``, the full pipeline, and ``plane``, ``rgt``, ``wo_nurbs`` and
+``wo_ecsrc`` if the run has such a variant."""
 
 
 def roles_of(config: Config) -> Roles:
     """Return the roles of a configuration's variants; FlexRoad is the first exported variant."""
     full = config.export.variants[0]
-    roles: dict[str, str] = {}
+    roles = {"full": full}
     for name, chain in config.chains.items():
-        role = _role(chain, config.chains[full])
-        if role:
+        if role := _role(chain, config.chains[full]):
             roles.setdefault(role, name)
-    return Roles(full, **roles)
+    return roles
 
 
 def _role(chain: Chain, full: Chain) -> str:
-    """Return the name of the field of `Roles` for a variant, or an empty string."""
+    """Return the role of a variant, or an empty string."""
     fit = chain["fit"].model_dump()
     if fit["method"] == "plane":
         return "plane"
@@ -115,11 +101,11 @@ class TileView:
     dropped: Bools
     """Cells of the segmented mask that the filter dropped."""
     results: dict[str, Result]
-    """By variant."""
+    """By role."""
 
-    def error(self, variant: str) -> Floats:
-        """Return the absolute vertical distance of a variant's mesh from `truth`, ``(H, W)``, m."""
-        return np.abs(self.results[variant].height - self.truth)
+    def error(self, role: str) -> Floats:
+        """Return the absolute vertical distance of a mesh from `truth`, ``(H, W)``, m."""
+        return np.abs(self.results[role].height - self.truth)
 
     def __str__(self) -> str:
         return f"Tile {self.tile_id}{f' ({self.stratum})' if self.stratum else ''}"
@@ -137,12 +123,8 @@ def read_tile_view(run: Run, tile_id: str, roles: Roles) -> TileView:
     """Read a tile's results from the store; results that are not stored are recomputed."""
     (tile,) = run.catalog.select([tile_id]).tiles
     (status,) = peek_statuses(run, [tile])
-    graph = status.graph
-    for variant in roles.names:
-        if variant not in graph.variants:
-            raise ConfigError(f"{run.path} has no variant {variant!r}; it has {', '.join(graph.variants)}")
     try:
-        return _view(FinishedTile.of(run, status, roles.full), roles)
+        return _view(FinishedTile.of(run, status, roles["full"]), roles)
     except ConfigError as error:
         raise ConfigError(f"{error}; choose another tile with --tile") from error
 
@@ -160,7 +142,7 @@ def _view(tile: FinishedTile, roles: Roles) -> TileView:
         "the DTM" if data.reference is None else "the reference surface",
         street[window] & ~road.outside[window],
         (road.mask & ~clusters.mask)[window],
-        {variant: _result(tile.in_variant(variant), core) for variant in roles.names},
+        {role: _result(tile.in_variant(variant), core) for role, variant in roles.items()},
     )
 
 
@@ -169,12 +151,12 @@ def _result(tile: FinishedTile, core: Grid) -> Result:
     return Result(mesh, drape(mesh, core) + mesh.origin[2], mean_angles(mesh), tile.metrics)
 
 
-def missing_roles(methods: Iterable[tuple[str, str | None]]) -> str:
+def missing_roles(view: TileView, methods: Mapping[str, str]) -> str:
     """Return which methods have no variant in the run, as a message; empty if all have one.
 
-    - `methods`: label and variant of each method that a figure needs.
+    - `methods`: role of each method that a figure needs, by label.
     """
-    missing = [label for label, variant in methods if variant is None]
+    missing = [label for label, role in methods.items() if role not in view.results]
     if not missing:
         return ""
     return f"the run has no variant for {' and '.join(missing)}; `--config ablation` has all variants"

@@ -33,13 +33,14 @@ STDIN = Path("-")
 
 @app.command(cls=Command)
 def query(
+    ctx: typer.Context,
     path: options.Run,
     points: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Points: CSV (easting, northing in m), GeoPackage or GeoJSON; - reads a CSV from standard "
-            "input.",
+            help="Points: CSV (easting, northing in m), GeoPackage or GeoJSON, FILE|layername=NAME for one "
+            "layer; - reads a CSV from standard input.",
             rich_help_panel=INPUTS,
         ),
     ] = None,
@@ -64,14 +65,6 @@ def query(
             rich_help_panel=INPUTS,
         ),
     ] = None,
-    layer: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Layer of a vector file; needed if it has several.",
-            rich_help_panel=INPUTS,
-        ),
-    ] = None,
     level: Annotated[
         str | None,
         typer.Option(
@@ -93,7 +86,6 @@ def query(
             rich_help_panel=OUTPUTS,
         ),
     ] = None,
-    allow: options.Allow = None,
 ) -> None:
     """Print heights, classes and flags at points or along lines.
 
@@ -105,14 +97,14 @@ def query(
     if output is not None and output.suffix.lower() not in (".csv", ".gpkg"):
         raise ConfigError(f"-o {output}: give a name that ends in .csv or .gpkg")
     wanted = _level(level)
-    sampler = RunSampler.open(path, variant, allow or (), earlier=True)
+    sampler = RunSampler.open(path, variant, options.allowed(ctx), earlier=True)
     if line is not None:
-        result = along_lines(sampler, read_lines(line, crs, layer, required_crs(sampler)), step, wanted)
+        result = along_lines(sampler, read_lines(line, crs, required_crs(sampler)), step, wanted)
     elif points == STDIN:
         result = at_points(sampler, parse_csv(sys.stdin.buffer.read(), "standard input", crs), wanted)
     else:
         assert points is not None
-        result = at_points(sampler, read_points(points, crs, layer), wanted)
+        result = at_points(sampler, read_points(points, crs), wanted)
     if output is not None and output.suffix.lower() == ".gpkg":
         result.write_geopackage(output)
     else:

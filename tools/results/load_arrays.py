@@ -65,7 +65,8 @@ def load_arrays(
     roads = road_mask if isinstance(road_mask, Source) else None
     if not isinstance(road_mask, Source):
         patches["road_mask"] = _patch("road_mask", road_mask)
-    core = _grid(patches["dsm"])
+    cells, crs = patches["dsm"].lattice, in_plan(patches["dsm"].crs or "")
+    core = Grid(crs, cells.west, cells.north, cells.dx, cells.width, cells.height)
     try:
         require_scale(
             "dsm", core.crs, core.bounds, "reproject it to metres, e.g. dsm.rio.reproject('{zone}')"
@@ -212,13 +213,6 @@ def _values(name: str, array: xr.DataArray) -> Floats:
         # Compare in the array's dtype: -3.4e38 is not the same number in float32 and float64.
         values[values == np.float64(np.asarray(nodata).astype(raw.dtype))] = np.nan
     return values
-
-
-def _grid(dsm: RasterWindow) -> Grid:
-    lattice = dsm.lattice
-    return Grid(
-        in_plan(dsm.crs or ""), lattice.west, lattice.north, lattice.dx, lattice.width, lattice.height
-    )
 
 
 def _absurd(patch: RasterWindow) -> str:

@@ -17,8 +17,7 @@ from flexroad.catalog.crs import same
 from flexroad.catalog.grid import LATTICE_TOLERANCE, overlap
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.storage.links import contained
-from flexroad.catalog.storage.paths import absolute, parse_location
+from flexroad.catalog.storage.paths import absolute, contained, parse_location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses

@@ -19,8 +19,16 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, reason
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import SEE_REPORT
-from flexroad.pipeline.run.points import LARGEST_STEP_M, STEP_REMEDY, Answer, length_text, to_crs
-from flexroad.pipeline.run.sampler import RunSampler, crs_of, required_crs
+from flexroad.pipeline.run.sampler import (
+    LARGEST_STEP_M,
+    STEP_REMEDY,
+    Answer,
+    RunSampler,
+    crs_of,
+    length_text,
+    required_crs,
+    to_crs,
+)
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.quality.flagged import Bits, flag_names
 from flexroad.tasks.types import Floats

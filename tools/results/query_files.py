@@ -19,9 +19,10 @@ from flexroad.catalog.crs import in_plan, is_geographic, same, short
 from flexroad.catalog.guard.open_vector import ERRORS, encoding_note, in_its_encoding, vector_name
 from flexroad.catalog.guard.source_files import InputRejected
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.scan.vectors import file_and_layer, one_layer
 from flexroad.catalog.text import reason, shown
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.points import to_crs
+from flexroad.pipeline.run.sampler import to_crs
 from flexroad.tasks import memory
 from flexroad.tasks.io.vectors import WHOLE
 from flexroad.tasks.types import Floats
@@ -63,12 +64,13 @@ class Points:
     notes: tuple[str, ...] = ()
 
 
-def read_points(path: Path, given: str | None = None, layer: str | None = None) -> Points:
+def read_points(named: Path | str, given: str | None = None) -> Points:
     """Read the points of a CSV or vector file.
 
-    - `path`: a vector file if its name ends like one (`VECTOR_SUFFIXES`), else a CSV (`parse_csv`).
-    - `layer`: layer of a vector file; needed if it has several.
+    - `named`: a vector file if its name ends like one (`VECTOR_SUFFIXES`), with a layer as in
+      `file_and_layer`; else a CSV (`parse_csv`).
     """
+    path, layer = file_and_layer(named)
     if path.suffix.lower() in VECTOR_SUFFIXES:
         return _points(*read_features(path, given, layer), path)
     try:
@@ -163,12 +165,10 @@ def read_features(path: Path, given: str | None, layer: str | None) -> tuple[Any
     try:
         file = vector_name(path)
         memory.check(WHOLE * path.stat().st_size, f"{path}, read as a whole,", "split it", str(path))
-        spatial = [name for name, kind in pyogrio.list_layers(file) if kind is not None]
-        if not spatial or (layer is not None and layer not in spatial):
-            raise ConfigError(f"{path}: no layer {layer!r}; it has {', '.join(spatial) or 'no features'}")
-        if layer is None and len(spatial) > 1:
-            raise ConfigError(f"{path}: has the layers {', '.join(spatial)}; name one with --layer")
-        read = partial(pyogrio.read_dataframe, file, layer=layer or spatial[0], force_2d=True)
+        layer = one_layer(str(path), path, layer)
+        if layer is None:
+            raise ConfigError(f"{path} has no features")
+        read = partial(pyogrio.read_dataframe, file, layer=layer, force_2d=True)
         table, encoding = in_its_encoding(read)
     except InputRejected as error:
         raise ConfigError(f"{path} {error}") from error
@@ -197,20 +197,19 @@ def _points(table: Any, note: str, path: Path) -> Points:
     return Points(attributes, x, y, table.crs.to_wkt(), vector=True, notes=notes)
 
 
-def read_lines(given: str, crs: str | None, layer: str | None, run_crs: str) -> list[Floats]:
+def read_lines(given: str, crs: str | None, run_crs: str) -> list[Floats]:
     """Return the vertices of lines, ``(n, 2)`` each, easting and northing (m) in the CRS of a run.
 
     A line is straight between its vertices in the CRS of the run.
 
-    - `given`: a vector file of lines, or the vertices of one line: ``"x y, x y"``. Parts of one feature that
-      touch at their ends are one line.
+    - `given`: a vector file of lines, with a layer as in `file_and_layer`, or the vertices of one line:
+      ``"x y, x y"``. Parts of one feature that touch at their ends are one line.
     - `crs`: CRS of the lines, as the user says it; None: that of the file, or for vertices that of the run.
-    - `layer`: layer of a vector file; needed if it has several.
     """
     if _COORDINATES.fullmatch(given) and not Path(given).exists():
         lines, source = [_vertices(given)], crs
     else:
-        lines, source = _features(Path(given), crs, layer)
+        lines, source = _features(given, crs)
     projected = [np.column_stack(to_crs(line[:, 0], line[:, 1], source, run_crs)) for line in lines]
     if not all(np.isfinite(line).all() for line in projected):
         raise ConfigError(f"--line {shown(given)}: cannot be transformed to {short(run_crs)}; check its CRS")
@@ -230,8 +229,9 @@ def _vertices(text: str) -> Floats:
         ) from None
 
 
-def _features(path: Path, crs: str | None, layer: str | None) -> tuple[list[Floats], str]:
+def _features(given: str, crs: str | None) -> tuple[list[Floats], str]:
     """Return the vertices of the lines of a vector file, and their CRS."""
+    path, layer = file_and_layer(given)
     table, _ = read_features(path, crs, layer)
     shapes = [shape for shape in table.geometry if shape is not None and not shape.is_empty]
     others = [shape.geom_type for shape in shapes if not shape.geom_type.endswith("LineString")]

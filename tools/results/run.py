@@ -23,9 +23,8 @@ from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.api import Workers, process, reopened
 from flexroad.pipeline.run.events import Observer
 from flexroad.pipeline.run.finished import FinishedTile, open_variant
-from flexroad.pipeline.run.points import Answer
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.sampler import RunSampler
+from flexroad.pipeline.run.sampler import Answer, RunSampler
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import sample

@@ -276,8 +276,18 @@ class Surface:
             )
         buffer = io.BytesIO(npz.encode(self.fitted))
         if self.road is not None and self.clusters is not None:
+            arrays: dict[str, Any] = {} if self.road.areas is None else {"areas": self.road.areas}
+            arrays |= {
+                "grid": np.asarray(astuple(self.road.grid)[1:], np.float64),
+                "core": np.asarray(astuple(self.road.core)[1:], np.float64),
+                "road_mask": self.road.mask,
+                "outside": self.road.outside,
+                "labels": self.clusters.labels,
+                "sampling": np.array(self.sampling.model_dump_json()),
+                "config": np.array(self.config),
+            }
             with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as archive:
-                for name, values in _masks(self.road, self.clusters, self.sampling, self.config).items():
+                for name, values in arrays.items():
                     with archive.open(f"{name}.npy", "w") as member:
                         np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
         with atomic_path(Path(path)) as temporary:
@@ -464,21 +474,6 @@ def placed(raster: xr.Dataset, crs: str, transform: Affine | None = None) -> xr.
 def _cut(values: Bools, road: RoadMask) -> Bools:
     """Return the part of a mask that lies on the core."""
     return values[road.grid.window(road.core)]
-
-
-def _masks(road: RoadMask, clusters: RoadClusters, sampling: sample.Options, config: str) -> dict[str, Any]:
-    """Return the arrays that `Surface.save` adds to those of the spline, by name."""
-    outlines = {} if road.areas is None else {"areas": road.areas}
-    return {
-        **outlines,
-        "grid": np.asarray(astuple(road.grid)[1:], np.float64),
-        "core": np.asarray(astuple(road.core)[1:], np.float64),
-        "road_mask": road.mask,
-        "outside": road.outside,
-        "labels": clusters.labels,
-        "sampling": np.array(sampling.model_dump_json()),
-        "config": np.array(config),
-    }
 
 
 def _grid(crs: str, numbers: Floats) -> Grid:

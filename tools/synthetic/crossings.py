@@ -21,11 +21,10 @@ from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.synthetic.centrelines import MAIN, MARGIN_M, SIDE, CentreLine
 from flexroad.tools.synthetic.network import Plan
 from flexroad.tools.synthetic.objects import Car, Crown
-from flexroad.tools.synthetic.population import Objects, Trace
-from flexroad.tools.synthetic.scene import DTM_BLUR_M, Scene, terrain_model
+from flexroad.tools.synthetic.population import Objects
+from flexroad.tools.synthetic.scene import DTM_BLUR_M, MAIN, MARGIN_M, SIDE, CentreLine, Scene, terrain_model
 from flexroad.tools.synthetic.spoilers import Canvas, surface_model
 from flexroad.tools.synthetic.surfaces import CROSSFALL, Relief, relief, smoothstep
 from flexroad.tools.synthetic.world import SOUTH_M, WEST_M, generator
@@ -215,8 +214,8 @@ class Crossings:
             crowns += self._crowns(crossing, rng)
             if not crossing.tunnel and self.options.density > 0:
                 rails.append(self._rails(crossing))
-        x, y, z = np.concatenate(rails, axis=1)
-        return Objects((), tuple(crowns), tuple(cars), (), (), (), (), Trace(x, y, z), Trace.none())
+        traces = np.concatenate(rails, axis=1)
+        return Objects((), tuple(crowns), tuple(cars), (), (), (), (), traces, np.zeros((3, 0)))
 
     @cached_property
     def _origin(self) -> tuple[float, float]:

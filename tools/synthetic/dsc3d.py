@@ -1,4 +1,4 @@
-"""The stand-in for the paper's dataset DSC3D: five urban scenes, and faults of their reconstruction.
+"""The stand-in for the paper's dataset DSC3D: five urban scenes as textured meshes with faults.
 
 The paper describes five scenes with meshes of 35 to 101 thousand triangles and height differences of 4.5 m to
 33.9 m. Its table gives RGT 45 thousand triangles: a square of 150 m with cells of 1 m. ``docs/decisions.md``
@@ -11,22 +11,23 @@ smooth surface or left open.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy import ndimage
 from scipy.optimize import brentq
 from scipy.special import ndtri
 
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
-from flexroad.tasks import options as base
 from flexroad.tasks.types import Bools, Floats
-from flexroad.tools.synthetic.scene import Scene, true_height
+from flexroad.tools.prepare.mesh.sample import TexturedMesh
+from flexroad.tools.synthetic.orthophoto import orthophoto
+from flexroad.tools.synthetic.scene import Scene, make_scene, true_height
 from flexroad.tools.synthetic.spoilers import Kind
 from flexroad.tools.synthetic.world import SOUTH_M, WEST_M, SceneOptions, field, generator, waves
 
@@ -41,9 +42,10 @@ HUMPS, BANKS = 0.1, 0.05
 """Root mean square height of a scene's humps and embankments, as fractions of its rise."""
 COARSE_M = 3.0
 """Cell size used to check whether a location suits a scene (m)."""
-rasterio = lazy("rasterio")
+PIL, pv = lazy("PIL"), lazy("pyvista")
+rasterio, trimesh = lazy("rasterio"), lazy("trimesh")
 
-BUMP_M = (1.5, 15.0)
+BUMP_WAVES_M = (1.5, 15.0)
 """Shortest and longest wave of the bumps (m)."""
 BLANK_M = (4.0, 20.0)
 """Shortest and longest wave of the random field that places areas without matches (m)."""
@@ -51,25 +53,25 @@ TEXTURELESS = (Kind.GROUND, Kind.DECK, Kind.PAVED, Kind.BUILDING)
 """Kinds that may have no texture: asphalt (on roads and car parks) and flat roofs."""
 OVERHEAD_M, ALLEY_M = 4.0, 2.0
 """Ground may be hidden within `ALLEY_M` of a surface that is `OVERHEAD_M` higher (m)."""
+MELT_M, BUMPS_M = 0.6, 0.04
+"""Gaussian smoothing of all edges, and root mean square height of bumps (m)."""
+BRIDGED_M2, OPEN = 8.0, 0.3
+"""Area up to which holes are always bridged (m2), and fraction of the larger holes that stay open."""
+FRAGMENTS = 8
+"""Number of floating pieces of surface."""
 GHOST = 0.25
 """Fraction of the height of moving objects that remains."""
-
-
-class _Faults(base.Options):
-    """Size of the faults of a reconstruction."""
-
-    melt_m: float = Field(0.6, ge=0, le=3, description="Gaussian smoothing of all edges (m)")
-    bumps_m: float = Field(0.04, ge=0, le=1, description="root mean square height of bumps (m)")
-    blank: float = Field(
-        0.04, ge=0, lt=1, description="fraction of the surfaces without texture that have no matches"
-    )
-    # RGT on roads, 0.195 m: ground bridged at walls is too high, and the mask covers it.
-    hidden: float = Field(
-        0.1, ge=0, lt=1, description="fraction of the ground at walls that no photograph shows"
-    )
-    bridged_m2: float = Field(8.0, ge=0, description="area up to which holes are always bridged (m2)")
-    open: float = Field(0.3, ge=0, le=1, description="fraction of the larger holes that stay open")
-    fragments: int = Field(8, ge=0, description="number of floating pieces of surface")
+NODE_M = 0.5
+"""Node spacing of the lattice before simplification (m): 300 x 300 quads, 180,000 triangles."""
+GSD_M = 0.25
+"""Pixel size of the texture (m)."""
+FLOATING_M = (2.0, 9.0)
+"""Range of the height of floating fragments over the surface (m)."""
+Faces = NDArray[np.int32]
+FRAGMENT_M = (0.4, 1.5)
+"""Least and greatest radius of a floating fragment (m)."""
+RIM = 7
+"""Number of corners of a floating fragment."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,11 @@ class _Site:
     """Number of triangles of its mesh."""
     options: SceneOptions
     """Slope, humps, embankments and direction are set from the rise and the location."""
-    faults: _Faults
+    blank: float = 0.04
+    """Fraction of the surfaces without texture that have no matches."""
+    hidden: float = 0.1
+    """Fraction of the ground at walls that no photograph shows. It follows from RGT on roads, 0.195 m: ground
+    bridged at walls is too high, and the mask covers it."""
 
 
 TOWN = SceneOptions(
@@ -108,11 +114,11 @@ TOWN = SceneOptions(
 SUBURB = TOWN.model_copy(update={"block_m": 80, "storeys": 2.2})
 
 SITES = (
-    _Site("boulevard", "urban", 4.5, 101_000, TOWN.model_copy(update={"block_m": 90.0}), _Faults()),
-    _Site("courtyards", "urban", 8.0, 78_000, TOWN.model_copy(update={"built": 0.5}), _Faults(hidden=0.2)),
-    _Site("garden_suburb", "suburban", 14.0, 35_000, SUBURB, _Faults()),
-    _Site("hillside", "suburban", 23.0, 46_000, SUBURB, _Faults()),
-    _Site("steep_quarter", "urban", 33.9, 60_000, TOWN, _Faults(blank=0.06)),
+    _Site("boulevard", "urban", 4.5, 101_000, TOWN.model_copy(update={"block_m": 90.0})),
+    _Site("courtyards", "urban", 8.0, 78_000, TOWN.model_copy(update={"built": 0.5}), hidden=0.2),
+    _Site("garden_suburb", "suburban", 14.0, 35_000, SUBURB),
+    _Site("hillside", "suburban", 23.0, 46_000, SUBURB),
+    _Site("steep_quarter", "urban", 33.9, 60_000, TOWN, blank=0.06),
 )
 """The ends of the ranges are the paper's; the values between them and their order are assumptions."""
 
@@ -180,17 +186,17 @@ class Reconstruction:
     """Holes without a surface, ``(H, W)``."""
 
 
-def reconstruct(scene: Scene, seed: int, faults: _Faults) -> Reconstruction:
+def reconstruct(scene: Scene, seed: int, site: _Site) -> Reconstruction:
     """Return a scene's surface with the faults of a reconstruction.
 
     - `scene`: a scene without noise; cells of 0.5 m resolve cars and walls.
     - `seed`: seed of the world; bumps and holes are functions of seed and coordinates.
     """
     grid = scene.grid
-    smoothed = ndimage.gaussian_filter(_static_surface(scene), faults.melt_m / grid.cell, mode="nearest")
-    uneven = smoothed + _bumps(grid, seed, faults.bumps_m)
-    holes = _textureless(scene, seed, faults.blank) | _hidden(scene, seed, faults.hidden)
-    still_open = _open_holes(holes, grid, seed, faults)
+    smoothed = ndimage.gaussian_filter(_static_surface(scene), MELT_M / grid.cell, mode="nearest")
+    uneven = smoothed + _bumps(grid, seed)
+    holes = _textureless(scene, seed, site.blank) | _hidden(scene, seed, site.hidden)
+    still_open = _open_holes(holes, grid, seed)
     bridged = holes & ~still_open
     return Reconstruction(grid, _bridge(uneven, bridged), bridged, still_open)
 
@@ -207,12 +213,12 @@ def _static_surface(scene: Scene) -> Floats:
     return hulled
 
 
-def _bumps(grid: Grid, seed: int, rms_m: float) -> Floats:
-    """Return bumps of root mean square ``rms_m`` (m), higher in some areas than in others."""
+def _bumps(grid: Grid, seed: int) -> Floats:
+    """Return bumps (m), higher in some areas than in others."""
     x, y = np.meshgrid(grid.eastings, grid.northings)
-    bumps = field(seed, "bumps", BUMP_M, 40)(x, y)
+    bumps = field(seed, "bumps", BUMP_WAVES_M, 40)(x, y)
     patchy = np.exp(waves(generator(seed, "matching"), np.geomspace(15, 80, 9), 0.15)(x, y))
-    uneven: Floats = rms_m * patchy / np.sqrt(np.mean(patchy**2)) * bumps
+    uneven: Floats = BUMPS_M * patchy / np.sqrt(np.mean(patchy**2)) * bumps
     return uneven
 
 
@@ -241,13 +247,13 @@ def _patches(grid: Grid, seed: int, purpose: str, share: float) -> Bools:
     return covered
 
 
-def _open_holes(holes: Bools, grid: Grid, seed: int, faults: _Faults) -> Bools:
+def _open_holes(holes: Bools, grid: Grid, seed: int) -> Bools:
     """Return the holes that stay open: a fraction of the large ones, ``(H, W)``."""
     numbers: NDArray[np.int32]
     numbers, count = ndimage.label(holes)
     area = np.bincount(numbers.ravel(), minlength=count + 1) * grid.cell**2
-    drawn = generator(seed, "open", *map(int, grid.origin)).random(count + 1) < faults.open
-    stays_open = drawn & (area > faults.bridged_m2)
+    drawn = generator(seed, "open", *map(int, grid.origin)).random(count + 1) < OPEN
+    stays_open = drawn & (area > BRIDGED_M2)
     stays_open[0] = False
     cells: Bools = stays_open[numbers]
     return cells
@@ -262,3 +268,139 @@ def _bridge(height: Floats, holes: Bools) -> Floats:
         (height - base_m).astype(np.float32), ~holes, span, smoothing_iterations=2
     )
     return np.where(holes, filled + base_m, height)
+
+
+@dataclass(frozen=True, eq=False)
+class _PhotogrammetryScene:
+    """One synthetic scene: its true surface and its photogrammetric mesh."""
+
+    name: str
+    mesh: TexturedMesh
+    """One texture, an orthophoto; it is stretched along walls."""
+    truth: Scene
+    """The scene with cells of 1 m, without noise: ``reference`` is the true ground with bridges,
+    ``reference_road`` the true roads, ``road_mask`` the roads with the errors of a segmentation."""
+    surface: Scene
+    """The scene at the nodes of the lattice, before reconstruction."""
+    reconstruction: Reconstruction
+    """The reconstructed surface, before simplification."""
+
+
+def photogrammetry(place: Place, seed: int) -> _PhotogrammetryScene:
+    """Make one scene of the stand-in for DSC3D.
+
+    - result: equal input gives equal scenes. The mesh fills the square of the place, except for open holes.
+    """
+    site, grid = place.site, place.grid
+    truth = make_scene(grid, seed, site.stratum, place.options)
+    surface = make_scene(_nodes(grid), seed, site.stratum, place.options)
+    reconstruction = reconstruct(surface, seed, site)
+    origin = np.array([grid.west, grid.south, math.floor(reconstruction.height.min())])
+    rng = generator(seed, "fragments", *map(int, grid.origin))
+    # Random points above the surface, relative to the origin.
+    x, y = rng.uniform(0, grid.width * grid.cell, (2, FRAGMENTS))
+    height = reconstruction.height[reconstruction.grid.cells(x + origin[0], y + origin[1])]
+    centres = np.column_stack([x, y, height - origin[2] + rng.uniform(*FLOATING_M, FRAGMENTS)])
+    floating, pieces = fragments(centres, rng)
+    east, north = reconstruction.grid.eastings - origin[0], reconstruction.grid.northings - origin[1]
+    nodes = lattice(east, north, reconstruction.height - origin[2], reconstruction.open)
+    vertices, faces = simplified(*nodes, site.triangles - len(pieces))
+    faces = np.concatenate([faces, pieces + np.int32(len(vertices))])
+    vertices = np.concatenate([vertices, floating])
+    vertices[:, :2] = np.clip(vertices[:, :2], 0, np.array([grid.width, grid.height]) * grid.cell)
+    texture = orthophoto(grid, seed, site.stratum, place.options, GSD_M).transpose(1, 2, 0)
+    return _PhotogrammetryScene(
+        site.name, _textured(vertices, faces, texture, origin, grid), truth, surface, reconstruction
+    )
+
+
+def _nodes(grid: Grid) -> Grid:
+    """Return the lattice whose outermost cell centres lie on the edges of a grid."""
+    cells = Grid.covering(grid.crs, grid.bounds, NODE_M)
+    west, north = grid.west - NODE_M / 2, grid.north + NODE_M / 2
+    return Grid(grid.crs, west, north, NODE_M, cells.width + 1, cells.height + 1)
+
+
+def _textured(
+    vertices: Floats, faces: Faces, texture: NDArray[np.uint8], origin: Floats, grid: Grid
+) -> TexturedMesh:
+    # v increases northwards.
+    uv = vertices[:, :2] / (np.array([grid.width, grid.height]) * grid.cell)
+    return TexturedMesh(
+        crs=grid.crs,
+        vertices=vertices + origin,
+        faces=faces,
+        texture=np.zeros(len(faces), np.int32),
+        textures=(np.ascontiguousarray(texture),),
+        uv=uv[faces].astype(np.float32),
+    )
+
+
+def encode(mesh: TexturedMesh) -> bytes:
+    """Return a mesh with one texture as GLB.
+
+    Vertices are relative to the whole-metre corner of the mesh, in glTF's axes (x east, y up, z south). CRS
+    and corner are in the scene's ``extras``, as in FlexRoad's other GLB files. Equal input gives equal bytes.
+
+    - `mesh`: faces that share a vertex must also share its texture coordinates.
+    """
+    assert mesh.uv is not None
+    origin = np.floor(mesh.vertices.min(axis=0))
+    east, north, up = (mesh.vertices - origin).T
+    uv = np.zeros((len(mesh.vertices), 2), np.float32)
+    uv[mesh.faces] = mesh.uv
+    material = trimesh.visual.material.PBRMaterial(
+        name="orthophoto",
+        baseColorTexture=PIL.Image.fromarray(mesh.textures[0]),
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+    )
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    part = trimesh.Trimesh(np.column_stack([east, up, -north]), mesh.faces, visual=visual, process=False)
+    place = {"crs": mesh.crs, "run_origin": [float(value) for value in origin]}
+    scene = trimesh.Scene(metadata=place)
+    scene.add_geometry(part, node_name="scene", geom_name="scene")
+    encoded: bytes = scene.export(file_type="glb")
+    return encoded
+
+
+def lattice(eastings: Floats, northings: Floats, height: Floats, gap: Bools) -> tuple[Floats, Faces]:
+    """Return vertices ``(V, 3)`` and faces ``(F, 3)``, two per quad, counter-clockwise from above.
+
+    - `eastings`, `northings`: coordinates of the nodes (m); northings descend.
+    - `height`, `gap`: heights of the nodes (m), and nodes in gaps; quads with a node in a gap are left out.
+    """
+    x, y = np.meshgrid(eastings, northings)
+    node = np.arange(height.size, dtype=np.int32).reshape(height.shape)
+    nw, sw, se, ne = node[:-1, :-1], node[1:, :-1], node[1:, 1:], node[:-1, 1:]
+    quads = np.stack([nw, sw, se, nw, se, ne], axis=-1).reshape(-1, 2, 3)
+    complete = ~gap.ravel()[quads].any(axis=(1, 2))
+    return np.column_stack([x.ravel(), y.ravel(), height.ravel()]), quads[complete].reshape(-1, 3)
+
+
+def simplified(vertices: Floats, faces: Faces, triangles: int) -> tuple[Floats, Faces]:
+    """Return a mesh with about ``triangles`` triangles, large where the surface is flat.
+
+    Edges are collapsed in the order of their error (quadrics), as in photogrammetry software. Coordinates
+    should be small, because they are converted to float32.
+    """
+    mesh = pv.PolyData.from_regular_faces(vertices, faces).clean()
+    if mesh.n_cells > triangles:
+        mesh = mesh.decimate(1 - triangles / mesh.n_cells)
+    return np.asarray(mesh.points, np.float64), mesh.regular_faces.astype(np.int32)
+
+
+def fragments(centres: Floats, rng: np.random.Generator) -> tuple[Floats, Faces]:
+    """Return small irregular pieces of surface around points ``(n, 3)``, facing up."""
+    n = len(centres)
+    radius = rng.uniform(*FRAGMENT_M, (n, 1)) * rng.uniform(0.6, 1.4, (n, RIM))
+    turn = np.linspace(0, 2 * np.pi, RIM, endpoint=False) + rng.uniform(0, 2 * np.pi, (n, 1))
+    tilt = rng.normal(0, 0.3, (n, 1, 2))
+    out = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
+    rise = (out * tilt).sum(axis=-1) + rng.normal(0, 0.1, (n, RIM))
+    rim = centres[:, None] + np.concatenate([out, rise[..., None]], axis=-1)
+    vertices = np.concatenate([centres[:, None], rim], axis=1).reshape(-1, 3)
+    corner = np.arange(RIM)
+    fan = np.column_stack([np.zeros(RIM, np.int64), 1 + corner, 1 + (corner + 1) % RIM])
+    faces = fan + (RIM + 1) * np.arange(n)[:, None, None]
+    return vertices, faces.reshape(-1, 3).astype(np.int32)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from flexroad.catalog.grid import Grid
 from flexroad.tools.synthetic.world import SOUTH_M, WEST_M, SceneOptions, generator
@@ -20,14 +21,20 @@ COLUMNS = 16
 VARIED = {"block_m": 0.2, "slope": 0.4, "roughness_m": 0.3, "built": 0.3, "trees": 0.4, "growth_m": 0.3}
 """Variation of tiles within a stratum: greatest relative deviation from its options."""
 
+_SHARED: Mapping[str, Any] = {
+    "slope": 0.122,
+    "dsm_noise_m": (0.04, 0.1),
+    "towers": 0.2,
+    "mixed": 0.25,
+    "scars_m": 0.25,
+}
 _WORLDS: Mapping[str, SceneOptions] = {
     "urban": SceneOptions(
+        **_SHARED,
         block_m=102,
         density=0.9,
-        slope=0.122,
         roughness_m=0.6,
         stream_share=0.06,
-        dsm_noise_m=(0.04, 0.1),
         embankment_m=0.2,
         cross_slope=0.02,
         curb_m=0.12,
@@ -36,23 +43,18 @@ _WORLDS: Mapping[str, SceneOptions] = {
         sunken_share=0.06,
         built=0.43,
         storeys=0.6,
-        towers=0.2,
         overhang_m=0.4,
         growth_m=0.7,
         rails=0.03,
         wires=0.1,
-        mixed=0.25,
         car_parks=0.12,
-        fields=0.0,
-        scars_m=0.25,
     ),
     "suburban": SceneOptions(
+        **_SHARED,
         block_m=95,
         density=0.85,
-        slope=0.122,
         roughness_m=0.7,
         stream_share=0.08,
-        dsm_noise_m=(0.04, 0.1),
         embankment_m=0.3,
         cross_slope=0.025,
         curb_m=0.1,
@@ -60,40 +62,33 @@ _WORLDS: Mapping[str, SceneOptions] = {
         roundabouts=0.1,
         sunken_share=0.03,
         built=0.53,
-        towers=0.2,
         overhang_m=0.5,
         trees=1.2,
         growth_m=0.75,
         rails=0.03,
         wires=0.3,
-        mixed=0.25,
         car_parks=0.06,
         fields=0.03,
-        scars_m=0.25,
     ),
     "rural": SceneOptions(
+        **_SHARED,
         block_m=110,
         density=0.9,
-        slope=0.122,
         roughness_m=1.0,
         stream_share=0.15,
-        dsm_noise_m=(0.04, 0.1),
         embankment_m=0.8,
         cross_slope=0.04,
         medians=0.1,
         roundabouts=0.06,
         sunken_share=0.06,
         built=0.63,
-        towers=0.2,
         overhang_m=0.5,
         trees=2.5,
         growth_m=0.85,
         rails=0.15,
         wires=0.25,
-        mixed=0.25,
         car_parks=0.02,
         fields=0.15,
-        scars_m=0.25,
     ),
 }
 """Mean contents of the tiles of each stratum.

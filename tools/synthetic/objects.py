@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.network import Street
 from flexroad.tools.synthetic.surfaces import Ground
 from flexroad.tools.synthetic.world import generator
@@ -112,9 +112,14 @@ def houses(
     xy = np.stack([_footprint(house, spread) for house in planned], axis=1)
     under = ground_at(xy[..., 0], xy[..., 1])
     free = ((under.edge > 0.5) & (under.trough == 0)).all(axis=0)
+    return _standing(planned, free, under.bare[-1], storeys)
+
+
+def _standing(planned: Sequence[House], free: Bools, bare: Floats, factor: float) -> tuple[House, ...]:
+    """Return the houses on free ground, with their eaves, times a factor, above the ground."""
     return tuple(
-        replace(house, eaves=float(base) + storeys * house.eaves)
-        for house, base, ok in zip(planned, under.bare[-1], free, strict=True)
+        replace(house, eaves=float(base) + factor * house.eaves)
+        for house, base, ok in zip(planned, bare, free, strict=True)
         if ok
     )
 
@@ -277,12 +282,7 @@ def towers(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: floa
     x, y = (np.array([getattr(house, axis) for house in planned]) for axis in ("x", "y"))
     under = ground_at(x, y)
     reach: Floats = np.array([np.hypot(house.half_length, house.half_depth) for house in planned])
-    free = (under.edge > reach + 1) & (under.trough == 0)
-    return tuple(
-        replace(house, eaves=float(base) + house.eaves)
-        for house, base, ok in zip(planned, under.bare, free, strict=True)
-        if ok
-    )
+    return _standing(planned, (under.edge > reach + 1) & (under.trough == 0), under.bare, 1.0)
 
 
 def _planned(street: Street, seed: int, mean: float) -> list[House]:

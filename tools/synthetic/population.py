@@ -66,8 +66,9 @@ class Objects:
     fields: tuple[Area, ...]
     false_roofs: tuple[Area, ...]
     """Roofs, or parts of them, that the segmentation mistakes for road."""
-    rails: Trace
-    wires: Trace
+    rails: Floats
+    """Points along guard rails in the plan's frame, ``(3, N)``, m; the same for overhead lines."""
+    wires: Floats
     yards: tuple[Area, ...] = ()
     roofs: tuple[Roof, ...] = ()
     """Roofs as the photograph shows them; empty if no error of the mask depends on them."""
@@ -212,32 +213,18 @@ def parked(area: Area, seed: int) -> tuple[Car, ...]:
     return tuple(cars)
 
 
-@dataclass(frozen=True, eq=False)
-class Trace:
-    """Points along thin objects, ``(N,)`` each, in the plan's frame (m)."""
-
-    x: Floats
-    y: Floats
-    z: Floats
-
-    @classmethod
-    def none(cls) -> Trace:
-        """Return a trace without points."""
-        return cls(*np.zeros((3, 0)))
-
-
-def rails(streets: Sequence[Street], seed: int, ground_at: GroundAt, share: float) -> Trace:
+def rails(streets: Sequence[Street], seed: int, ground_at: GroundAt, share: float) -> Floats:
     """Return guard rails along a fraction of the street sides, and parapets on all bridges."""
     sides = [
         side for street in streets for side in _sides(street, generator(seed, "rails", *street.key), share)
     ]
     if share <= 0 or not sides:
-        return Trace.none()
+        return np.zeros((3, 0))
     x, y, railed = np.concatenate(sides, axis=1)
     under = ground_at(x, y)
     # A rail ends where another street joins.
     kept = (under.deck | (railed > 0)) & (under.over > RAIL_OFFSET_M / 2)
-    return Trace(x[kept], y[kept], under.height[kept] + RAIL_M)
+    return np.stack([x, y, under.height + RAIL_M])[:, kept]
 
 
 def _sides(street: Street, rng: np.random.Generator, share: float) -> list[Floats]:
@@ -250,7 +237,7 @@ def _sides(street: Street, rng: np.random.Generator, share: float) -> list[Float
     return sides
 
 
-def wires(streets: Sequence[Street], seed: int, ground_at: GroundAt, share: float) -> Trace:
+def wires(streets: Sequence[Street], seed: int, ground_at: GroundAt, share: float) -> Floats:
     """Return overhead lines along a fraction of the streets, with connections to houses across the street."""
     lines = [
         _line(street, rng)
@@ -258,9 +245,9 @@ def wires(streets: Sequence[Street], seed: int, ground_at: GroundAt, share: floa
         if (rng := generator(seed, "wires", *street.key)).random() < share
     ]
     if not lines:
-        return Trace.none()
+        return np.zeros((3, 0))
     x, y, sag = np.concatenate(lines, axis=1)
-    return Trace(x, y, ground_at(x, y).bare + WIRE_M - sag)
+    return np.stack([x, y, ground_at(x, y).bare + WIRE_M - sag])
 
 
 def _line(street: Street, rng: np.random.Generator) -> Floats:

@@ -29,9 +29,7 @@ from flexroad.catalog.text import write_reason
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
 HEIGHTS = ("dsm", "dtm", "road_height", "reference")
-MASKS = ("road_mask", "reference_road")
 PHOTO = "dop"
-SUPPORTED = (*HEIGHTS, *MASKS, PHOTO)
 
 TILE_TAG, LAYER_TAG, STRATUM_TAG = "FLEXROAD_TILE", "FLEXROAD_LAYER", "FLEXROAD_STRATUM"
 DATASET_TAG = "FLEXROAD_DATASET"
@@ -48,45 +46,20 @@ def write_tile(
     date: datetime | None = None,
     dataset: str = "",
 ) -> Tile:
-    """Write a tile's layers, and return the tile; existing files are replaced, each atomically.
+    """Write a tile's layers; return the tile, whose layers list its own files only (`with_neighbours`).
 
-    Parameters
-    ----------
-    folder : Path
-        Parent of the layers' folders.
-    tile_id : str
-        The tile's id, unique in the folder.
-    grid : Grid
-        Grid of every layer but ``dop``.
-    layers : mapping of str to (H, W) array
-        Arrays by layer name: heights (m) as ``dsm``, ``dtm``, ``road_height`` and ``reference``, masks as
-        ``road_mask`` and ``reference_road``, red, green and blue (uint8) as ``dop``, ``(3, h, w)`` over the
-        grid's bounds.
-    stratum : str
-        Class of area for reports.
-    date : datetime, optional
-        Date of the survey, with a time zone; None: when the files were written.
-    dataset : str
-        Name of the data in reports.
+    Existing files are replaced, each atomically.
 
-    Returns
-    -------
-    Tile
-        Its layers list only its own files, see `with_neighbours`.
-
-    Raises
-    ------
-    CatalogError
-        If a layer is not supported or does not fit the grid, the id is not a valid file name, the CRS is
-        invalid, or the folder cannot be written.
+    - `grid`: grid of every layer but ``dop``.
+    - `layers`: heights (m) and masks, ``(H, W)``, by layer name; red, green and blue (uint8) as ``dop``,
+      ``(3, h, w)`` over the grid's bounds.
+    - `stratum`: class of area for reports.
+    - `date`: date of the survey, with a time zone; None: when the files were written.
+    - `dataset`: name of the data in reports.
     """
-    if not tile_id or Path(tile_id).name != tile_id:
-        raise CatalogError(f"tile id {tile_id!r} is not a valid file name in {folder}; leave out slashes")
     tags = {TILE_TAG: tile_id, STRATUM_TAG: stratum, DATASET_TAG: dataset}
     if date is not None:
         tags[DATE_TAG] = date.astimezone(UTC).strftime(DATE_FORMAT)
-    for name, array in layers.items():
-        _check(name, array, grid, tile_id)
     for name, array in layers.items():
         _write(folder / name / f"{tile_id}.tif", grid, name, array, {**tags, LAYER_TAG: name})
     names = [name for name in LAYERS if name in layers]
@@ -122,20 +95,6 @@ def with_neighbours(tiles: Iterable[Tile]) -> list[Tile]:
             if not overlap(bounds[one], bounds[other], LATTICE_TOLERANCE * cell):
                 near[group[one].id].append(group[other])
     return [_joined(near[tile.id]) for tile in ordered]
-
-
-def _check(name: str, array: NDArray[Any], grid: Grid, tile_id: str) -> None:
-    if name not in SUPPORTED:
-        raise CatalogError(f"no layer {name!r} in a prepared folder; layers are {', '.join(SUPPORTED)}")
-    if name == PHOTO:
-        fits = array.ndim == 3 and len(array) == 3 and array.dtype == np.uint8
-        if not fits or array.shape[1] * grid.width != array.shape[2] * grid.height:
-            raise CatalogError(
-                f"layer dop of tile {tile_id} is {array.shape} of {array.dtype}, not 3 x h x w of uint8 "
-                f"with square pixels over {grid.width} x {grid.height} cells"
-            )
-    elif array.shape != grid.shape:
-        raise CatalogError(f"layer {name} of tile {tile_id} is {array.shape}, but its grid is {grid.shape}")
 
 
 def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping[str, str]) -> None:

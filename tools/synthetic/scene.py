@@ -1,9 +1,9 @@
-"""A scene: the rasters that a survey would deliver for one tile, and the true ground and roads."""
+"""A scene: the rasters that a survey would deliver for one tile, the true ground and roads, centre lines."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,11 +15,19 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.prepare.points.binning import Points, bins
-from flexroad.tools.synthetic.network import Box, Plan, find_stratum
+from flexroad.tools.synthetic.network import Box, Plan, Stream, Street
 from flexroad.tools.synthetic.objects import GroundAt
 from flexroad.tools.synthetic.population import Objects, populate
 from flexroad.tools.synthetic.spoilers import BARE, Canvas, Kind, surface_model
-from flexroad.tools.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
+from flexroad.tools.synthetic.surfaces import (
+    CIRCLE_M,
+    ISLAND_M,
+    REACH_M,
+    SUNKEN_M,
+    Ground,
+    ground,
+    relief,
+)
 from flexroad.tools.synthetic.survey_errors import (
     changes,
     growth,
@@ -31,8 +39,6 @@ from flexroad.tools.synthetic.survey_errors import (
     water,
 )
 from flexroad.tools.synthetic.world import DEFAULTS, SceneOptions, field, generator
-
-__all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
 
 OBJECT_REACH_M = 45.0
 """Greatest distance of a house, crown, car or patch from its street's centre line (m)."""
@@ -46,6 +52,11 @@ GROUND, DECK, OTHER = 2, 17, 1
 """Classes by ASPRS LAS 1.4; what is neither ground nor deck is unclassified."""
 DECK_M = 0.5
 """The true surface is a deck where it is this much above the terrain model (m)."""
+STEP_M = 5.0
+"""Distance between the points of a centre line (m)."""
+MARGIN_M = 50.0
+"""Centre lines within this distance around the grid are included (m)."""
+MAIN, SIDE, SUNKEN = "secondary", "residential", "primary"
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +105,6 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     """
     if seed < 0:
         raise TaskError(f"a seed is 0 or more, not {seed}")
-    if stratum is not None:
-        find_stratum(stratum)
     plan = plan_of(seed, stratum, options)
     # A margin, so that the smoothing of the terrain model has no edge effect on the tile.
     wide = grid.buffered(4 * DTM_BLUR_M)
@@ -191,15 +200,7 @@ def _ground_near(canvas: Canvas, options: SceneOptions) -> GroundAt:
     # Objects may lie beyond the tile, and the streets that shape their ground even farther.
     box = _box(canvas, 2 * OBJECT_REACH_M)
     circles = tuple(plan.circles(box, CIRCLE_M + REACH_M))
-    ways = Ways(
-        plan.streets(box),
-        tuple(plan.streams(box)),
-        circles,
-        curb_m=options.curb_m,
-        wall_m=options.wall_m,
-        hump_m=options.hump_m,
-    )
-    return partial(ground, land, ways)
+    return partial(ground, land, plan.streets(box), tuple(plan.streams(box)), circles, options.curb_m)
 
 
 def terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Generator) -> Floats:
@@ -241,3 +242,65 @@ def scan(scene: Scene, per_m2: float, noise_m: float, seed: int = 0) -> Points:
     deck = bare & (scene.reference - scene.dtm > DECK_M)
     kind = np.where(deck, DECK, np.where(bare, GROUND, OTHER)).astype(np.uint8).ravel()[cells]
     return Points(easting, northing, ground + above + noise_m * rng.standard_normal(number), kind)
+
+
+@dataclass(frozen=True, eq=False)
+class CentreLine:
+    """The centre line of one carriageway."""
+
+    points: Floats
+    """``(n, 2)``: easting and northing (m)."""
+    width_m: float
+    highway: str
+    """Class: a value of OSM's ``highway`` key."""
+    level: int = 0
+    """Number of the level: above 0 on a deck, below 0 in a tunnel."""
+
+
+def centre_lines(
+    grid: Grid, seed: int, stratum: str | None = None, options: SceneOptions = DEFAULTS
+) -> list[CentreLine]:
+    """Return the centre lines on and around a grid, in the world of `make_scene` with the same arguments.
+
+    A dual carriageway has two lines. The ends of medians are not represented, nor are the islands of
+    roundabouts where streets join.
+    """
+    plan = plan_of(seed, stratum, options)
+    west, south, east, north = grid.buffered(MARGIN_M).bounds
+    x, y = plan.from_map(np.array([west, west, east, east]), np.array([south, north, south, north]))
+    box = (float(x.min()), float(y.min()), float(x.max()), float(y.max()))
+    lines = [line for street in plan.streets(box) for line in _carriageways(plan, street)]
+    lines += [_sunken(plan, stream, box[1], box[3]) for stream in plan.streams(box) if stream.paved]
+    return lines + [_circle(plan, *centre) for centre in plan.circles(box, 0)]
+
+
+def _carriageways(plan: Plan, street: Street) -> Iterator[CentreLine]:
+    along = _steps(street.start, street.end)
+    beside, width = (street.half_width_m + street.median_m) / 2, street.half_width_m - street.median_m
+    highway = SIDE if street.key[1] % 2 else MAIN
+    if not street.median_m:
+        yield CentreLine(_on_map(plan, *street.point(along, 0.0)), 2 * width, highway)
+        return
+    for side in (-beside, beside):
+        yield CentreLine(_on_map(plan, *street.point(along, side)), width, highway)
+
+
+def _sunken(plan: Plan, stream: Stream, low: float, high: float) -> CentreLine:
+    left, right = stream.banks
+    y = _steps(low, high)
+    return CentreLine(_on_map(plan, (left.across(y) + right.across(y)) / 2, y), 2 * SUNKEN_M, SUNKEN)
+
+
+def _circle(plan: Plan, x: float, y: float) -> CentreLine:
+    turn, radius = np.linspace(0, 2 * np.pi, 33), (CIRCLE_M + ISLAND_M) / 2
+    turn[-1] = 0
+    ring = _on_map(plan, x + radius * np.cos(turn), y + radius * np.sin(turn))
+    return CentreLine(ring, CIRCLE_M - ISLAND_M, MAIN)
+
+
+def _steps(start: float, end: float) -> Floats:
+    return np.linspace(start, end, max(2, round((end - start) / STEP_M) + 1))
+
+
+def _on_map(plan: Plan, x: Floats, y: Floats) -> Floats:
+    return np.column_stack(plan.to_map(x, y))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import shapely
 
@@ -23,15 +23,14 @@ from flexroad.tools.prepare.from_mesh import POINTS, MeshOptions, prepare_mesh
 from flexroad.tools.prepare.options import PrepareOptions
 from flexroad.tools.prepare.output import on_failure
 from flexroad.tools.synthetic import SceneOptions, block, dsc3d, gerod, make_scene, prepared
-from flexroad.tools.synthetic.centrelines import CentreLine, centre_lines
 from flexroad.tools.synthetic.crossings import CrossingOptions, Crossings, make_crossings
-from flexroad.tools.synthetic.dsc3d import Place
+from flexroad.tools.synthetic.dsc3d import Place, encode, photogrammetry
 from flexroad.tools.synthetic.orthophoto import orthophoto
-from flexroad.tools.synthetic.photogrammetry import encode, photogrammetry
+from flexroad.tools.synthetic.scene import CentreLine, centre_lines
 
 geopandas = lazy("geopandas")
 
-PRESETS = ("gerod", "dsc3d")
+Preset = Literal["gerod", "dsc3d"]
 TILES, SIZE_M = 4, 250
 """Default number and side (m) of the tiles."""
 MADE = datetime(2025, 1, 1, tzinfo=UTC)
@@ -70,7 +69,7 @@ def write_scenes(
     seed: int,
     size_m: int | None = None,
     dop: bool = False,
-    preset: str | None = None,
+    preset: Preset | None = None,
     decks: bool = False,
 ) -> Path:
     """Write a block of neighbouring tiles, or the tiles of a preset; return the path of their catalog.
@@ -82,13 +81,16 @@ def write_scenes(
     - `tiles`: number of tiles; if None, 4, or all of the preset.
     - `size_m`: side of a tile (m); 250 if None. The size of a preset's tiles is fixed.
     - `dop`: whether to write orthophotos; the preset dsc3d always has them.
-    - `preset`: one of `PRESETS`; None for a block of neighbouring tiles.
+    - `preset`: None for a block of neighbouring tiles.
     - `decks`: whether the block has roads on decks and in tunnels (`tools.synthetic.crossings`).
     """
     if decks and (dop or preset):
         what = "--dop" if dop else f"--preset {preset}"
         raise ConfigError(f"--decks {what}: scenes with decks have no photos and no preset; leave {what} out")
-    if preset == "dsc3d" and size_m in (None, dsc3d.SIZE_M):
+    own_m = {"gerod": gerod.SIZE_M, "dsc3d": dsc3d.SIZE_M, None: size_m}[preset]
+    if size_m not in (None, own_m):
+        raise ConfigError(f"--tile-size {size_m}: tiles of {preset} have {own_m} m; leave --tile-size out")
+    if preset == "dsc3d":
         return write_stand_in(folder, tiles, seed)
     jobs = _jobs(folder, tiles, seed, size_m, dop, preset, decks)
     executor = AdaptiveExecutor(None, DaskExecutor(), lambda line: None)
@@ -114,7 +116,7 @@ def _jobs(
     seed: int,
     size_m: int | None,
     dop: bool,
-    preset: str | None,
+    preset: Preset | None,
     decks: bool,
 ) -> list[_SceneJob]:
     if preset is None:
@@ -124,11 +126,6 @@ def _jobs(
             _SceneJob(str(folder), tile_id, grid, seed, None, options, name, dop, extended_dtm=False)
             for tile_id, grid in block(tiles or TILES, size_m or SIZE_M)
         ]
-    if preset not in PRESETS:
-        raise ConfigError(f"--preset {preset}: unknown, there are {', '.join(PRESETS)}")
-    own_m = {"gerod": gerod.SIZE_M, "dsc3d": dsc3d.SIZE_M}[preset]
-    if size_m not in (None, own_m):
-        raise ConfigError(f"--tile-size {size_m}: tiles of {preset} have {own_m} m; leave --tile-size out")
     name = f"synthetic benchmark {preset}, seed {seed}"
     return [
         _SceneJob(str(folder), tile_id, grid, seed, stratum, options, name, dop, extended_dtm=True)
@@ -182,7 +179,13 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
         "width_m": [line.width_m for line in lines],
     }
     if any(line.level for line in lines):
-        columns |= _level_columns(lines)
+        # OSM's tags of decks and tunnels, and the level as a number.
+        columns |= {
+            "bridge": ["yes" if line.level > 0 else None for line in lines],
+            "tunnel": ["yes" if line.level < 0 else None for line in lines],
+            "layer": [str(line.level) if line.level else None for line in lines],
+            "level": [line.level for line in lines],
+        }
     shapes = [shapely.LineString(line.points) for line in lines]
     try:
         with vector_date(MADE):
@@ -190,16 +193,6 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _level_columns(lines: Sequence[CentreLine]) -> dict[str, list[Any]]:
-    """Return OSM's tags of decks and tunnels, and the level as a number."""
-    return {
-        "bridge": ["yes" if line.level > 0 else None for line in lines],
-        "tunnel": ["yes" if line.level < 0 else None for line in lines],
-        "layer": [str(line.level) if line.level else None for line in lines],
-        "level": [line.level for line in lines],
-    }
 
 
 def _with_truth(tile: Tile, folder: str, dataset: str) -> Tile:
@@ -215,7 +208,7 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int) -> Path:
     """Write the stand-in for DSC3D; return the path of the catalog with the paper's reference.
 
     The folder of a scene contains ``mesh.glb``, its true layers (``known/<layer>/<scene>.tif``), and the
-    rasters and catalog that ``prepare mesh`` writes. In the folder above are the catalogs of all scenes.
+    rasters and catalog that ``prepare`` writes. In the folder above are the catalogs of all scenes.
 
     - `scenes`: number of scenes; all five if None.
     """

@@ -12,7 +12,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.synthetic.network import Plan
 from flexroad.tools.synthetic.objects import Car, Crown, House
-from flexroad.tools.synthetic.population import Area, Objects, Trace
+from flexroad.tools.synthetic.population import Area, Objects
 
 
 class Kind(IntEnum):
@@ -116,18 +116,18 @@ def _trace(
     canvas: Canvas,
     dsm: Floats,
     kind: NDArray[np.uint8],
-    trace: Trace,
+    points: Floats,
     new_kind: Kind,
     rng: np.random.Generator,
 ) -> None:
     """Raise cells along a thin line, in place; only a fraction of the pulses hits it."""
     share = RAIL_ECHOES if new_kind == Kind.RAIL else WIRE_ECHOES
     west, south, east, north = canvas.grid.bounds
-    easting, northing = canvas.plan.to_map(trace.x, trace.y)
+    easting, northing = canvas.plan.to_map(*points[:2])
     inside = (easting > west) & (easting < east) & (northing > south) & (northing < north)
     hit = inside & (rng.random(inside.size) < share)
     row, col = canvas.grid.cells(easting[hit], northing[hit])
-    z = trace.z[hit]
+    z = points[2, hit]
     higher = z > dsm[row, col]
     row, col, z = row[higher], col[higher], z[higher]
     np.maximum.at(dsm, (row, col), z)

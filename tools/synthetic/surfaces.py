@@ -96,53 +96,46 @@ class Ground:
         return self.edge <= 0
 
 
-@dataclass(frozen=True, eq=False)
-class Ways:
-    """Streets, streams and roundabouts near some points."""
-
-    streets: Sequence[Street]
-    streams: Sequence[Stream]
-    circles: Sequence[tuple[float, float]] = ()
-    """Centres of roundabouts in the plan's frame."""
-    curb_m: float = 0.0
-    """Height of the pavement over the carriageway's edge (m)."""
-    wall_m: float = 0.0
-    """Height of the ground behind retaining walls over the carriageway's edge (m)."""
-    hump_m: float = 0.0
-    """Rise of streets over the middle of a stream (m)."""
-
-
-def ground(land: Relief, ways: Ways, x: Floats, y: Floats) -> Ground:
+def ground(
+    land: Relief,
+    streets: Sequence[Street],
+    streams: Sequence[Stream],
+    circles: Sequence[tuple[float, float]],
+    curb_m: float,
+    x: Floats,
+    y: Floats,
+) -> Ground:
     """Return the ground at points given in the plan's frame, in their shape.
 
     A street has the height of the hills under its centre line, with a rounded crossfall. Its weight falls
     smoothly from its edge into the terrain. Where streets meet, the weighted mean of their heights is used,
-    so there is no step at crossings. Kerbs and walls are added to it.
+    so there is no step at crossings. Kerbs are added to it.
+
+    - `circles`: centres of roundabouts.
+    - `curb_m`: height of the pavement over the carriageway's edge (m).
     """
     hills = land.large(x, y)
-    rise = ways.hump_m * _crest(ways.streams if ways.hump_m else (), x, y)
     blend = _Blend.of(hills)
-    for street in ways.streets:
+    for street in streets:
         near = _near(street, x, y)
         if near.any():
             lift, beyond, edge = _street_lift(street, land, x[near], y[near])
-            blend.add(near, hills[near] + lift + rise[near], beyond, edge)
-    for centre in ways.circles:
+            blend.add(near, hills[near] + lift, beyond, edge)
+    for centre in circles:
         away = np.hypot(x - centre[0], y - centre[1])
         blend.add(..., hills + land.grading(x, y), away - CIRCLE_M, away - CIRCLE_M)
         np.maximum(blend.edge, ISLAND_M - away, out=blend.edge)
     over = blend.edge.copy()
-    for stream in ways.streams:
+    for stream in streams:
         if stream.paved:
             beyond = stream.distance(x, y) - SUNKEN_M
             # Streets cross the sunken road at their own height.
             blend.add(..., hills, beyond, beyond, 1 - blend.heaviest)
     graded = blend.with_terrain(hills + land.small(x, y)) + land.datum_m
-    if ways.curb_m:
-        graded = graded + ways.curb_m * _terrace(over, 2.2, 1.5)
-    if ways.wall_m:
-        graded = graded + ways.wall_m * _terrace(over, 8.0, 12.0)
-    return Ground(graded, _trough(ways.streams, x, y), blend.edge, over)
+    if curb_m:
+        # A step up, a level pavement, then a slope down.
+        graded = graded + curb_m * (smoothstep(over / 0.2) - smoothstep((over - 2.2) / 1.5))
+    return Ground(graded, _trough(streams, x, y), blend.edge, over)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,23 +190,6 @@ def _street_lift(street: Street, land: Relief, x: Floats, y: Floats) -> tuple[Fl
         lift = lift + street.cross_slope * offset
     strip = street.strip(along)
     return lift, beyond, np.where(strip > 0, np.maximum(beyond, strip - distance), beyond)
-
-
-def _terrace(edge: Floats, level_m: float, slope_m: float) -> Floats:
-    """Return the profile of a pavement, or of the ground behind a wall, beside an edge, 0 to 1.
-
-    It is a step up, level up to ``level_m`` from the edge, then a slope down of width ``slope_m``.
-    """
-    return smoothstep((edge - 0.0) / 0.2) - smoothstep((edge - level_m) / slope_m)
-
-
-def _crest(streams: Sequence[Stream], x: Floats, y: Floats) -> Floats:
-    """Return the profile of hump bridges, 0 to 1: 1 on the axis of a stream, 0 beyond its banks."""
-    crest = np.zeros_like(x)
-    for stream in streams:
-        if not stream.paved:
-            crest = np.maximum(crest, 1 - smoothstep(stream.distance(x, y) / (BED_M + BANK_M)))
-    return crest
 
 
 def _near(street: Street, x: Floats, y: Floats) -> Bools:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass
+from collections.abc import Callable
 from itertools import islice
 
 import numpy as np
@@ -49,13 +49,6 @@ class SceneOptions(Options):
     )
     cross_slope: float = Field(0.0, ge=0, le=0.08, description="greatest one-sided slope of a street")
     curb_m: float = Field(0.0, ge=0, le=0.3, description="height of pavements over the carriageway (m)")
-    wall_m: float = Field(
-        0.0,
-        ge=-6,
-        le=6,
-        description="height of retaining walls along streets; negative: the ground beyond lies lower (m)",
-    )
-    hump_m: float = Field(0.0, ge=0, le=2, description="rise of streets over streams, as on hump bridges (m)")
     medians: float = Field(
         0.0, ge=0, le=1, description="fraction of the main streets that are dual carriageways"
     )
@@ -149,26 +142,11 @@ def generator(seed: int, purpose: str, *key: int) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(purpose.encode()), *(k + KEY_OFFSET for k in key)])
 
 
-@dataclass(frozen=True, eq=False)
-class Waves:
-    """A smooth field: a sum of plane waves of several lengths and directions.
+Waves = Callable[[Floats, Floats], Floats]
+"""A smooth field (m) at points x and y (m), in their broadcast shape: a sum of plane waves.
 
-    It is defined everywhere, so tiles that are evaluated separately join without a step.
-    """
-
-    wavevectors: Floats
-    """``(K, 2)``, rad/m along x and y."""
-    phases: Floats
-    """``(K,)``, rad."""
-    amplitudes: Floats
-    """``(K,)``, m."""
-
-    def __call__(self, x: Floats, y: Floats) -> Floats:
-        """Return the field (m) at the points, in their broadcast shape."""
-        total = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
-        for (kx, ky), phase, amplitude in zip(self.wavevectors, self.phases, self.amplitudes, strict=True):
-            total += amplitude * np.sin(kx * x + ky * y + phase)
-        return total
+It is defined everywhere, so tiles that are evaluated separately join without a step.
+"""
 
 
 def field(seed: int, purpose: str, span_m: tuple[float, float], number: int, rms_m: float = 1.0) -> Waves:
@@ -184,4 +162,12 @@ def waves(rng: np.random.Generator, lengths_m: ArrayLike, amplitudes_m: ArrayLik
     )
     heading = rng.uniform(0, 2 * np.pi, lengths.size)
     wavevectors = (2 * np.pi / lengths)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-    return Waves(wavevectors, rng.uniform(0, 2 * np.pi, lengths.size), amplitudes)
+    phases = rng.uniform(0, 2 * np.pi, lengths.size)
+
+    def at(x: Floats, y: Floats) -> Floats:
+        total = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
+        for (kx, ky), phase, amplitude in zip(wavevectors, phases, amplitudes, strict=True):
+            total += amplitude * np.sin(kx * x + ky * y + phase)
+        return total
+
+    return at

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from flexroad.catalog import Catalog
-from flexroad.catalog.allowlist import check_allowed
+from flexroad.catalog.index import check_allowed
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.storage.paths import check_writable
 from flexroad.catalog.text import printable, shown
@@ -31,6 +31,7 @@ app = group()
 @app.command(cls=Command)
 @shared.with_options
 def train(
+    ctx: typer.Context,
     catalog: shared.CatalogFile,
     options: training.TrainOptions,
     output: Annotated[
@@ -60,7 +61,6 @@ def train(
             rich_help_panel=METHOD,
         ),
     ] = None,
-    allow: shared.Allow = None,
 ) -> None:
     """Train the head of `segment: dinov2` on labelled tiles.
 
@@ -70,7 +70,7 @@ def train(
     changes = [text for text in settings or () if "." in text.partition("=")[0]]
     own = [text for text in settings or () if text not in changes]
     options = replace(options, settings=_settings(own))
-    tiles, loaded_config = Catalog.read(catalog, allow or ()), load_config(config, changes)
+    tiles, loaded_config = Catalog.read(catalog, shared.allowed(ctx)), load_config(config, changes)
     check_allowed(tiles)
     output.parent.mkdir(parents=True, exist_ok=True)
     check_writable(output.parent)

@@ -1,14 +1,17 @@
 """Train the head of `segment: dinov2` on some tiles of a catalog and validate it on others, which lie apart.
 
+Neighbouring tiles show the same streets, so a random split overestimates the quality of a model. Instead one
+straight line divides the tiles, and cells near the validation side are not used for training.
+
 Validation runs the segmenter as a run does, with the trained model but without cleanup: the metrics are those
 of the model alone.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,15 +30,15 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.segment.dinov2 import segment as segmenter
 from flexroad.tasks.types import Bools, RoadMask, TileData
 from flexroad.tools.train import fit_head
-from flexroad.tools.train.fit_head import Epoch, Sample, Trained
+from flexroad.tools.train.fit_head import Losses, Sample
 from flexroad.tools.train.mask_metrics import Quality, judge, together
-from flexroad.tools.train.spatial_split import Block, Split, inside, split, split_tile
 
 Labels = Literal["mask", "vector"]
+DIRECTIONS = 8
+"""Number of directions of the line between training and validation that are tried."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,46 @@ class TrainOptions:
     seed: int = option(0, METHOD, "Seed of the split and of the training.", "N", min=0)
     settings: Mapping[str, Any] | None = None
     """Options of the head's training, by name; None for the defaults."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A tile, or a part of it, on one side of the line."""
+
+    tile: Tile
+    bounds: Bounds
+    """Area whose labels are used."""
+    road: int
+    """Number of labelled road cells."""
+    ground: int
+    """Number of labelled cells of other ground."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Blocks of the training side and of the validation side."""
+
+    train: tuple[Block, ...]
+    validate: tuple[Block, ...]
+    gap_m: float
+    """Training cells are at least this far from the validation side (m)."""
+
+    def training_cells(self, grid: Grid, bounds: Bounds) -> Bools:
+        """Return the cells within the bounds and far enough from the validation side, ``(H, W)``."""
+        cells = inside(grid, bounds)
+        for piece in self.validate:
+            west, south, east, north = piece.bounds
+            excluded = (west - self.gap_m, south - self.gap_m, east + self.gap_m, north + self.gap_m)
+            cells &= ~inside(grid, excluded)
+        return cells
+
+
+def inside(grid: Grid, bounds: Bounds) -> Bools:
+    """Return the cells of a grid whose centres lie within bounds, ``(H, W)``."""
+    west, south, east, north = bounds
+    rows = (grid.northings > south) & (grid.northings < north)
+    cols = (grid.eastings > west) & (grid.eastings < east)
+    return np.asarray(rows[:, None] & cols)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +146,7 @@ class LabelledTiles:
         """Return the cells within the survey and outside the band along label edges, ``(H, W)``."""
         cell, width = data.grid.cell, self.options.ignore_m
         band = within(road, cell, width) & within(~road, cell, width)
-        return ~beyond_extent(data) & ~band
+        return ~data.beyond_extent() & ~band
 
     def blocks(self, tile: Tile, parts: Sequence[Bounds]) -> list[Block]:
         """Return a block for each part of a tile that has labelled cells."""
@@ -124,9 +167,11 @@ class LabelledTiles:
 class Outcome:
     """A trained model and its validation."""
 
-    options: TrainOptions
     tiles: LabelledTiles
-    trained: Trained
+    model: bytes
+    """Content of the model file."""
+    history: tuple[Losses, ...]
+    """One entry per epoch, in order."""
     split: Split
     judged: tuple[Evaluation, ...]
     notes: tuple[str, ...]
@@ -152,26 +197,13 @@ class Outcome:
         return together(one.inner for one in self.judged)
 
 
-@dataclass(frozen=True)
-class Samples(Sequence[Sample]):
-    """The samples of one side; each is read when it is accessed."""
-
-    tiles: LabelledTiles
-    split: Split
-    part: Literal["train", "validate"]
-
-    @cached_property
-    def _blocks(self) -> tuple[Block, ...]:
-        return self.split.train if self.part == "train" else self.split.validate
-
-    def __len__(self) -> int:
-        return len(self._blocks)
-
-    def __getitem__(self, index: Any) -> Any:
-        block = self._blocks[index]
-        data, road = self.tiles.read(block.tile)
-        select = self.split.training_cells if self.part == "train" else inside
-        return Sample(data, road, self.tiles.usable_cells(data, road) & select(data.grid, block.bounds))
+def samples(
+    tiles: LabelledTiles, blocks: Sequence[Block], select: Callable[[Grid, Bounds], Bools]
+) -> Iterator[Sample]:
+    """Yield the sample of each block; ``select`` returns the cells of a grid that are used of some bounds."""
+    for block in blocks:
+        data, road = tiles.read(block.tile)
+        yield Sample(data, road, tiles.usable_cells(data, road) & select(data.grid, block.bounds))
 
 
 def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notify) -> Outcome:
@@ -189,15 +221,15 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notif
     notes: list[str] = []
     sides = _split(list(_labelled(catalog, tiles, notes)), options)
     notify(f"{count(len(sides.train), 'tile')} for training, {len(sides.validate)} for validation")
-    samples, validation = (Samples(tiles, sides, part) for part in ("train", "validate"))
-
-    def progress(done: int, of: int, last: Epoch) -> None:
-        notify(f"epoch {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
-
-    trained = fit_head.train(samples, validation, settings, progress)
+    trained, history = fit_head.train(
+        samples(tiles, sides.train, sides.training_cells),
+        samples(tiles, sides.validate, inside),
+        settings,
+        notify,
+    )
     with ScratchFolder() as folder:
-        model = Path(folder, f"model{trained.suffix}")
-        model.write_bytes(trained.model)
+        model = Path(folder, "model.safetensors")
+        model.write_bytes(trained)
         given = configured.model_dump() if isinstance(configured, segmenter.Options) else {}
         # Without cleanup: the figures are those of the model alone.
         applied = segmenter.Options(**given | {"model": model, "cleanup": "none"})
@@ -205,12 +237,12 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notif
             _evaluate(block, tiles, lambda data: segmenter.segment(data, applied)) for block in sides.validate
         )
     notes += [f"{each.piece.tile.id}: {each.note}" for each in judged if each.note]
-    return Outcome(options, tiles, trained, sides, judged, tuple(notes))
+    return Outcome(tiles, trained, history, sides, judged, tuple(notes))
 
 
 def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], RoadMask]) -> Evaluation:
     data, road = tiles.read(block.tile)
-    surveyed = inside(data.grid, block.bounds) & ~beyond_extent(data)
+    surveyed = inside(data.grid, block.bounds) & ~data.beyond_extent()
     note = ""
     try:
         mask = segment(data)
@@ -283,3 +315,48 @@ def _settings(options: TrainOptions) -> fit_head.Options:
             f"--set {name}: {fault['msg'].lower()}, not {shown(fault['input'])}; "
             f"the training has {', '.join(fit_head.Options.model_fields)}"
         ) from error
+
+
+def split(pieces: Sequence[Block], share: float, gap_m: float, seed: int) -> Split:
+    """Split blocks by a straight line into a training side and a validation side.
+
+    Eight directions of the line are tried in an order drawn from the seed. The first one with road and other
+    ground on both sides is used.
+
+    - `pieces`: at least two, all in one CRS.
+    - `share`: fraction of the blocks on the validation side, 0 to 1; each side has at least one block.
+    """
+    count = min(max(1, round(share * len(pieces))), len(pieces) - 1)
+    for turn in np.random.default_rng(seed).permutation(DIRECTIONS):
+        angle = 2 * math.pi * turn / DIRECTIONS
+        along = [
+            math.sin(angle) * (w + e) + math.cos(angle) * (s + n)
+            for w, s, e, n in (one.bounds for one in pieces)
+        ]
+        order = np.argsort(along, kind="stable")
+        validate = tuple(pieces[i] for i in sorted(order[-count:]))
+        train = tuple(pieces[i] for i in sorted(order[:-count]))
+        if _has_both(train) and _has_both(validate):
+            return Split(train, validate, gap_m)
+    raise ConfigError(
+        "no straight line splits the tiles into two sides with road and other ground on each: "
+        f"{len(pieces)} tiles with labels, "
+        f"{sum(piece.road > 0 for piece in pieces)} of them with road; label more tiles"
+    )
+
+
+def split_tile(bounds: Bounds, share: float) -> tuple[Bounds, Bounds]:
+    """Return the bounds of two parts of a tile, for a catalog with a single tile.
+
+    The second part has a fraction ``share`` of the area. It is in the east, or in the south of a tall tile.
+    """
+    west, south, east, north = bounds
+    if east - west >= north - south:
+        middle = east - share * (east - west)
+        return (west, south, middle, north), (middle, south, east, north)
+    middle = south + share * (north - south)
+    return (west, middle, east, north), (west, south, east, middle)
+
+
+def _has_both(pieces: Sequence[Block]) -> bool:
+    return any(piece.road for piece in pieces) and any(piece.ground for piece in pieces)

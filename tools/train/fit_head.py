@@ -7,7 +7,7 @@ not grow with the number of tiles.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from pydantic import Field
 
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.text import Notify
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
@@ -55,34 +56,11 @@ class Sample:
     """Cells whose label is used, ``(H, W)``: inside survey and tile, outside the band along label edges."""
 
 
-@dataclass(frozen=True)
-class Epoch:
-    """Losses after one epoch."""
-
-    train_loss: float
-    validation_loss: float
-
-
-@dataclass(frozen=True, eq=False)
-class Trained:
-    """The result of training."""
-
-    model: bytes
-    """Content of the model file."""
-    suffix: str
-    """Suffix of the model file: ``.safetensors``."""
-    history: tuple[Epoch, ...]
-    """One entry per epoch, in order."""
-
-
-@dataclass(frozen=True, eq=False)
-class Labels:
-    """The labelled cells of one window."""
-
-    position: NDArray[np.float32]
-    """Column and row of the cells' centres, ``(m, 2)``, from -1 to 1 across the window."""
-    road: NDArray[np.float32]
-    """1 for road, else 0, ``(m,)``."""
+Losses = tuple[float, float]
+"""Mean loss of training and of validation in one epoch."""
+Labels = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""The labelled cells of one window: column and row of their centres, ``(m, 2)``, from -1 to 1 across the
+window; and 1 for road, else 0, ``(m,)``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,25 +76,12 @@ class Windows:
     @property
     def road(self) -> int:
         """Number of labelled road cells."""
-        return round(sum(float(part.road.sum()) for part in self.labels))
+        return round(sum(float(road.sum()) for _, road in self.labels))
 
     @property
     def cells(self) -> int:
         """Number of labelled cells."""
-        return sum(len(part.road) for part in self.labels)
-
-
-@dataclass(frozen=True, eq=False)
-class Line:
-    """A linear map from a token to a logit."""
-
-    weight: NDArray[np.float32]
-    """``(features,)``."""
-    bias: float
-
-
-Progress = Callable[[int, int, Epoch], None]
-"""Called at the end of every epoch with its number, from 1, the largest number, and its losses."""
+        return sum(len(road) for _, road in self.labels)
 
 
 class Options(base.Options):
@@ -140,20 +105,17 @@ class Options(base.Options):
 
 
 def train(
-    train: Sequence[Sample],
-    validate: Sequence[Sample],
-    options: Options,
-    progress: Progress | None = None,
-) -> Trained:
-    """Train a head; keep the epoch with the lowest loss on the validation tiles."""
+    train: Iterable[Sample], validate: Iterable[Sample], options: Options, notify: Notify
+) -> tuple[bytes, tuple[Losses, ...]]:
+    """Train a head; return the model file of the epoch with the lowest validation loss, and all losses."""
     backbone = load_backbone(options.backbone, options.device, options.half)
     if options.layers > backbone.layers:
         raise TaskError(f"{backbone.name} has {backbone.layers} layers, not {options.layers}; lower layers")
     with tempfile.TemporaryFile() as first, tempfile.TemporaryFile() as second:
         train_windows = _windows(train, backbone, options, first, "training")
         validation = _windows(validate, backbone, options, second, "validation")
-        line, history = regress(train_windows, validation, options, progress)
-        threshold, iou = best_threshold(validation, line)
+        weight, bias, history = regress(train_windows, validation, options, notify)
+        threshold, iou = best_threshold(validation, weight, bias)
     facts: dict[str, str | int | float] = {
         "train_tiles": " ".join(train_windows.tiles),
         "validation_tiles": " ".join(validation.tiles),
@@ -161,21 +123,11 @@ def train(
         "train_road_cells": train_windows.road,
         "validation_cells": validation.cells,
         "validation_road_cells": validation.road,
-        "validation_loss": min(past.validation_loss for past in history),
+        "validation_loss": min(loss for _, loss in history),
         "validation_iou": iou,
         "epochs": len(history),
         "options": options.model_dump_json(),
     }
-    return Trained(_head(line, threshold, facts, backbone, options).encode(), ".safetensors", history)
-
-
-def _head(
-    line: Line,
-    threshold: float,
-    facts: dict[str, str | int | float],
-    backbone: Backbone,
-    options: Options,
-) -> Head:
     about = About(
         backbone=options.backbone,
         model_type=backbone.model_type,
@@ -191,11 +143,11 @@ def _head(
         threshold=threshold,
         trained=facts,
     )
-    return Head(line.weight[None], np.array([line.bias], np.float32), about)
+    return Head(weight[None].numpy(), bias[None].numpy(), about).encode(), history
 
 
 def _windows(
-    samples: Sequence[Sample], backbone: Backbone, options: Options, scratch: IO[bytes], name: str
+    samples: Iterable[Sample], backbone: Backbone, options: Options, scratch: IO[bytes], name: str
 ) -> Windows:
     """Compute the tokens of all labelled windows and write them to the scratch file."""
     side = options.window_px // PATCH
@@ -208,13 +160,12 @@ def _windows(
             tokens = backbone.tokens(images, options.layers).cpu().numpy()
             scratch.write(tokens.astype(np.float16).tobytes())
             labels += part
-    road = sum(float(part.road.sum()) for part in labels)
-    if not 0 < road < sum(len(part.road) for part in labels):
+    scratch.flush()
+    if not 0 < sum(float(road.sum()) for _, road in labels) < sum(len(road) for _, road in labels):
         raise TaskError(
             f"no {name} tile has an orthophoto and labels of both road and other ground; "
             "give --dop to `flexroad catalog`, or train on more tiles"
         )
-    scratch.flush()
     return Windows(np.memmap(scratch, np.float16, "r", shape=(len(labels), *shape)), labels, tiles)
 
 
@@ -229,7 +180,7 @@ def _batches(sample: Sample, options: Options) -> Iterator[tuple[NDArray[np.floa
     for row, col in corners(photo.known.shape, size):
         window = np.s_[row : row + size, col : col + size]
         window_labels = _labels(sample, photo.grid.part(*window), photo.known[window])
-        if len(window_labels.road):
+        if len(window_labels[1]):
             images.append(image[(slice(None), *window)])
             labels.append(window_labels)
         if len(images) == options.batch:
@@ -251,13 +202,14 @@ def _labels(sample: Sample, window: Grid, covered: Bools) -> Labels:
     x = 2 * (east - window.west) / (window.east - window.west) - 1
     y = 2 * (window.north - north) / (window.north - window.south) - 1
     road = sample.road[np.ix_(rows, cols)].ravel()[used]
-    return Labels(np.stack([x, y], axis=1)[used].astype(np.float32), road.astype(np.float32))
+    return np.stack([x, y], axis=1)[used].astype(np.float32), road.astype(np.float32)
 
 
 class _Regression:
     """A linear map trained by AdamW on the weighted cross entropy."""
 
     def __init__(self, windows: Windows, options: Options) -> None:
+        self.batch = options.batch
         self.centre, self.spread = (torch.tensor(m, dtype=torch.float32) for m in _moments(windows.tokens))
         self.road_weight = ((windows.cells - windows.road) / windows.road) ** options.balance
         self.weight = torch.zeros(len(self.centre), requires_grad=True)
@@ -266,62 +218,47 @@ class _Regression:
             [self.weight, self.bias], lr=options.learning_rate, weight_decay=options.weight_decay
         )
 
-    def folded(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def line(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return weight and bias for tokens that are not standardised."""
         weight = self.weight / self.spread
         return weight, self.bias - weight @ self.centre
 
-    def line(self) -> Line:
-        """Return the current linear map."""
-        weight, bias = self.folded()
-        return Line(weight.detach().numpy().copy(), bias.item())
-
-    def loss(self, windows: Windows, which: NDArray[np.intp]) -> tuple[torch.Tensor, float]:
-        """Return the summed cross entropy of the labelled cells in windows ``which``, and their weight."""
-        logits, road = at_cells(windows, which, *self.folded())
-        weights = 1 + (self.road_weight - 1) * road
+    def mean_loss(self, windows: Windows, order: NDArray[np.intp], learn: bool) -> float:
+        """Return the mean cross entropy of the labelled cells over windows; each batch is learnt if asked."""
         entropy = torch.nn.functional.binary_cross_entropy_with_logits
-        return entropy(logits, road, weights, reduction="sum"), float(weights.sum())
-
-    def train_epoch(self, windows: Windows, order: NDArray[np.intp], batch: int) -> float:
-        """Train one epoch; return the mean loss during it."""
         sums = np.zeros(2)
-        for which in _parts(order, batch):
-            self.adam.zero_grad()
-            loss, weight = self.loss(windows, which)
-            (loss / weight).backward()
-            self.adam.step()
-            sums += loss.item(), weight
-        return float(sums[0] / sums[1])
-
-    def mean_loss(self, windows: Windows, batch: int) -> float:
-        """Return the mean loss over windows, without training."""
-        sums = np.zeros(2)
-        with torch.no_grad():
-            for which in _parts(np.arange(len(windows.labels)), batch):
-                loss, weight = self.loss(windows, which)
+        with torch.set_grad_enabled(learn):
+            for start in range(0, len(order), self.batch):
+                logits, road = at_cells(windows, order[start : start + self.batch], *self.line())
+                weights = 1 + (self.road_weight - 1) * road
+                loss, weight = entropy(logits, road, weights, reduction="sum"), float(weights.sum())
+                if learn:
+                    self.adam.zero_grad()
+                    (loss / weight).backward()
+                    self.adam.step()
                 sums += loss.item(), weight
         return float(sums[0] / sums[1])
 
 
 def regress(
-    train: Windows, validate: Windows, options: Options, progress: Progress | None = None
-) -> tuple[Line, tuple[Epoch, ...]]:
-    """Train; return the map with the lowest loss on ``validate``, and the losses of all epochs."""
+    train: Windows, validate: Windows, options: Options, notify: Notify
+) -> tuple[torch.Tensor, torch.Tensor, tuple[Losses, ...]]:
+    """Train; return weight and bias with the lowest loss on ``validate``, and the losses of all epochs."""
     regression = _Regression(train, options)
     rng = np.random.default_rng(options.seed)
-    history: list[Epoch] = []
+    history: list[Losses] = []
     best = regression.line()
     lowest, since = np.inf, 0
     while len(history) < options.epochs and since < options.patience:
-        loss = regression.train_epoch(train, rng.permutation(len(train.labels)), options.batch)
-        history.append(Epoch(loss, regression.mean_loss(validate, options.batch)))
+        loss = regression.mean_loss(train, rng.permutation(len(train.labels)), learn=True)
+        validation = regression.mean_loss(validate, np.arange(len(validate.labels)), learn=False)
+        history.append((loss, validation))
         since += 1
-        if history[-1].validation_loss < lowest:
-            best, lowest, since = regression.line(), history[-1].validation_loss, 0
-        if progress:
-            progress(len(history), options.epochs, history[-1])
-    return best, tuple(history)
+        if validation < lowest:
+            best, lowest, since = regression.line(), validation, 0
+        notify(f"epoch {len(history)} of {options.epochs}: loss {loss:.4f}, validation {validation:.4f}")
+    weight, bias = (part.detach() for part in best)
+    return weight, bias, tuple(history)
 
 
 def at_cells(
@@ -334,18 +271,17 @@ def at_cells(
     logits = []
     for i in which:
         coarse = torch.from_numpy(windows.tokens[i].astype(np.float32)) @ weight + bias
-        position = torch.from_numpy(windows.labels[i].position)
+        position = torch.from_numpy(windows.labels[i][0])
         fine = torch.nn.functional.grid_sample(
             coarse[None, None], position[None, None], padding_mode="border", align_corners=False
         )
         logits.append(fine.ravel())
-    road = np.concatenate([windows.labels[i].road for i in which])
+    road = np.concatenate([windows.labels[i][1] for i in which])
     return torch.cat(logits), torch.from_numpy(road)
 
 
-def best_threshold(windows: Windows, line: Line) -> tuple[float, float]:
+def best_threshold(windows: Windows, weight: torch.Tensor, bias: torch.Tensor) -> tuple[float, float]:
     """Return the probability threshold with the best IoU, and that IoU."""
-    weight, bias = torch.from_numpy(line.weight), torch.tensor(line.bias)
     counts = np.zeros((2, len(THRESHOLDS) + 1))
     for i in range(len(windows.labels)):
         logits, road = at_cells(windows, np.array([i]), weight, bias)
@@ -370,8 +306,3 @@ def _moments(tokens: NDArray[np.float16]) -> tuple[Floats, Floats]:
     centre = total / n
     # A constant feature must not cause a division by 0.
     return centre, np.sqrt(np.maximum(square / n - centre**2, 1e-12))
-
-
-def _parts(order: NDArray[np.intp], size: int) -> Iterator[NDArray[np.intp]]:
-    for start in range(0, len(order), size):
-        yield order[start : start + size]

@@ -103,16 +103,10 @@ def judge(
 
 def together(parts: Iterable[Quality]) -> Quality:
     """Return the sum of the counts of several tiles, at least one."""
-    tiles = list(parts)
-    return Quality(
-        right=sum(tile.right for tile in tiles),
-        wrong=sum(tile.wrong for tile in tiles),
-        missed=sum(tile.missed for tile in tiles),
-        ground=sum(tile.ground for tile in tiles),
-        road_by_probability=np.sum([tile.road_by_probability for tile in tiles], axis=0),
-        ground_by_probability=np.sum([tile.ground_by_probability for tile in tiles], axis=0),
-        edge_m=np.concatenate([tile.edge_m for tile in tiles]),
-    )
+    tiles = [vars(tile) for tile in parts]
+    edge_m = np.concatenate([tile["edge_m"] for tile in tiles])
+    summed = {name: sum(tile[name] for tile in tiles) for name in tiles[0] if name != "edge_m"}
+    return Quality(**summed, edge_m=edge_m)
 
 
 def edges(mask: Bools, valid: Bools) -> Floats:

@@ -48,11 +48,11 @@ def write_model(outcome: Outcome, path: Path) -> tuple[Path, ...]:
 
     - `path`: path of the model; without a suffix, ``.safetensors`` is added.
     """
-    path = path if path.suffix else path.with_suffix(outcome.trained.suffix)
+    path = path if path.suffix else path.with_suffix(".safetensors")
     html, record = path.with_name(f"{path.name}.html"), path.with_name(f"{path.name}.json")
     write(html, _page(outcome, path.name).encode())
     write(record, json.dumps(_record(outcome), indent=1).encode())
-    write(path, outcome.trained.model)
+    write(path, outcome.model)
     return path, html, record
 
 
@@ -90,7 +90,7 @@ def _figures(quality: Quality) -> dict[str, float]:
 def _page(outcome: Outcome, name: str) -> str:
     rows = [
         ("all cells", outcome.quality),
-        (f"{outcome.options.ignore_m:g} m off label edges", outcome.inner),
+        (f"{outcome.tiles.options.ignore_m:g} m off label edges", outcome.inner),
     ]
     overall = pd.DataFrame([{"cells": cells} | _figures(quality) for cells, quality in rows])
     per_tile = pd.DataFrame(
@@ -117,7 +117,7 @@ def _page(outcome: Outcome, name: str) -> str:
 
 
 def _lines(outcome: Outcome) -> list[str]:
-    options, split = outcome.options, outcome.split
+    options, split = outcome.tiles.options, outcome.split
     warning = verdict(outcome)
     return [
         *([f"Warning: {warning}."] if warning else []),
@@ -140,13 +140,11 @@ def _curves(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
         line = {"thresholds from 0 to 1": (recall[valid], precision[valid])}
         limits = ((0.0, 1.02), (0.0, 1.02))
         yield "Precision and recall by threshold", curves(line, ("recall", "precision"), limits, mark)
-    history = outcome.trained.history
+    history = outcome.history
     if len(history) > 1:
         epochs = np.arange(1.0, len(history) + 1)
-        losses = {
-            "training": (epochs, np.array([entry.train_loss for entry in history])),
-            "validation": (epochs, np.array([entry.validation_loss for entry in history])),
-        }
+        named = zip(("training", "validation"), np.array(history).T, strict=True)
+        losses = {name: (epochs, values) for name, values in named}
         yield "Loss by epoch", curves(losses, ("epoch", "loss"))
 
 
@@ -170,7 +168,7 @@ def _share(quality: Quality) -> float:
 
 def _options(outcome: Outcome) -> dict[str, Any]:
     """Return the training options and the ids of the tiles of both sides."""
-    return asdict(outcome.options) | {
+    return asdict(outcome.tiles.options) | {
         "learnt from": [piece.tile.id for piece in outcome.split.train],
         "judged by": [piece.tile.id for piece in outcome.split.validate],
     }
@@ -180,7 +178,7 @@ def _record(outcome: Outcome) -> dict[str, Any]:
     """Return the content of MODEL.json: options, figures, curves and versions."""
     thresholds, precision, recall = outcome.quality.curve()
     return {
-        "model_sha256": hashlib.sha256(outcome.trained.model).hexdigest(),
+        "model_sha256": hashlib.sha256(outcome.model).hexdigest(),
         "asked": _options(outcome),
         "all": no_nan(_figures(outcome.quality)),
         "off_label_edges": no_nan(_figures(outcome.inner)),
@@ -192,7 +190,10 @@ def _record(outcome: Outcome) -> dict[str, Any]:
             "precision": [None if math.isnan(value) else value for value in precision.tolist()],
             "recall": [None if math.isnan(value) else value for value in recall.tolist()],
         },
-        "history": [no_nan(asdict(entry)) for entry in outcome.trained.history],
+        "history": [
+            no_nan({"train_loss": loss, "validation_loss": validation})
+            for loss, validation in outcome.history
+        ],
         "notes": list(outcome.notes),
         "versions": versions(),
     }

@@ -18,7 +18,7 @@ from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.options import OUTPUTS
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
 from flexroad.pipeline.run.record import Run
 from flexroad.tools.view.driver import server, write_viewer
 
@@ -30,6 +30,7 @@ MOST_NOTES = 5
 
 @app.command(cls=Command)
 def view(
+    ctx: typer.Context,
     path: options.Run,
     output: Annotated[
         Path | None,
@@ -55,7 +56,6 @@ def view(
     ] = 0,
     tile: options.TileIds = None,
     bbox: options.Box = None,
-    allow: options.Allow = None,
     workers: options.Parallel = 1,
 ) -> None:
     """Write a run as a page for browsers: map and surface in 3D.
@@ -65,12 +65,12 @@ def view(
     """
     if port and not serve:
         raise ConfigError(f"--port {port} is for --serve; add that, or leave out --port")
-    run = Run.open(parse_location(path), [str(place) for place in allow or ()])
+    run = Run.open(parse_location(path), options.allowed(ctx))
     folder = parse_location(output) if output else run.path / FOLDER
     if serve and is_remote(folder):
         raise ConfigError(f"--serve needs a folder on disk, not {folder}; give one with -o")
     runner = SerialExecutor() if workers == 1 else DaskExecutor(workers)
-    track = StepProgress(Console(stderr=True))
+    track = step_progress(Console(stderr=True))
     written = write_viewer(run, folder, runner, tile or (), bbox, track)
     for note in written.notes[:MOST_NOTES]:
         echo(f"note: {note}", err=True)

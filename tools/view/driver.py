@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -20,13 +20,12 @@ from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.crs import in_plan, name, short, transformer
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.storage.links import contained
-from flexroad.catalog.storage.paths import Location, absolute, exists, read, remove, write
+from flexroad.catalog.storage.paths import Location, absolute, contained, exists, read, remove, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run, check_links, check_own
-from flexroad.pipeline.run.status import TileStatus, Track, ended, peek_statuses, untracked
+from flexroad.pipeline.run.status import Track, ended, peek_statuses, untracked
 from flexroad.pipeline.store.records import LEVELS
 from flexroad.pipeline.worker.exports import tile_photo
 from flexroad.tasks.errors import TaskError
@@ -36,13 +35,11 @@ from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.products import glb
 from flexroad.tasks.quality.height_source import top_height_source
 from flexroad.tasks.roads import rasterise
-from flexroad.tasks.roads.rasterise import DEFAULTS
 from flexroad.tasks.roads.rasterise import Options as RoadOptions
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Floats
 from flexroad.tools.export.network import read_centre_lines
-from flexroad.tools.export.source import TileItem, layer_state
+from flexroad.tools.export.source import layer_state
 from flexroad.tools.export.tile_outputs import TileOutput, write_outputs
 from flexroad.tools.view import encoding
 
@@ -110,10 +107,15 @@ def write_viewer(
     index, done = _index(run, tiles, variant)
     options = run.config.chains[variant]["segment"]
     roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
-    look = Look(run.origin, roads)
-    finished = track(_finished(run, done, variant), "writing tiles", len(done))
-    with ended(finished):
-        rows = list(write_outputs(finished, out, VERSION, script, look, executor))
+    place = RunPlace.of(run)
+    finished = (
+        FinishedTile(tile, variant, snapshot, place)
+        for tile, snapshot in snapshots(run, done, variant)
+        if snapshot
+    )
+    tracked, look = track(finished, "writing tiles", len(done)), (run.origin, roads)
+    with ended(tracked):
+        rows = list(write_outputs(tracked, out, VERSION, script, look, executor, made_of=_made_of))
     for file in built_files():
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())
@@ -173,13 +175,10 @@ def _claim(out: Location, run: Run) -> None:
     remove(out / PAGE)
 
 
-def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[TileItem]:
-    place = RunPlace.of(run)
-    for tile, snapshot in snapshots(run, done, variant):
-        if snapshot:
-            photo_and_lines = (layer_state(tile, name) for name in ("dop", "roads"))
-            made_of = " ".join((snapshot.nodes["assess"], *photo_and_lines))
-            yield TileItem(FinishedTile(tile, variant, snapshot, place), made_of)
+def _made_of(tile: FinishedTile) -> str:
+    """Return the name of a tile's script by what it is made of."""
+    photo_and_lines = (layer_state(tile.tile, name) for name in ("dop", "roads"))
+    return " ".join((tile.snapshot.nodes["assess"], *photo_and_lines))
 
 
 def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any], list[Tile]]:
@@ -187,8 +186,12 @@ def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any
     states, rows, errors, stale = list[int](), list[dict[str, Any]](), list[str](), list[bool]()
     for status in peek_statuses(run, tiles):
         states.append(DONE if status.done else FAILED if status.failed else PENDING)
-        rows.append(_row(status, variant))
-        errors.append(_error(status))
+        record = status.last_record
+        figures = record.rows if status.done and record else ()
+        rows.append(next((row for row in figures if row.get("variant") == variant), {}))
+        failures = record.failures if status.failed and record else ()
+        lines = dict.fromkeys(f"{f.line}{f' [{f.file}]' if f.file else ''}" for f in failures)
+        errors.append("; ".join(lines))
         stale.append(status.stale)
     bounds = [tile.grid.bounds for tile in tiles]
     measures = {name: [_figure(row.get(name)) for row in rows] for name in MEASURES}
@@ -218,18 +221,6 @@ def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any
         "tiles": columns,
     } | ({"levels": True} if any(LEVELS in row for row in rows) else {})
     return index, [tile for tile, state in zip(tiles, states, strict=True) if state == DONE]
-
-
-def _row(status: TileStatus, variant: str) -> dict[str, Any]:
-    """Return the figures of a finished tile; none of others."""
-    rows: Iterable[dict[str, Any]] = status.last_record.rows if status.done and status.last_record else ()
-    return next((row for row in rows if row.get("variant") == variant), {})
-
-
-def _error(status: TileStatus) -> str:
-    failures = status.last_record.failures if status.failed and status.last_record else ()
-    lines = dict.fromkeys(f"{f.line}{f' [{f.file}]' if f.file else ''}" for f in failures)
-    return "; ".join(lines)
 
 
 def _figure(value: Any) -> float | None:
@@ -275,22 +266,17 @@ def server(folder: Path, port: int) -> ThreadingHTTPServer:
     return ThreadingHTTPServer((LOOPBACK, port), partial(_Files, directory=str(folder)))
 
 
-@dataclass(frozen=True)
-class Look:
-    """Options of the tiles' scripts."""
+def script(tile: FinishedTile, look: tuple[tuple[float, float], RoadOptions]) -> TileOutput:
+    """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks.
 
-    origin: tuple[float, float]
-    """Whole-metre (easting, northing) that meshes of the run are relative to."""
-    roads: RoadOptions = DEFAULTS
-    """Selection of the road lines."""
-
-
-def script(item: TileItem, look: Look) -> TileOutput:
-    """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks."""
-    tile = item.tile
-    source, notes = tile.tile, list[str]()
+    - `look`: the run's origin (easting, northing), and which road lines are shown.
+    """
+    (origin, roads), source, notes = look, tile.tile, list[str]()
     photo = _photo(source, PHOTO_PX, notes)
     quality, surface, core = tile.quality, tile.surface, source.grid
+    west, south, east, north = core.bounds
+    to_degrees = transformer(core.crs, WGS84).transform
+    corners = to_degrees([west, east, west, east], [south, south, north, north])
     top = surface.top(*np.meshgrid(core.eastings, core.northings))
     try:
         data, (estimate, _) = tile.data, tile.top_errors
@@ -309,31 +295,22 @@ def script(item: TileItem, look: Look) -> TileOutput:
         seen = base64.b64encode(small).decode("ascii")
     encoded = encoding.encode_tile(
         tile.id,
-        glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
+        glb.encode(tile.mesh, (*origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
-        corners(source),
+        np.column_stack(corners),
         top_height_source(quality, top),
         dsm,
         dtm,
         estimate,
         surface if isinstance(surface, NurbsSurface) and not surface.levels else None,
         surface.highest.lattice(core.eastings, core.northings) if surface.levels else None,
-        _lines(source, look.roads, notes),
+        _lines(source, roads, notes),
     )
     name = f"tiles/{safe_name(tile.id)}{encoding.NAME_TILE}"
     return TileOutput(
         {name: encoded},
         {"tile": tile.id, "notes": notes, "picture": seen, "places": places},
     )
-
-
-def corners(tile: Tile) -> Floats:
-    """Return longitude and latitude of a tile's corners, ``(4, 2)``: SW, SE, NW, NE (degrees)."""
-    west, south, east, north = tile.grid.bounds
-    places = transformer(tile.grid.crs, WGS84).transform(
-        [west, east, west, east], [south, south, north, north]
-    )
-    return np.column_stack(places)
 
 
 def _photo(tile: Tile, largest_px: int, notes: list[str]) -> glb.Texture | None:
@@ -357,7 +334,7 @@ def _lines(tile: Tile, options: RoadOptions, notes: list[str]) -> tuple[CentreLi
         return ()
     bounds = tile.grid.bounds
     try:
-        lines = read_centre_lines(source, bounds, tile.grid.crs, options).lines
+        lines = read_centre_lines({source: bounds}, tile.grid.crs, options).lines
     except TaskError as error:
         notes.append(f"no road lines: {error}")
         return ()

@@ -71,7 +71,11 @@ def encode_tile(
     """
     stride = max(1, -(-max(grid.shape) // MOST_CELLS))
     thinned = slice(stride // 2, None, stride)
-    rows, cols = height_source[thinned, thinned].shape
+    height_source = height_source[thinned, thinned]
+    dsm, dtm, estimate, top = (
+        None if values is None else values[thinned, thinned] for values in (dsm, dtm, estimate, top)
+    )
+    rows, cols = height_source.shape
     shift = (stride // 2 + 0.5 - stride / 2) * grid.cell
     west, north = grid.west + shift, grid.north - shift
     content = {
@@ -84,16 +88,16 @@ def encode_tile(
             "cols": cols,
         },
         "corners": np.round(corners, 8).tolist(),
-        "support": _packed(height_source[thinned, thinned].tobytes()),
-        "dsm": _heights(dsm, thinned),
-        "dtm": _heights(dtm, thinned),
-        "estimate": _estimate(estimate, thinned),
+        "support": _packed(height_source.tobytes()),
+        "dsm": _heights(dsm),
+        "dtm": _heights(dtm),
+        "estimate": _estimate(estimate),
         "surface": _surface(surface),
         "steps": _steps(surface),
         "lines": [_line(line, grid) for line in lines],
     }
     if top is not None:
-        content["top"] = _heights(top, thinned)
+        content["top"] = _heights(top)
     return _call("tile", tile_id, content)
 
 
@@ -144,12 +148,8 @@ def _packed(data: bytes) -> str:
     return base64.b64encode(zlib.compress(data, 6)).decode("ascii")
 
 
-def _heights(values: Floats | None, thinned: slice) -> dict[str, Any] | None:
-    if values is None:
-        return None
-    values = values[thinned, thinned]
-    known = np.isfinite(values)
-    if not known.any():
+def _heights(values: Floats | None) -> dict[str, Any] | None:
+    if values is None or not (known := np.isfinite(values)).any():
         return None
     low, high = float(values[known].min()), float(values[known].max())
     step = max(STEP_M, (high - low) / CODES)
@@ -158,10 +158,9 @@ def _heights(values: Floats | None, thinned: slice) -> dict[str, Any] | None:
     return {"low": low, "step": step, "data": _packed(codes.tobytes())}
 
 
-def _estimate(values: Floats | None, thinned: slice) -> str | None:
+def _estimate(values: Floats | None) -> str | None:
     if values is None:
         return None
-    values = values[thinned, thinned]
     known = np.isfinite(values)
     codes = np.zeros(values.shape, np.uint8)
     codes[known] = np.minimum(np.round(values[known] / ESTIMATE_STEP_M), 254).astype(np.uint8) + 1
@@ -187,7 +186,7 @@ def _steps(surface: NurbsSurface | None) -> dict[str, Any] | None:
     """Return the steps of the cells that have one, with their cells, which are never thinned."""
     if not isinstance(surface, SteppedSurface):
         return None
-    steps = _heights(np.where(surface.steps == 0, np.nan, surface.steps), slice(None))
+    steps = _heights(np.where(surface.steps == 0, np.nan, surface.steps))
     if steps is None:
         return None
     cells = surface.cells

@@ -20,7 +20,6 @@ from flexroad.tasks import options
 from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import coregistration
-from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
 from flexroad.tasks.segment.dinov2.backbone import Backbone, Device, load_backbone, normalised
 from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
@@ -101,7 +100,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
         grid=data.grid,
         core=data.core,
         mask=mask,
-        outside=beyond_extent(data),
+        outside=data.beyond_extent(),
         probability=_mean(probability, photo.grid, data.grid),
         notes=notes,
     )

@@ -5,11 +5,11 @@ import struct
 import numpy as np
 import pytest
 import rasterio
-from rasterio.enums import ColorInterp, Resampling
+from rasterio.enums import ColorInterp
 
 from flexroad.catalog import Grid
 from flexroad.catalog.scan.cell_values import height_share, mask_notes
-from flexroad.catalog.scan.valid_cells import alpha_band, read_valid
+from flexroad.catalog.scan.rasters import alpha_band, read_valid
 from flexroad.tasks.io.raster import read_window
 from tests.make_rasters import UTM, write
 
@@ -31,7 +31,7 @@ def with_alpha(path, values, void, *, dtype="float32", opaque=255, **more):
 
 
 def window(path, grid=GRID):
-    return read_window(path, path.name, grid, grid, UTM, Resampling.average, heights=True)
+    return read_window(path, path.name, grid, grid, UTM, heights=True)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "int32", "uint32", "float32", "float64"])

@@ -119,12 +119,11 @@ def test_file_of_several_layers_needs_the_choice_of_one(survey):
     )
     write_roads(survey / "r.gpkg", [box(296_000, 5_629_250, 296_010, 5_629_260)], layer="plots")
     both = r"ways \(LineString, 3 features\), plots \(Polygon, 1 feature\)"
-    with pytest.raises(CatalogError, match=rf"r.gpkg has 2 layers: {both}; name one with --roads-layer$"):
+    with pytest.raises(CatalogError, match=rf"r.gpkg has 2 layers: {both}; name one, such as .*ways'$"):
         indexed(survey, "r.gpkg")
-    patterns = {"dsm": "dsm.tif", "roads": "r.gpkg"}
     with pytest.raises(CatalogError, match=rf"r.gpkg has no layer 'roads'; it has {both}$"):
-        rasters.index(survey, patterns, roads_layer="roads")
-    result = rasters.index(survey, patterns, roads_layer="ways")
+        indexed(survey, "r.gpkg|layername=roads")
+    result = rasters.index(survey, {"dsm": "dsm.tif", "roads": "r.gpkg|layername=ways"})
     assert named(result.tiles) == [["r.gpkg"], ["r.gpkg"], []]
     for name in ("c.parquet", "c.json"):
         Catalog(result.tiles).write(survey / name)

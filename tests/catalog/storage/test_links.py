@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flexroad.catalog.storage.links import contained
+from flexroad.catalog.storage.paths import contained
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from flexroad.catalog import Catalog
-from flexroad.catalog.allowlist import check_allowed
+from flexroad.catalog.index import check_allowed
 from flexroad.pipeline.config.loading import load_config
 from flexroad.tools.check.catalog import check
 from flexroad.tools.synthetic.scenes import write_scenes

@@ -1,4 +1,4 @@
-"""Point clouds: their headers and their points, by `flexroad prepare points`."""
+"""Point clouds: their headers and their points, by `flexroad prepare`."""
 
 from pathlib import Path
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks import TaskError
 from flexroad.tools.lift import xml_text
 from flexroad.tools.lift.driver import XML_FORMATS
@@ -88,8 +88,7 @@ def read(path: Path) -> None:
 
 
 def _count(path: Path) -> int:
-    with xml_text.opened(path) as file:
-        return sum(isinstance(part, xml_text.Part) for part in xml_text.parts(file, {"road", "node", "edge"}))
+    return sum(1 for _ in xml_text.elements(path, {"road", "node", "edge"}))
 
 
 def heights(x: np.ndarray, y: np.ndarray) -> Heights:

@@ -7,8 +7,7 @@ from flexroad.catalog import LAYERS, Catalog
 from flexroad.catalog.sources.rasters import index
 from flexroad.pipeline.check import trial
 from flexroad.pipeline.check.failures import expected_failures
-from flexroad.pipeline.check.heights import height_findings
-from flexroad.pipeline.check.trial import trials
+from flexroad.pipeline.check.trial import height_findings, trials
 from flexroad.pipeline.config.loading import load_config
 from flexroad.tasks.load import Options, load
 from tests.make_rasters import write

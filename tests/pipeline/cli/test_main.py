@@ -240,7 +240,7 @@ def test_run_with_failed_tile_exits_with_1(survey, tmp_path):
         (["run", "--config", "paper", "--catalog", "CAT", "--out", "FILE/x"], "cannot write the run"),
         (["run", "--config", "paper", "--catalog", "CAT", "--out", "OUT", "--tile", "1_2"], "did you mean"),
         (
-            [*"run --config paper --catalog CAT --out OUT --scheduler tcp://127.0.0.1:9".split()],
+            [*"run --config paper --catalog CAT --out OUT --executor tcp://127.0.0.1:9".split()],
             "does not answer",
         ),
         (["run", "--config", "paper"], "Missing option"),

@@ -201,13 +201,18 @@ def test_run_source_outside_catalog_folder_needs_allow(flexroad, nightly, survey
     said = flexroad(*nightly, expect=2)
     option = f"--allow {tmp_path / 'dtm'}"
     assert option in said
-    flexroad(*nightly, *option.split())
+    flexroad(*option.split(), *nightly)
     flexroad("rerun", tmp_path / "run", "--executor", "serial")
     path = tmp_path / "run" / "run.json"
     record = load_checked(path.read_bytes())
     record["allowed"] = [str(tmp_path / "other")]
     path.write_bytes(dump_checked(record))
     assert f"--allow {tmp_path}\n" in flexroad("rerun", tmp_path / "run", "--executor", "serial", expect=2)
+
+
+def test_allow_after_the_command_names_its_place(flexroad, tmp_path):
+    said = flexroad("catalog", "check", tmp_path / "c.json", "--allow", tmp_path, expect=2)
+    assert "--allow stands before the command: flexroad --allow FOLDER COMMAND" in said
 
 
 def test_clean_dry_run_lists_files_that_clean_deletes(flexroad, nightly, survey, tmp_path):

@@ -31,11 +31,11 @@ def test_catalog_with_address_is_refused_by_all_commands(flexroad, tampered, web
     catalog = tampered(name.format(url=web.url))
     options = ("--labels", "mask", "-o", tmp_path / "model")
     for words in (
-        ("catalog", "check", catalog, "--allow", "/"),
-        ("train", catalog, *options, "--allow", "/"),
-        ("run", "--config", "paper", "--catalog", catalog, "--out", tmp_path / "run", "--allow", "/"),
+        ("catalog", "check", catalog),
+        ("train", catalog, *options),
+        ("run", "--config", "paper", "--catalog", catalog, "--out", tmp_path / "run"),
     ):
-        said = flexroad(*words).expected(2)
+        said = flexroad("--allow", "/", *words).expected(2)
         assert said.err.count("fetch it first") == len(said.err.splitlines()) == 1
     assert web.requests == []
 
@@ -50,7 +50,7 @@ def test_catalog_with_file_outside_needs_allow_for_all_commands(flexroad, tamper
         said = flexroad(*words).expected(2)
         assert f"dsm names {outside}, outside" in said.err
         assert " ".join(option) in said.err
-    assert "missing" not in flexroad("catalog", "check", catalog, *option).out
+    assert "missing" not in flexroad(*option, "catalog", "check", catalog).out
 
 
 @pytest.mark.slow
@@ -70,7 +70,7 @@ def test_run_from_another_user_needs_allow(flexroad, survey, quick_config, tmp_p
         ("status", run),
     ):
         assert "--allow" in flexroad(*words).expected(2).err, words
-        flexroad(*words, *option).expected(0)
+        flexroad(*option, *words).expected(0)
     view = library.open_run(run)
     with pytest.raises(CatalogError, match="--allow"):
         view.tile(tile.id)

@@ -13,8 +13,8 @@ import psutil
 import pytest
 
 import flexroad
-from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.config.models import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor, clusters
 from flexroad.pipeline.execute.clusters import open_cluster

@@ -10,7 +10,7 @@ import cloudpickle
 import dask
 import pytest
 
-from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.models import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor
 from flexroad.pipeline.execute.clusters import open_cluster
@@ -43,8 +43,8 @@ def test_check_address_other_text_raises(address):
         check_address(address)
 
 
-def test_run_scheduler_without_port_is_refused_before_the_catalog_is_read(flexroad, tmp_path):
-    words = ["run", "--catalog", tmp_path / "none.parquet", "--out", tmp_path / "run", "--scheduler", "foo"]
+def test_run_executor_without_port_is_refused_before_the_catalog_is_read(flexroad, tmp_path):
+    words = ["run", "--catalog", tmp_path / "none.parquet", "--out", tmp_path / "run", "--executor", "foo"]
     assert "'foo' is no address of a Dask scheduler" in flexroad(*words).expected(2).err
 
 

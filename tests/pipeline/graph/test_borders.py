@@ -354,8 +354,8 @@ def test_run_refuses_tiles_of_different_size(tmp_path, flexroad):
         tile, id="smaller", grid=Grid("EPSG:25832", tile.grid.east, tile.grid.north, 1.0, 30, 30)
     )
     Catalog((tile, smaller)).write(tmp_path / "mixed.json")
-    arguments = ("--catalog", tmp_path / "mixed.json", "--allow", tmp_path, "--out", tmp_path / "run")
-    (line,) = flexroad("run", "--config", "production", *arguments).expected(2).errors
+    arguments = ("--catalog", tmp_path / "mixed.json", "--out", tmp_path / "run")
+    (line,) = flexroad("--allow", tmp_path, "run", "--config", "production", *arguments).expected(2).errors
     assert "set fit.method to nurbs, which fits each tile alone" in line
 
 

@@ -230,7 +230,7 @@ def test_files_of_layers_that_no_stage_reads_may_lie_anywhere(survey):
     assert "dop" not in {layer.name for layer in graph.readable.layers}
     assert own_files_missing(replace(graph, file_stats={"/missing": None})) == ["/missing"]
     node = graph.nodes[graph.variants["flexroad"]["load"]]
-    assert node.function(graph.readable, node.options).dop is None
+    assert stage_module(node.options).load(graph.readable, node.options).dop is None
 
 
 def with_photo(tile, folder, *names):

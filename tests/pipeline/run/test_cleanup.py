@@ -15,9 +15,8 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run import cleanup
 from flexroad.pipeline.run.cleanup import delete, exclusive, find_garbage
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.record import Run, runs_using, unregister
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.run.store_users import runs_using, unregister
 
 QUICK = {
     "extends": "defaults",

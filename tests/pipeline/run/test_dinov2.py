@@ -40,7 +40,7 @@ def place(tmp_path):
     options = training.Options(
         backbone=str(folder), layers=2, gsd_m=0.25, window_px=112, epochs=30, learning_rate=0.03
     )
-    (tmp_path / "head.safetensors").write_bytes(training.train([sample], [sample], options).model)
+    (tmp_path / "head.safetensors").write_bytes(training.train([sample], [sample], options, print)[0])
     return tmp_path
 
 

@@ -73,9 +73,9 @@ def finished(undisturbed, out) -> Path:
 def night(flexroad, config, made_survey, out):
     """The run command that is repeated every night."""
 
-    def call(*more, catalog=made_survey / "catalog.parquet"):
+    def call(*more, catalog=made_survey / "catalog.parquet", allow=()):
         words = ["--config", config, "--catalog", catalog, "--out", out, "--executor", "serial"]
-        return flexroad("run", *words, *more)
+        return flexroad(*allow, "run", *words, *more)
 
     return call
 
@@ -128,7 +128,7 @@ def test_run_scheduler_killed_keeps_done_tiles(
 
     monkeypatch.setattr(EventLog, "tile", kill)
     words = ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out]
-    said = flexroad("run", *words, "--scheduler", processes.address)
+    said = flexroad("run", *words, "--executor", processes.address)
     assert said.code == 1
     name = f"the Dask scheduler at {processes.address}"
     assert said.errors == [f"error: {name} is gone; the same command goes on from here"]
@@ -482,9 +482,9 @@ def test_run_catalog_with_files_outside_needs_allow(night, flexroad, made_survey
     (line,) = said.errors
     assert f"tile {original.tiles[0].id}: dsm names {made_survey}/dsm/" in line
     assert not out.exists()
-    option = line.partition("add ")[2].split()
+    option = line.partition("begin with flexroad ")[2].split()
     assert option == ["--allow", str(made_survey)]
-    assert night("--allow", made_survey, catalog=moved).code == 0
+    assert night(allow=option, catalog=moved).code == 0
     pd.testing.assert_frame_equal(rows(out), rows(undisturbed), check_exact=True)
     assert "4 cached" in flexroad("rerun", out, "--executor", "serial").out
     # The run's own catalog was changed.
@@ -500,7 +500,8 @@ def test_run_catalog_with_url_exits(night, made_survey, out, tmp_path):
     tile, url = Catalog.read(made_survey / "catalog.parquet").tiles[0], "https://example.org/dsm.tif"
     layers = tuple(Layer("dsm", (url,)) if layer.name == "dsm" else layer for layer in tile.layers)
     Catalog((replace(tile, layers=layers),)).write(tmp_path / "catalog.json", movable=False)
-    said = night("--allow", made_survey, "--allow", "https://example.org", catalog=tmp_path / "catalog.json")
+    allow = ("--allow", made_survey, "--allow", "https://example.org")
+    said = night(catalog=tmp_path / "catalog.json", allow=allow)
     assert said.code == 2
     assert f"dsm names {url}; only files on disk and in s3:// are read: fetch it first" in said.errors[0]
     assert not out.exists()

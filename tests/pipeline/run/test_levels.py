@@ -29,8 +29,8 @@ from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.products import npz
 from flexroad.tasks.quality.height_source import HeightSource
 from flexroad.tasks.spline.levelled import LevelledSurface
-from flexroad.tools.synthetic.centrelines import MAIN, SIDE
 from flexroad.tools.synthetic.crossings import CROSS_M, MAIN_M, Crossings
+from flexroad.tools.synthetic.scene import MAIN, SIDE
 from flexroad.tools.synthetic.scenes import write_scenes
 from flexroad.tools.view.driver import write_viewer
 from tests import validators
@@ -191,7 +191,7 @@ def test_viewer_has_heights_and_estimates_of_the_highest_level(run, tmp_path):
         at = np.meshgrid(tile.tile.grid.eastings, tile.tile.grid.northings)
         np.testing.assert_allclose(heights(made["top"], made["grid"]), view.height(*at), atol=1e-3)
         deck = np.isfinite(view.height(*at, 1))
-        (top, height_source), (low, _) = tile.top_errors, tile.cell_errors
+        (top, height_source), (low, _) = tile.top_errors, tile.level_errors(0)
         np.testing.assert_array_equal(top[~deck], low[~deck])
         on_decks.append((top[deck], low[deck], height_source[deck]))
     top, low, height_source = (np.concatenate(values) for values in zip(*on_decks, strict=True))

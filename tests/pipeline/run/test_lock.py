@@ -13,7 +13,7 @@ import pytest
 
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run import lock
-from flexroad.pipeline.run.lock import Heartbeat, Owner, describe_owner, owner, run_lock, started
+from flexroad.pipeline.run.lock import Owner, describe_owner, owner, run_lock, started
 from tests.faulty_files import intercepted
 from tests.power_loss import Recording, states
 
@@ -25,7 +25,7 @@ with run_lock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
 """
-QUICK = Heartbeat(interval_s=0.05, stale_s=0.5)
+QUICK = {"interval_s": 0.05, "stale_s": 0.5}
 ELSEWHERE = Owner("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
 
 
@@ -44,10 +44,10 @@ def write_lock(folder, holder: Owner, age_s: float = 0.0) -> None:
     os.utime(folder / "lock.json", (modified, modified))
 
 
-def take_lock(folder, heartbeat: Heartbeat = QUICK) -> list[str]:
+def take_lock(folder, interval_s: float = 0.05, stale_s: float = 0.5) -> list[str]:
     """Take and release the lock; return its messages."""
     messages: list[str] = []
-    with run_lock(folder, messages.append, heartbeat):
+    with run_lock(folder, messages.append, interval_s, stale_s):
         assert owner(folder).pid == os.getpid()
     assert not (folder / "lock.json").exists()
     return messages
@@ -98,9 +98,8 @@ def test_owner_on_this_machine_is_checked_by_process_table(change, reason, tmp_p
 
 
 def test_owner_before_the_last_start_of_this_machine_is_dead_at_once(tmp_path):
-    heartbeat = Heartbeat(interval_s=30, stale_s=1e9)
     write_lock(tmp_path, replace(Owner.me(), boot="before"), age_s=lock._uptime_s() + 100)
-    (message,) = take_lock(tmp_path, heartbeat)
+    (message,) = take_lock(tmp_path, interval_s=30, stale_s=1e9)
     assert "was restarted since" in message
 
 
@@ -110,7 +109,7 @@ def test_owner_with_other_boot_that_renewed_its_lock_is_other_machine(uptime_s, 
     monkeypatch.setattr(lock, "_uptime_s", lambda: uptime_s)
     write_lock(tmp_path, replace(Owner.me(), boot="other", pid=2**22 + 1), age_s=20)
     with pytest.raises(ConfigError, match="last sign of life 20 s ago; if it is dead, the same command"):
-        take_lock(tmp_path, Heartbeat())
+        take_lock(tmp_path, interval_s=30, stale_s=300)
 
 
 def test_owner_with_other_boot_is_taken_over_when_stale(tmp_path, monkeypatch):
@@ -150,7 +149,7 @@ def test_clock_jump_keeps_lock_of_living_owner(age_s, tmp_path):
     renewal.start()
     try:
         with pytest.raises(ConfigError, match="pid 4711 on node7"):
-            take_lock(tmp_path, Heartbeat(interval_s=1, stale_s=300))
+            take_lock(tmp_path, interval_s=1, stale_s=300)
     finally:
         stop.set()
         renewal.join()
@@ -199,7 +198,7 @@ def test_lock_requested_by_many_is_taken_by_one(stale, tmp_path):
 
 
 def test_held_lock_is_renewed_and_restored_after_deletion(tmp_path):
-    with run_lock(tmp_path, heartbeat=QUICK):
+    with run_lock(tmp_path, **QUICK):
         os.utime(tmp_path / "lock.json", (1, 1))
         _until(lambda: (tmp_path / "lock.json").stat().st_mtime > 1)
         (tmp_path / "lock.json").unlink()
@@ -211,7 +210,7 @@ def test_process_that_lost_its_lock_ends(tmp_path):
     messages: list[str] = []
 
     def lose() -> None:
-        with run_lock(tmp_path, messages.append, QUICK):
+        with run_lock(tmp_path, messages.append, **QUICK):
             write_lock(tmp_path, ELSEWHERE)
             _until(lambda: bool(messages), 10)
             time.sleep(30)

@@ -8,12 +8,12 @@ import pytest
 
 from flexroad.catalog.storage.paths import parse_location, read, write
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.lock import Heartbeat, Owner, owner, run_lock
+from flexroad.pipeline.run.lock import Owner, owner, run_lock
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 ELSEWHERE = Owner("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
-QUICK = Heartbeat(interval_s=0.05, stale_s=0.5)
+QUICK = {"interval_s": 0.05, "stale_s": 0.5}
 
 
 @pytest.fixture
@@ -43,19 +43,19 @@ def test_owner_on_other_machine_is_checked_by_lock_age(run):
     write(run / "lock.json", ELSEWHERE.data)
     with (
         pytest.raises(ConfigError, match="the same command takes over"),
-        run_lock(run, heartbeat=Heartbeat(stale_s=60)),
+        run_lock(run, stale_s=60),
     ):
         pass
     messages = []
     # Times of a bucket's objects are whole seconds.
     time.sleep(1.1)
-    with run_lock(run, messages.append, QUICK):
+    with run_lock(run, messages.append, **QUICK):
         assert owner(run).token != "t7"
     assert messages[-1].startswith("took over the lock of pid 4711 on node7: no sign of life")
 
 
 def test_held_lock_is_renewed(run):
-    with run_lock(run, heartbeat=QUICK):
+    with run_lock(run, **QUICK):
         first = _time(run)
         while _time(run) == first:
             time.sleep(0.1)

@@ -14,7 +14,7 @@ from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import sample
 from flexroad.tools.report.browser.page import html_page
-from flexroad.tools.report.content import gather
+from flexroad.tools.report.content import MESHES, gather
 from flexroad.tools.report.pages import markdown_page
 
 SPLINE = {"load": {"halo_m": 50}, "fit": {"method": "smoothing_spline", "spacing_m": 20}}
@@ -37,7 +37,7 @@ EVERY = {
 
 
 def checks(run):
-    return gather(run).meshes.set_index("method")
+    return gather(run).tables[MESHES][0].set_index("method")
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.run.summary import read_summary
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import decode
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
@@ -103,7 +103,7 @@ def assert_files_complete(run):
     for name in paths.listing(run.store):
         if name.endswith(".npz"):
             fingerprint = name.rpartition("/")[2].removesuffix(".npz")
-            assert codec.decode(paths.read(run.store / name), fingerprint)
+            assert decode(paths.read(run.store / name), fingerprint)
     for tile in run.catalog.tiles:
         folder = run.folder(tile.id)
         assert folder.verified() == paths.exists(folder.path / "item.json")

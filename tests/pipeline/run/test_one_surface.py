@@ -17,7 +17,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.products import npz
-from flexroad.tools.report.steps import edge_steps
+from flexroad.tools.report.content import LARGEST_STEPS, STEPS, gather
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests.mesh_union import Union
 from tests.read_exports import true_heights
@@ -166,10 +166,11 @@ def test_tiles_processed_together_have_the_same_bytes(alone, tmp_path):
     summary = run_tiles(run, SerialExecutor())
     assert (summary.done, summary.cached) == (9, 8)
     assert all(file.read_bytes() == data for file, data in before.items())
-    steps = edge_steps(run)
-    assert not len(steps.edges)
-    assert list(steps.check.result) == ["one surface: all differences are exactly 0"]
-    assert steps.check.edges.sum() == 12
+    tables = gather(run).tables
+    assert not len(tables[LARGEST_STEPS][0])
+    check, _ = tables[STEPS]
+    assert list(check.result) == ["one surface: all differences are exactly 0"]
+    assert check.edges.sum() == 12
     view = flexroad.open_run(tmp_path / "run")
     west, south, east, north = np.array([tile.grid.bounds for tile in catalog.tiles]).T
     x, y = np.random.default_rng(0).uniform((west.min(), south.min()), (east.max(), north.max()), (500, 2)).T

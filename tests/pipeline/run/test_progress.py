@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from flexroad.pipeline.run import progress
-from flexroad.pipeline.run.progress import ProgressDisplay, StepProgress, said_repeatedly
+from flexroad.pipeline.run.progress import ProgressDisplay, said_repeatedly, step_progress
 from flexroad.pipeline.store.records import TileRecord
 from flexroad.pipeline.worker.tile import TileResult
 
@@ -68,7 +68,7 @@ def test_run_without_results_speaks_in_a_pipe(log):
 
 
 def test_step_in_a_pipe_says_how_many_are_done(log):
-    items = StepProgress(Console(file=log))(iter("abc"), "checking tiles", 3)
+    items = step_progress(Console(file=log))(iter("abc"), "checking tiles", 3)
     assert next(items) == "a"
     assert next(items) == "b"
     assert log.has("checking tiles: 1 of 3, ")
@@ -77,5 +77,5 @@ def test_step_in_a_pipe_says_how_many_are_done(log):
 
 def test_step_on_a_terminal_has_a_bar(log):
     console = Console(file=log, force_terminal=True, width=80)
-    assert list(StepProgress(console)(range(3), "checking tiles", 3)) == [0, 1, 2]
+    assert list(step_progress(console)(range(3), "checking tiles", 3)) == [0, 1, 2]
     assert "checking tiles" in log.getvalue()

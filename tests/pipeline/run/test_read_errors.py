@@ -33,7 +33,7 @@ from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import open_database, tile_states
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import encode
 from flexroad.pipeline.store.records import load_checked
 from flexroad.tasks.io import vectors
 from flexroad.tasks.products import npz
@@ -449,7 +449,7 @@ def assert_computed_as_stored(run, empty):
         if snapshot:
             places = stored, replace(stored, store=str(empty))
             one, other = (FinishedTile(tile, "flexroad", snapshot, place) for place in places)
-            assert codec.encode(one.surface, {}, (), "") == codec.encode(other.surface, {}, (), "")
+            assert encode(one.surface, {}, (), "") == encode(other.surface, {}, (), "")
             assert one.graph.fingerprint == snapshot.fingerprint
 
 

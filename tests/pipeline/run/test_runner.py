@@ -24,9 +24,10 @@ from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import TileResult
-from flexroad.tools.report.browser.relief import relief
-from flexroad.tools.report.content import gather
-from flexroad.tools.report.steps import edge_steps, find_results
+from flexroad.tools.report import steps
+from flexroad.tools.report.content import LARGEST_STEPS, gather
+from flexroad.tools.report.pictures import relief
+from flexroad.tools.report.steps import edge_steps
 from tests.conftest import QUICK
 
 FIXED = (
@@ -458,15 +459,18 @@ def test_products_open_in_standard_readers(run, executor):
         assert raster.crs.to_epsg() == 25832
 
 
-def test_edge_steps_of_large_run_are_a_sample(finished):
-    whole, part = edge_steps(finished), edge_steps(finished, most=2)
+def test_edge_steps_of_large_run_are_a_sample(finished, monkeypatch):
+    results = gather(finished).results
+    check, whole, note = edge_steps(finished, results)
+    assert (len(whole), note) == (4, "")
+    assert list(check.result) == ["tiles are fitted independently"]
+    monkeypatch.setattr(steps, "MOST", 2)
+    _, part, note = edge_steps(finished, results)
     pairs = ["tile", "neighbour"]
-    assert (len(whole.edges), whole.note) == (4, "")
-    assert 0 < len(part.edges) < len(whole.edges)
-    chosen = pd.MultiIndex.from_frame(part.edges[pairs])
-    assert part.edges.set_index(pairs).equals(whole.edges.set_index(pairs).loc[chosen])
-    assert part.note == "Of one tile in 2, against its neighbours in the east and north."
-    assert list(whole.check.result) == ["tiles are fitted independently"]
+    assert 0 < len(part) < len(whole)
+    chosen = pd.MultiIndex.from_frame(part[pairs])
+    assert part.set_index(pairs).equals(whole.set_index(pairs).loc[chosen])
+    assert note == "Of one tile in 2, against its neighbours in the east and north."
 
 
 def test_report_checks_every_tile_once(finished, monkeypatch):
@@ -478,7 +482,7 @@ def test_report_checks_every_tile_once(finished, monkeypatch):
 
     monkeypatch.setattr(Pattern, "graph", counted)
     content = gather(finished)
-    assert len(content.steps.edges) == 4
+    assert len(content.tables[LARGEST_STEPS][0]) == 4
     picture = relief(finished, finished.catalog.tiles, content.results)
     assert list(picture.places) == [tile.id for tile in finished.catalog.tiles]
     assert checked == dict.fromkeys(picture.places, 1)
@@ -486,8 +490,8 @@ def test_report_checks_every_tile_once(finished, monkeypatch):
 
 def test_relief_has_tiles_with_results_in_the_store(finished):
     first, second, *others = finished.catalog.tiles
-    results = find_results(finished, [first, second])
-    assert set(results["flexroad"]) == {first.id, second.id}
+    stored = gather(finished).results["flexroad"]
+    results = {"flexroad": {tile.id: stored[tile.id] for tile in (first, second)}}
     (surface,) = finished.store.glob(f"fit/*/{results['flexroad'][first.id][0]}.npz")
     surface.unlink()
     assert list(relief(finished, finished.catalog.tiles, results).places) == [second.id]

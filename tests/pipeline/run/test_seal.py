@@ -84,8 +84,8 @@ def test_programs_given_to_run_hold_for_its_user(flexroad, survey, quick_config,
     flexroad("rerun", run, *words).expected(0)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another"))
     option = ("--allow", survey.parent)
-    assert "cluster.prologue can start programs" in flexroad("rerun", run, *words, *option).expected(2).err
-    flexroad("rerun", run, *words, *option, *given).expected(0)
+    assert "cluster.prologue can start programs" in flexroad(*option, "rerun", run, *words).expected(2).err
+    flexroad(*option, "rerun", run, *words, *given).expected(0)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_store_outside_of_a_foreign_run_needs_allow(flexroad, survey, quick_conf
     record = load_checked((run / "run.json").read_bytes())
     other = tmp_path / "other"
     (run / "run.json").write_bytes(dump_checked(record | {"store": str(other)}))
-    line = f"{run} has its store in {other}, which this user has not given .* add --allow {other}$"
+    line = f"{run} has its store in {other}, which this user has not .* begin with flexroad --allow {other}$"
     with pytest.raises(ConfigError, match=line):
         Run.open(run)
     with pytest.raises(ConfigError, match=f"add --store {other}$"):
@@ -149,7 +149,7 @@ def test_changed_list_of_a_run_allows_nothing(flexroad, survey, quick_config, tm
         said = flexroad(command, run)
         assert said.code == 2, command
         assert f"--allow {survey.parent}" in said.err
-    assert flexroad("status", run, "--allow", survey.parent).code == 0
+    assert flexroad("--allow", survey.parent, "status", run).code == 0
     tile = Run.open(run, [str(survey.parent)]).catalog.tiles[0]
     assert tile.paths(tile.layers[0])
 

@@ -61,7 +61,7 @@ def run(flexroad, processes, made_survey, tmp_path, monkeypatch):
     (tmp_path / "run").mkdir()
     words = ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "run"]
     processes.scheduler()
-    return lambda: flexroad("run", *words, "--scheduler", processes.address)
+    return lambda: flexroad("run", *words, "--executor", processes.address)
 
 
 @pytest.fixture(scope="module")

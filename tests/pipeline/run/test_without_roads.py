@@ -20,8 +20,7 @@ from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import QUALITY
 from flexroad.tasks.products import npz
 from flexroad.tasks.quality.assess import NO_ROAD
-from flexroad.tools.report.content import WITH_ROADS, gather
-from flexroad.tools.report.steps import edge_steps
+from flexroad.tools.report.content import MAIN, STEPS, WITH_ROADS, WORST_ROADS, gather
 from tests.builders import LIGHT
 from tests.conftest import QUICK
 
@@ -68,12 +67,12 @@ def test_run_tiles_without_roads_are_done_flagged_and_cached(half, tmp_path, exe
     assert rows[~bare].l2_road_m.notna().all()
     content = gather(run)
     assert content.state.startswith("Tiles: 4 done (2 of them without roads")
-    table = content.main.set_index("method")
+    table = content.tables[MAIN][0].set_index("method")
     assert set(table.tiles) == {4}
     assert set(table[WITH_ROADS]) == {2}
     mine = rows[~bare & (rows.variant == "flexroad")]
     assert table["L2 road (m)"]["flexroad"] == pytest.approx(mine.l2_road_m.mean())
-    assert len(content.worst) == 2
+    assert len(content.tables[WORST_ROADS][0]) == 2
 
 
 def test_products_of_tile_without_roads_open_and_follow_dtm(half, tmp_path):
@@ -92,9 +91,9 @@ def test_products_of_tile_without_roads_open_and_follow_dtm(half, tmp_path):
     surface = npz.decode(product["_surface.npz"].read_bytes())
     np.testing.assert_allclose(surface.height(east, north), heights, atol=1e-3)
     # The tile and its neighbours with roads are one surface.
-    steps = edge_steps(run)
-    assert list(steps.check.result) == ["one surface: all differences are exactly 0"]
-    assert list(steps.check.edges) == [4]
+    check, _ = gather(run).tables[STEPS]
+    assert list(check.result) == ["one surface: all differences are exactly 0"]
+    assert list(check.edges) == [4]
 
 
 def test_command_counts_tiles_without_roads_apart(half, flexroad, tmp_path):
@@ -145,7 +144,7 @@ def test_tiles_that_no_mask_reaches_are_done_and_meet_the_others(survey, tmp_pat
     run = Run.create(tmp_path / "run", load_config("production"), Catalog(tiles))
     result = run_tiles(run, SerialExecutor())
     assert (result.done, result.without_roads, result.exit_code) == (4, 2, 0)
-    assert list(edge_steps(run).check.result) == ["one surface: all differences are exactly 0"]
+    assert list(gather(run).tables[STEPS][0].result) == ["one surface: all differences are exactly 0"]
 
 
 def test_tile_that_no_mask_reaches_is_done_with_a_note(survey, tmp_path):

@@ -13,8 +13,7 @@ from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.graph.graph import Pattern
-from flexroad.pipeline.store import codec
-from flexroad.pipeline.store.artefacts import DAMAGED, ArtefactStore
+from flexroad.pipeline.store.artefacts import DAMAGED, HEADER, ArtefactStore, decode, encode
 from flexroad.pipeline.store.products import TileProducts, file_entry
 from flexroad.pipeline.worker.evaluator import Evaluator
 from flexroad.tasks.io.archive import npz
@@ -54,7 +53,7 @@ def test_codec_restores_every_result_exactly(evaluator):
         if node.stage == "load":
             continue
         value = evaluator(fingerprint)
-        back, seconds, notes = codec.decode(codec.encode(value, {"fit": 0.25}, ("dsm: a note",), ""), "")
+        back, seconds, notes = decode(encode(value, {"fit": 0.25}, ("dsm: a note",), ""), "")
         assert (seconds, notes) == ({"fit": 0.25}, ("dsm: a note",))
         assert type(back) is type(value)
         for field in fields(value):
@@ -86,12 +85,12 @@ def test_decode_any_damaged_byte_or_truncation_raises(evaluator):
     evaluator(node.fingerprint)
     (path,) = evaluator.store.root.rglob(f"{node.fingerprint}.npz")
     whole = path.read_bytes()
-    assert codec.decode(whole, node.fingerprint)
+    assert decode(whole, node.fingerprint)
     flips = (whole[:i] + bytes([whole[i] ^ 1 << i % 8]) + whole[i + 1 :] for i in range(len(whole)))
     cuts = (whole[:i] for i in range(len(whole)))
     for damaged in (*flips, *cuts, whole + b"0"):
         with pytest.raises(DAMAGED):
-            codec.decode(damaged, node.fingerprint)
+            decode(damaged, node.fingerprint)
 
 
 def test_artefact_under_another_name_is_missing(evaluator):
@@ -128,7 +127,7 @@ EMPTY = {"type": "Metrics", "seconds": {}, "notes": []}
 @pytest.mark.parametrize("header", [[], {"type": "Metrics"}, EMPTY, EMPTY | {"fields": []}])
 def test_artefact_with_another_header_is_missing(header, evaluator):
     node = evaluator.graph.nodes[evaluator.graph.variants["plane"]["evaluate"]]
-    payload = npz({codec.HEADER: np.frombuffer(json.dumps(header).encode(), np.uint8)})
+    payload = npz({HEADER: np.frombuffer(json.dumps(header).encode(), np.uint8)})
     checksum = hashlib.sha256(payload + node.fingerprint.encode()).digest()
     write(
         evaluator.store.root / node.stage / node.fingerprint[:2] / f"{node.fingerprint}.npz",

@@ -343,7 +343,7 @@ def test_flat_patches_equal_least_squares(seed):
     row, col = np.indices((40, 40))
     dsm = 0.05 * row - 0.02 * col + rng.normal(0, 0.08, row.shape) + (rng.random(row.shape) < 0.02)
     mask = rng.random(dsm.shape) < 0.97
-    result = flat_patches.flat_patches(dsm, mask, 1.0, 0.1, 1e9).centres
+    result, *_ = flat_patches.flat_patches(dsm, mask, 1.0, 0.1, 1e9)
     row, col = np.mgrid[-1:2, -1:2]
     design = np.column_stack([np.ones(9), row.ravel(), col.ravel()])
     for r, c in np.ndindex(dsm.shape):

@@ -9,12 +9,12 @@ import scipy
 
 from flexroad.catalog.borders import border_of
 from flexroad.catalog.grid import Grid
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import encode
 from flexroad.tasks import load
 from flexroad.tasks.border import BorderStages
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
-from flexroad.tasks.quality.estimate import heights_fitted
+from flexroad.tasks.roads.dtm_validity import ground_to_fit
 from flexroad.tasks.segment import mask
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import basis_matrix, uniform_knots
@@ -193,7 +193,7 @@ def test_reach_equals_distance_to_farthest_ground(seed):
     reaches = set()
     for border in border_of(NORTH_WEST, AROUND_M):
         data, _, clusters = filtered(world, border.grid)
-        missing = np.isnan(heights_fitted(data, clusters))
+        missing = np.isnan(ground_to_fit(data, clusters))
         away = border.along(scipy.ndimage.distance_transform_edt(missing)).max()
         enough = [lines for lines in (7, 14, 28) if lines * 250 / 70 >= 15 + away]
         lines = smoothing_spline._lines(data, clusters, border, lattice)
@@ -219,7 +219,7 @@ def test_part_with_dtm_checked_near_border_equals_that_of_complete_filter(monkey
         complete = stages.frame(world, NORTH_WEST)
         for field in fields(Frame):
             parts = (getattr(result, field.name) for result in (frame, complete))
-            assert len({codec.encode(result, {}, (), "") for result in parts}) == 1
+            assert len({encode(result, {}, (), "") for result in parts}) == 1
 
 
 def test_border_without_ground_is_left_free():

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -80,9 +81,8 @@ def test_loss_equals_paper_equations():
 def test_gradient_equals_autograd(degree, free):
     loss_function, at = random_objective(degree, free)
     loss, gradient = loss_function(at)
-    torch_objective = adam.TorchObjective(loss_function, at.shape[1:], "cpu")
-    variables = torch_objective.tensor(at).requires_grad_()
-    peer = torch_objective(variables)
+    variables = torch.tensor(at).requires_grad_()
+    peer = adam.torch_loss(loss_function, at.shape[1:], "cpu")(variables)
     peer.backward()
     assert loss == pytest.approx(peer.item(), rel=1e-12)
     np.testing.assert_allclose(gradient, variables.grad.numpy(), rtol=1e-9, atol=1e-14)
@@ -98,34 +98,35 @@ def test_fit_engines_give_same_surface():
 
 
 def test_adam_stops_when_loss_is_stable():
-    schedule = adam.Schedule(rate=0.1, iterations=50, tolerance=1e-4, window=5)
     steps = []
 
     def flat(x):
         steps.append(1)
         return 1.0, np.zeros_like(x)
 
-    adam.minimise(flat, np.zeros(3), np.full(3, np.inf), schedule)
-    assert len(steps) == 6
-    assert not schedule.has_finished([1.0, 1.0, 1.0, 1.0, 1.0, 0.99])
-    assert schedule.has_finished(list(np.linspace(1, 0, 51)))
+    def falling(x):
+        return 1.0 - x[0], -np.ones_like(x)
+
+    adam.minimise(flat, np.zeros(3), np.full(3, np.inf), 0.1, 50)
+    assert len(steps) == 1 + adam.STOP_WINDOW
+    assert len(adam.minimise(falling, np.zeros(3), np.full(3, np.inf), 0.1, 50)[1]) == 51
 
 
 @pytest.mark.parametrize(("engine", "last"), [("numba", False), ("numba", True), ("torch", False)])
 def test_minimise_returns_variables_of_lowest_loss_or_of_last_step(engine, last):
     loss_function, at = random_objective()
-    limit, schedule = np.full((2, 1, 1), 2.0), adam.Schedule(5.0, 20, 0, 20, last=last)
+    limit = np.full((2, 1, 1), 2.0)
     if engine == "torch":
-        best, losses = adam.minimise_with_torch(loss_function, at, limit, schedule, "cpu")
+        best, losses = adam.minimise_with_torch(loss_function, at, limit, 5.0, 20, "cpu")
     else:
-        best, losses = adam.minimise(loss_function, at, limit, schedule)
+        best, losses = adam.minimise(loss_function, at, limit, 5.0, 20, last=last)
     assert len(losses) == 21
     assert losses[-1] > min(losses)
     assert loss_function(best)[0] == pytest.approx(losses[-1] if last else min(losses), rel=1e-12)
 
 
 def test_fit_unbounded_weights_exceed_the_bounds(monkeypatch):
-    monkeypatch.setattr(nurbs, "STOP_TOLERANCE", 0)
+    monkeypatch.setattr(adam, "STOP_TOLERANCE", 0)
     data, clusters, _ = tile(noise=1.0)
     changes = {"learning_rate": 1.0, "iterations": 60}
     softplus = fitted(data, clusters, weights="softplus", **changes)
@@ -166,7 +167,7 @@ def test_options_that_do_not_go_together_raise(changes, message):
 
 @pytest.mark.parametrize("engine", ["numba", "torch"])
 def test_fit_free_weights_stay_within_bounds(engine, monkeypatch):
-    monkeypatch.setattr(nurbs, "STOP_TOLERANCE", 0)
+    monkeypatch.setattr(adam, "STOP_TOLERANCE", 0)
     data, clusters, _ = tile(noise=1.0)
     surface = fitted(data, clusters, engine=engine, learning_rate=1.0, iterations=60)
     assert surface.W.max() == pytest.approx(10)

@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 from affine import Affine
-from rasterio.enums import Resampling
 from shapely import LineString
 
 from flexroad.tasks.io.orthophoto import read_photo
@@ -31,7 +30,7 @@ def made(folder, form, northward=False, cell=1.0):
 
 
 def read(path, grid=GRID):
-    return read_window(path, path.name, grid, grid, UTM, Resampling.average, heights=True)
+    return read_window(path, path.name, grid, grid, UTM, heights=True)
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexroad.tasks.levels.along_route import RouteLevels, Structure, structures
+from flexroad.tasks.levels.along_route import Structure, route_levels, structures
 from flexroad.tasks.roads.routes import CentreLine, Route
 
 
@@ -15,7 +15,7 @@ def route(*parts):
 
 
 def test_route_on_the_ground_has_no_levels():
-    assert RouteLevels.of(route((50, 0), (30, 0))) is None
+    assert route_levels(route((50, 0), (30, 0))) is None
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,7 @@ def test_route_on_the_ground_has_no_levels():
 )
 @pytest.mark.parametrize("aside", [0.0, -4.0])
 def test_decks_go_on_for_16_m(parts, x, numbers, own, aside):
-    found = RouteLevels.of(route(*parts)).at(np.array(x, float)[:, None], np.full((1, 2), aside))
+    found = route_levels(route(*parts))(np.array(x, float)[:, None], np.full((1, 2), aside))
     assert found.number[:, 1].tolist() == numbers
     assert found.own[:, 0].tolist() == [bool(each) for each in own]
     assert found.of_line[:, 0].tolist() == [k if mine else 0 for k, mine in zip(numbers, own, strict=True)]

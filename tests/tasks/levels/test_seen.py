@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import encode
 from flexroad.tasks.levels.seen import level_data, level_road, top_mask
 from flexroad.tasks.roads.rasterise import cells
 from tests.builders import make_grid
@@ -112,7 +112,7 @@ def test_tile_without_decks_has_the_bytes_of_one_without_the_option(tmp_path):
     assert with_option.road.mask.any()
     for name in ("road", "clusters", "surface"):
         one, other = getattr(with_option, name), getattr(without, name)
-        assert codec.encode(one, {}, (), "") == codec.encode(other, {}, (), "")
+        assert encode(one, {}, (), "") == encode(other, {}, (), "")
 
 
 def test_levels_see_their_own_heights(tmp_path):

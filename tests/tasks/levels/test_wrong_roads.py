@@ -8,9 +8,8 @@ import shapely
 from scipy.ndimage import binary_dilation
 
 from flexroad.tasks.metrics.mesh_check import faults
-from flexroad.tasks.quality.assess import Options, assess
+from flexroad.tasks.quality.assess import NO_RISE, Options, assess
 from flexroad.tasks.quality.height_source import HeightSource
-from flexroad.tasks.quality.structures import NO_RISE
 from flexroad.tasks.sample import Options as SampleOptions
 from flexroad.tasks.sample import sample
 from tests.make_crossings import Survey, block

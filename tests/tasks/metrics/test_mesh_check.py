@@ -117,8 +117,7 @@ def test_fault_is_found_with_kind_count_and_place(name):
     if isinstance(place, tuple):
         place = f"{ORIGIN[0] + place[0]:.3f}, {ORIGIN[1] + place[1]:.3f}"
     line = f"{count} {kind} (the first at {place}"
-    (fault,) = faults(mesh)
-    assert str(fault).startswith(line)
+    assert len(faults(mesh)) == 1
     with pytest.raises(MeshFault, match="the mesh has .*; this is an error of FlexRoad, report it") as error:
         check(mesh)
     assert line in str(error.value)
@@ -128,7 +127,7 @@ def test_fault_is_found_with_kind_count_and_place(name):
 def test_faults_several_kinds_of_one_group_are_all_named():
     mesh = with_face(0, (1, 0, 7))
     mesh.faces[5] = 2, 2, 3
-    kinds = [(fault.kind, fault.count) for fault in faults(mesh)]
+    kinds = [(kind, number) for kind, number, _ in faults(mesh)]
     assert kinds == [("degenerate faces", 1), ("inverted faces", 1)]
 
 
@@ -146,7 +145,7 @@ def test_faults_of_valid_meshes_are_none():
 
 def test_faults_without_faces_are_unused_vertices():
     empty = np.zeros((0, 3), np.int32)
-    assert [fault.kind for fault in faults(mesh_of(square()[0], empty))] == ["unused vertices"]
+    assert [kind for kind, _, _ in faults(mesh_of(square()[0], empty))] == ["unused vertices"]
     assert faults(mesh_of(np.zeros((0, 2)), empty)) == ()
 
 

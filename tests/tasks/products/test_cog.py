@@ -22,7 +22,7 @@ def plane(grid: Grid) -> np.ndarray:
 
 
 def test_encode_reads_back_in_place():
-    with MemoryFile(cog.encode_height(plane(GRID), GRID)) as file, file.open() as raster:
+    with MemoryFile(cog.encode(plane(GRID), GRID, cog.HEIGHT)) as file, file.open() as raster:
         assert np.isnan(raster.nodata)
         assert raster.overviews(1) == [2]
         assert raster.crs.to_epsg() == 25832
@@ -32,29 +32,28 @@ def test_encode_reads_back_in_place():
         (value,) = next(raster.sample([(easting, northing)]))
     assert value == pytest.approx(100 + 0.01 * 400.5 + 0.02 * 200.5, abs=1e-5)
     road = plane(GRID) > 104
-    with MemoryFile(cog.encode_mask(road, GRID)) as file, file.open() as raster:
+    with MemoryFile(cog.encode(road, GRID, cog.ROAD)) as file, file.open() as raster:
         np.testing.assert_array_equal(raster.read(1), road)
 
 
 def test_encode_height_with_vertical_crs_has_compound_crs():
-    with MemoryFile(cog.encode_height(plane(GRID), GRID, "EPSG:7837")) as file, file.open() as raster:
+    with MemoryFile(cog.encode(plane(GRID), GRID, cog.HEIGHT, "EPSG:7837")) as file, file.open() as raster:
         plan, height = CRS(raster.crs.to_wkt()).sub_crs_list
         assert (plan.to_epsg(), height.to_epsg()) == (25832, 7837)
         assert raster.bounds == GRID.bounds
 
 
 @pytest.mark.parametrize(
-    ("band", "encode", "values"),
+    ("band", "values"),
     [
-        (cog.HEIGHT, cog.encode_height, plane(GRID)),
-        (cog.ROAD, cog.encode_mask, plane(GRID) > 104),
-        (cog.HEIGHT_SOURCE, cog.encode_height_source, np.full(GRID.shape, HeightSource.DTM, np.uint8)),
+        (cog.HEIGHT, plane(GRID)),
+        (cog.ROAD, plane(GRID) > 104),
+        (cog.HEIGHT_SOURCE, np.full(GRID.shape, HeightSource.DTM, np.uint8)),
     ],
     ids=["height", "road", "height_source"],
 )
-def test_encoded_raster_declares_what_its_band_means(band, encode, values):
-    encoded = encode(values, GRID)
-    with MemoryFile(encoded) as file, file.open() as raster:
+def test_encoded_raster_declares_what_its_band_means(band, values):
+    with MemoryFile(cog.encode(values, GRID, band)) as file, file.open() as raster:
         assert raster.dtypes == (band.dtype,)
         assert raster.descriptions == (band.name,)
         assert raster.units == (band.unit or None,)
@@ -70,7 +69,7 @@ def test_encoded_raster_declares_what_its_band_means(band, encode, values):
 def test_encode_mask_keeps_wkt():
     wkt = CRS.from_proj4("+proj=tmerc +lat_0=50 +lon_0=7 +ellps=GRS80 +units=m").to_wkt()
     grid = Grid(wkt, 0.0, 20.0, 0.5, 40, 40)
-    with MemoryFile(cog.encode_mask(np.ones(grid.shape, bool), grid)) as file, file.open() as raster:
+    with MemoryFile(cog.encode(np.ones(grid.shape, bool), grid, cog.ROAD)) as file, file.open() as raster:
         (latitude,) = [
             p.value for p in CRS(raster.crs.to_wkt()).coordinate_operation.params if "lat" in p.name.lower()
         ]
@@ -80,14 +79,14 @@ def test_encode_mask_keeps_wkt():
 
 def test_encode_height_wrong_shape_raises():
     with pytest.raises(TaskError, match=r"\(250, 599\).*\(250, 600\)"):
-        cog.encode_height(plane(GRID)[:, 1:], GRID)
+        cog.encode(plane(GRID)[:, 1:], GRID, cog.HEIGHT)
 
 
 @pytest.mark.parametrize(("size", "block"), [(250, 256), (256, 256), (40, 48), (600, 512)])
 def test_encode_block_is_as_large_as_a_small_raster(size, block, tmp_path):
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, size, 30)
     file = tmp_path / "height.tif"
-    file.write_bytes(cog.encode_height(np.zeros(grid.shape), grid))
+    file.write_bytes(cog.encode(np.zeros(grid.shape), grid, cog.HEIGHT))
     assert cog_validate(file, strict=True) == (True, [], [])
     with rasterio.open(file) as raster:
         assert raster.block_shapes == [(block, block)]

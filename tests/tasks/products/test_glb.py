@@ -11,8 +11,6 @@ from scipy.ndimage import map_coordinates
 
 from flexroad.catalog import Grid
 from flexroad.tasks.meshing.normals import mesh_normals
-from flexroad.tasks.meshing.parts import part
-from flexroad.tasks.meshing.relief import Relief, Sheet, sheet
 from flexroad.tasks.products import glb
 from flexroad.tasks.types import Mesh, Orthophoto
 from tests.builders import make_surface
@@ -87,11 +85,6 @@ def test_encode_photos_are_unlit_and_plain_colours_are_not():
     for material in unlit["materials"]:
         assert material["extensions"] == {"KHR_materials_unlit": {}}
     assert not any("extensions" in material for material in lit["materials"])
-    # So is a coarse tile.
-    for has_photo in (False, True):
-        tree = gltf_json(coarse(b"", has_photo)[0])
-        assert tree.get("extensionsUsed") == (["KHR_materials_unlit"] if has_photo else None)
-        assert ["extensions" in material for material in tree["materials"]] == [has_photo]
 
 
 def test_encode_extras_have_georeference():
@@ -126,7 +119,7 @@ def test_encode_normals_on_the_border_are_those_of_the_surface():
     truth = surface.normal(x + west, y + south)
     np.testing.assert_array_equal(normals, np.where(border[:, None], truth, faces_alone))
     written = attribute(glb.encode(mesh, RUN_ORIGIN, normals=normals), "road", "NORMAL")
-    used, _ = part(mesh, mesh.road)
+    used, _ = mesh.part(mesh.road)
     east, north, up = normals[used].T
     np.testing.assert_allclose(written, np.c_[east, up, -north], atol=1e-6)
 
@@ -244,35 +237,20 @@ def test_encode_drops_vertices_without_faces():
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
 
 
-def coarse(jpeg: bytes, photo: bool = False) -> tuple[bytes, Sheet]:
-    """Return the GLB of a slope of 3 x 2 cells of 10 m with a skirt of 4 m."""
-    heights = np.add.outer(np.arange(3.0), 2 * np.arange(4.0))
-    made = sheet(Relief((100.0, 200.0, 130.0, 220.0), heights, np.ones((2, 3), bool), 0.5), 4.0)
-    local = made.points - (100, 200, 0)
-    return glb.encode_sheet(made, local, (100.0, 200.0, 130.0, 220.0), jpeg, photo), made
-
-
-def test_encode_sheet_skirt_has_normals_and_colours_of_the_edge():
-    data, made = coarse(glb.jpeg(np.full((8, 8, 3), 90, np.uint8), 85))
-    position, normal, uv = (attribute(data, "ground", name) for name in ("POSITION", "NORMAL", "TEXCOORD_0"))
-    np.testing.assert_allclose(
-        np.column_stack([position[:, 0], -position[:, 2]]), made.points[:, :2] - (100, 200)
-    )
-    np.testing.assert_allclose(normal, normal[made.top])
-    np.testing.assert_allclose(uv, uv[made.top])
-    # Per cell of 10 m, heights rise by 2 m to the east and by 1 m to the south.
-    slope = np.array([-0.2, 1.0, -0.1])
-    np.testing.assert_allclose(normal, np.tile(slope / np.linalg.norm(slope), (len(normal), 1)), atol=1e-6)
-    np.testing.assert_allclose(uv, np.column_stack([position[:, 0] / 30, 1 + position[:, 2] / 20]), atol=1e-6)
-
-
 def test_encoded_files_have_no_issue_by_the_khronos_validator(tmp_path):
     image = glb.texture(colour_by_place(0.5), 85)
     files = {
         "plain": glb.encode(hills(), RUN_ORIGIN),
         "road": glb.encode(hills(road_columns=20), RUN_ORIGIN),
         "textured": glb.encode(hills(), RUN_ORIGIN, image),
-        "coarse": coarse(image.jpeg)[0],
+        "coarse": glb.encode_ground(
+            hills().vertices,
+            mesh_normals(hills()),
+            hills().vertices[:, :2] / 10,
+            hills().faces,
+            image.jpeg,
+            True,
+        ),
         "deck": glb.encode(Crossing((40.0, 30.0)).mesh()[0], RUN_ORIGIN),
     }
     for name, data in files.items():

@@ -8,8 +8,9 @@ import pytest
 
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import smoothing_spline
-from flexroad.tasks.quality.estimate import INTERVAL, heights_fitted
+from flexroad.tasks.quality.estimate import INTERVAL
 from flexroad.tasks.quality.holdout import INSET_M, holdout, withheld_squares
+from flexroad.tasks.roads.dtm_validity import ground_to_fit
 from flexroad.tools.prepare.points.to_rasters import Options
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from flexroad.tools.synthetic.scene import scan
@@ -69,7 +70,7 @@ def test_holdout_hides_squares_from_fit():
         assert np.isnan(rest.dsm[hidden]).all()
         assert np.isnan(rest.dtm[hidden]).all()
         np.testing.assert_array_equal(rest.dsm[~hidden], data.dsm[~hidden])
-        return given_heights(heights_fitted(data, clusters) + hidden, GRID)
+        return given_heights(ground_to_fit(data, clusters) + hidden, GRID)
 
     result = holdout(data, road, clusters, refit, 0.3, 0.2)
     assert result["holdout_squares"] > 10

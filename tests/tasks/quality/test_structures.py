@@ -8,11 +8,18 @@ import pytest
 import shapely
 
 from flexroad.catalog.grid import Grid
-from flexroad.pipeline.store import codec
-from flexroad.tasks.quality.assess import Options, assess, cell_errors
+from flexroad.pipeline.store.artefacts import decode, encode
+from flexroad.tasks.quality.assess import (
+    BELOW,
+    NO_ABUTMENT,
+    NO_RISE,
+    Options,
+    assess,
+    cell_errors,
+    structures,
+)
 from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.height_source import HeightSource
-from flexroad.tasks.quality.structures import BELOW, NO_ABUTMENT, NO_RISE, structures
 from flexroad.tasks.types import Level, RoadClusters, RoadMask, Structures, TileData
 from tests.tasks.spline.test_levelled import GRID, LEVEL, SOUTH, WEST, made_surface
 
@@ -71,7 +78,7 @@ def test_flags_of_decks_are_those_of_the_tile_and_results_keep_them():
     (own,) = quality.levels
     assert own[1].structures.clearance_m == pytest.approx(-1, abs=1e-9)
     assert {BELOW, NO_RISE} <= set(quality.flags) & set(own[1].flags)
-    restored = codec.decode(codec.encode(quality, {}, (), ""), "").value
+    restored = decode(encode(quality, {}, (), ""), "").value
     assert restored.levels[0][1].structures == own[1].structures
 
 

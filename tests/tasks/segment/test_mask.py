@@ -1,8 +1,10 @@
 import numpy as np
+from hypothesis import given
+from hypothesis.extra.numpy import arrays
 
 from flexroad.tasks.segment.mask import Options, segment
 from flexroad.tasks.types import TileData
-from tests.builders import make_grid
+from tests.builders import make_grid, make_tile
 
 CORE = make_grid(8, 6)
 
@@ -39,3 +41,27 @@ def test_segment_road_only_in_halo_is_kept_with_a_note():
     mask[5, 5] = True
     road = segment(data(mask, halo=2), Options())
     assert (road.mask.sum(), road.notes) == (13, ())
+
+
+def tile(void, dtm_void=None):
+    models = (np.where(cells, np.nan, 5.0) for cells in (void, void if dtm_void is None else dtm_void))
+    return make_tile(*models)
+
+
+def test_beyond_extent_cell_with_one_height_is_inside():
+    row = np.indices((6, 8))[0]
+    assert not tile(row < 3, row >= 3).beyond_extent().any()
+    np.testing.assert_array_equal(tile(row < 3, row >= 2).beyond_extent(), row == 2)
+
+
+@given(arrays(bool, (6, 8)))
+def test_beyond_extent_equals_flood_fill_from_edge(void):
+    """Compared with a flood fill that spreads cell by cell, not diagonally."""
+    filled = np.zeros_like(void)
+    rim = np.ones_like(void)
+    rim[1:-1, 1:-1] = False
+    filled |= void & rim
+    for _ in range(void.size):
+        spread = np.pad(filled, 1)
+        filled |= void & (spread[:-2, 1:-1] | spread[2:, 1:-1] | spread[1:-1, :-2] | spread[1:-1, 2:])
+    np.testing.assert_array_equal(tile(void).beyond_extent(), filled)

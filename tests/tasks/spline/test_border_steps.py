@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from flexroad.catalog.borders import border_of
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import decode, encode
 from flexroad.tasks import sample
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.metrics.mesh_check import check
@@ -109,7 +109,7 @@ def test_meshes_meet_with_steps_away_from_the_road(method):
 
 def test_edge_is_stored_without_loss():
     edge = frame_of("across the edge", TILES[0]).east
-    restored, *_ = codec.decode(codec.encode(edge, {}, (), ""), "")
+    restored, *_ = decode(encode(edge, {}, (), ""), "")
     assert np.array_equal(restored.steps, edge.steps)
     assert np.array_equal(restored.road_m, edge.road_m)
 

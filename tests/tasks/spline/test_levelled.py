@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import decode, encode
 from flexroad.tasks.spline.frame import Corner, Edge
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.space import Lattice, surface_on
@@ -128,7 +128,7 @@ CLUSTERS = RoadClusters(GRID, np.ones(GRID.shape, np.int32))
     ids=["mask", "clusters", "corner", "edge", "surface"],
 )
 def test_results_with_levels_are_stored(result):
-    same(codec.decode(codec.encode(result, {}, (), ""), "").value, result)
+    same(decode(encode(result, {}, (), ""), "").value, result)
 
 
 def test_frame_part_of_missing_level_is_that_of_ground():

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.spline.banded import Banded
-from flexroad.tasks.spline.multigrid import Multigrid
+from flexroad.tasks.spline.normal_equations import Multigrid, is_narrow, solve_banded
 from flexroad.tasks.spline.stencil import add_from_cells, at_cells, from_lines, gram, line_width, to_lines
 from flexroad.tasks.spline.surface import basis, dense, uniform_knots
 
@@ -44,7 +43,7 @@ def determined(m, n, p, held_share, seed=0):
 def test_multigrid_equals_dense_solution(seed, p, m, n, held_share):
     """Held points keep their height."""
     stencil, held, right, expected = determined(m, n, p, held_share, seed)
-    solution = from_lines(Multigrid((m, n), p, held).solve(stencil, right, 1e-10, True), m, p)
+    solution = from_lines(Multigrid(p, held).solve(stencil, right, 1e-10, True), m, p)
     np.testing.assert_allclose(solution.ravel(), expected, atol=1e-4 + 1e-6 * np.abs(expected).max())
 
 
@@ -52,7 +51,7 @@ def test_multigrid_equals_dense_solution(seed, p, m, n, held_share):
 @pytest.mark.parametrize("p", [2, 3, 4])
 def test_banded_equals_dense_solution(m, n, p):
     stencil, held, right, expected = determined(m, n, p, 0.2)
-    solution = from_lines(Banded((m, n), p, held).solve(stencil, right), m, p)
+    solution = from_lines(solve_banded(stencil, right, held), m, p)
     np.testing.assert_allclose(solution.ravel(), expected, atol=1e-6 * np.abs(expected).max())
 
 
@@ -68,13 +67,14 @@ def test_splines_at_cells_equal_dense_products(p):
     np.testing.assert_allclose(from_lines(sums, m, p).ravel(), design.T @ pull.ravel(), atol=1e-12)
 
 
-@pytest.mark.parametrize("solver", [Banded((9, 9), 3, None), Multigrid((9, 9), 3, None)])
-def test_solve_with_indefinite_matrix_raises(solver):
-    stencil = np.zeros((9, 4, 4, line_width(9, 3)))
+def test_solve_with_indefinite_matrix_raises():
+    stencil, held = np.zeros((9, 4, 4, line_width(9, 3))), np.zeros((9, 9), bool)
     stencil[:, 0, 0, 3:12] = -1.0
-    more = (1e-6, True) if isinstance(solver, Multigrid) else ()
+    right = to_lines(np.ones((9, 9)), 3)
     with pytest.raises(TaskError, match="control point 1 of the surface is undetermined"):
-        solver.solve(stencil, to_lines(np.ones((9, 9)), 3), *more)
+        solve_banded(stencil, right, held)
+    with pytest.raises(TaskError, match="control point 1 of the surface is undetermined"):
+        Multigrid(3, held).solve(stencil, right, 1e-6, True)
 
 
 def test_multigrid_undetermined_points_keep_their_height():
@@ -82,10 +82,11 @@ def test_multigrid_undetermined_points_keep_their_height():
     stencil[10:, :] = 0.0
     right = np.zeros((20, 20))
     right[:, :5] = 1.0
-    solution = from_lines(Multigrid((20, 20), 3, None).solve(stencil, to_lines(right, 3), 1e-8, True), 20, 3)
+    grids = Multigrid(3, np.zeros((20, 20), bool))
+    solution = from_lines(grids.solve(stencil, to_lines(right, 3), 1e-8, True), 20, 3)
     assert np.isfinite(solution).all()
     np.testing.assert_array_equal(solution[:, 15:], 0.0)
 
 
-def test_banded_suits_strips_alone():
-    assert [Banded.suits(shape, 3) for shape in ((17, 87), (400, 17), (73, 73))] == [True, True, False]
+def test_is_narrow_strips_alone():
+    assert [is_narrow(shape, 3) for shape in ((17, 87), (400, 17), (73, 73))] == [True, True, False]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import decode, encode
 from flexroad.tasks import sample
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.meshing.survey_limit import APART, breaklines
@@ -60,7 +60,7 @@ def test_steps_error_at_edge_is_halved_and_road_unchanged(height):
     assert np.array_equal(stepped.A, smooth.A)
     assert np.array_equal(heights(stepped)[ROAD], heights(smooth)[ROAD])
     assert np.abs(heights(stepped) - truth)[inner(VERGE)].mean() < 0.03
-    restored, *_ = codec.decode(codec.encode(stepped, {}, (), ""), "")
+    restored, *_ = decode(encode(stepped, {}, (), ""), "")
     assert type(restored) is type(stepped)
     assert heights(restored).tobytes() == heights(stepped).tobytes()
 

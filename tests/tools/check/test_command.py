@@ -40,7 +40,7 @@ def test_init_commands_run_as_printed(downloads, flexroad, tmp_path):
     flexroad(*catalog, "--tile-size", 60).expected(0)
     flexroad(*check).expected(0)
     assert "--config own.yaml" in " ".join(run)
-    flexroad(*run, "--allow", downloads, "--dry-run").expected(0)
+    flexroad("--allow", downloads, *run, "--dry-run").expected(0)
 
 
 def test_init_heights_for_roads_become_a_layer(downloads, flexroad):

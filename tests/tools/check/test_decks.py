@@ -8,7 +8,7 @@ import shapely
 from flexroad.catalog import Grid, Tile
 from flexroad.tasks.roads.attributes import level_numbers
 from flexroad.tools.check import catalog as catalog_check
-from flexroad.tools.check.likely_decks import Deck
+from flexroad.tools.check.catalog import Deck
 from flexroad.tools.synthetic.crossings import Crossings
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests.make_town import make_town

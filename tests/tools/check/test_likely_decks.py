@@ -4,7 +4,7 @@ import shapely
 from scipy.ndimage import binary_dilation, label
 
 from flexroad.catalog import Grid
-from flexroad.tools.check.likely_decks import AREA_M2, RISE_M, likely_decks
+from flexroad.tools.check.catalog import AREA_M2, RISE_M, likely_decks
 from flexroad.tools.synthetic import Kind, gerod, make_scene
 from flexroad.tools.synthetic.crossings import CrossingOptions, Crossings, make_crossings
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexroad.tools.export.aerial import Aerial, joined, of_classes
+from flexroad.tools.export.tileset import Aerial, joined, of_classes
 
 BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 

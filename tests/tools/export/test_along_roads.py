@@ -330,13 +330,12 @@ def text(folder, city):
     ("make", "options", "message"),
     [
         (None, [], "has no roads: name a file of centre lines with --roads"),
-        (None, ["--roads-layer", "a"], "--roads-layer needs --roads"),
         (lambda folder, city: folder / "none.gpkg", [], "none.gpkg: no such file"),
         (text, [], "roads.gpkg is not a vector file"),
         (no_crs, [], "bare.gpkg carries no CRS; give it one with ogr2ogr -a_srs"),
         (areas, [], "areas.gpkg: 1 area and no line; exports along roads need centre lines"),
-        (two_layers, [], "has 2 layers: .*; name one with --roads-layer"),
-        (two_layers, ["--roads-layer", "paths"], "has no layer 'paths'; it has"),
+        (two_layers, [], "has 2 layers: .*; name one, such as .*streets"),
+        (lambda *args: f"{two_layers(*args)}|layername=paths", [], "has no layer 'paths'; it has"),
         (
             lambda folder, city: write_lines(folder / "far.gpkg", city, [(9000, 0), (9999, 0)]),
             [],
@@ -348,7 +347,7 @@ def text(folder, city):
             "no road could be written: shorter than 10 m",
         ),
     ],
-    ids=["no roads", "no file", "missing", "text", "no crs", "areas", "layers", "layer", "far", "short"],
+    ids=["no roads", "missing", "text", "no crs", "areas", "layers", "layer", "far", "short"],
 )
 def test_bad_input_is_refused_in_one_line(city, tmp_path, flexroad, make, options, message):
     if make:

@@ -15,7 +15,7 @@ from tests.permissions import permissions_enforced
 
 from .conftest import OPTIONS, contents
 
-DATUM = ("--height-offset", "47.5", "--allow-steps")
+DATUM = ("--vertical", "47.5", "--allow-steps")
 """Options of each format; the tiles of the run do not meet."""
 WRITTEN_WHOLE = ("mosaic",)
 """Formats that have no markers: each export writes them again."""

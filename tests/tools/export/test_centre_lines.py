@@ -68,7 +68,7 @@ def test_read_centre_lines_equal_lines_of_two_files_are_one(tmp_path):
     line, other = (shapely.LineString(on_grid((10, y), (90, y))) for y in (20, 50))
     far = shapely.LineString(on_grid((10, 9000), (90, 9000)))
     paths = (write(tmp_path / "a.gpkg", [line, far]), write(tmp_path / "b.gpkg", [line, other]))
-    found = read_centre_lines(Source("roads", paths), GRID.bounds, GRID.crs, Options())
+    found = read_centre_lines({Source("roads", paths): GRID.bounds}, GRID.crs, Options())
     np.testing.assert_allclose([part.points[0] for part in found.lines], on_grid((10, 20), (10, 50)))
 
 
@@ -77,7 +77,7 @@ def test_read_centre_lines_are_selected_by_any_column(suffix, tmp_path):
     shapes = [shapely.LineString(on_grid((0, y), (90, y))) for y in (20, 60)]
     path = write(tmp_path / f"a.{suffix}", shapes, surface=["gravel", "asphalt"])
     found = read_centre_lines(
-        Source("roads", (path,)), GRID.bounds, GRID.crs, Options(where="surface = 'asphalt'")
+        {Source("roads", (path,)): GRID.bounds}, GRID.crs, Options(where="surface = 'asphalt'")
     )
     (line,) = found.lines
     assert line.points.tolist() == [list(place) for place in on_grid((0, 60), (90, 60))]
@@ -104,7 +104,7 @@ def test_names_of_columns_in_another_encoding_than_declared_are_read_with_a_note
     line = shapely.LineString(on_grid((0, 20), (90, 20)))
     path = write(tmp_path / f"a.{suffix}", [line], name=["Lane"], width_m=[6.0], xxxxxxx=["stone"])
     in_cp1252(path, "xxxxxxx", "Straßen")
-    found = read_centre_lines(Source("roads", (path,)), GRID.bounds, GRID.crs, Options())
+    found = read_centre_lines({Source("roads", (path,)): GRID.bounds}, GRID.crs, Options())
     assert [(line.name, line.width_m) for line in found.lines] == [("Lane", 6.0)]
     (note,) = [note for note in found.notes if "encoding" in note]
     assert "was read as cp1252;" in note
@@ -115,7 +115,7 @@ def test_names_of_columns_in_another_encoding_than_declared_are_read_with_a_note
 def test_name_in_another_encoding_than_declared_is_read_with_a_note(suffix, data, tmp_path):
     """A byte that cp1252 does not have is latin1's, and GDAL leaves it out of a Shapefile's text."""
     path = with_name(tmp_path / f"a.{suffix}", data)
-    found = read_centre_lines(Source("roads", (path,)), GRID.bounds, GRID.crs, Options())
+    found = read_centre_lines({Source("roads", (path,)): GRID.bounds}, GRID.crs, Options())
     encoding = "latin1" if b"\x81" in data and suffix == "gpkg" else "cp1252"
     text = data.decode("latin1")
     assert [line.name for line in found.lines] == [text if suffix == "gpkg" else text.removesuffix(" \x81")]

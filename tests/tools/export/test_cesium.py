@@ -14,7 +14,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.spline.stepped import without_steps
 from flexroad.tools.export.driver import export
-from flexroad.tools.export.georeference import Datum, Ellipsoidal
+from flexroad.tools.export.georeference import Datum
 from flexroad.tools.export.source import Options, select
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests import validators
@@ -52,7 +52,6 @@ def seen(folder, task, tmp_path):
 def test_picked_heights_are_those_of_the_surface_within_5_mm(city, tmp_path):
     run, folder = city
     rng = np.random.default_rng(0)
-    conversion = Ellipsoidal("EPSG:25832", DATUM)
     places, heights = [], []
     for tile in select(run.path).finished():
         # Where the mesh has no steps: on small faces; large ones on the road's edge reach into the terrain.
@@ -61,7 +60,7 @@ def test_picked_heights_are_those_of_the_surface_within_5_mm(city, tmp_path):
         road = mesh.faces[mesh.road & small]
         faces = road[rng.choice(len(road), 25, replace=False)]
         x, y, _ = (mesh.vertices[faces] + mesh.origin).mean(axis=1).T
-        longitude, latitude, height = conversion.geographic(x, y, surface.height(x, y))
+        longitude, latitude, height = DATUM.geographic("EPSG:25832", x, y, surface.height(x, y))
         places += np.column_stack([longitude, latitude]).tolist()
         heights += height.tolist()
     assert len(places) == 50

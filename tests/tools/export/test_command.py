@@ -34,8 +34,9 @@ def test_area_selects_the_tiles_of_an_export(town, area, tmp_path):
 def test_area_selects_the_tiles_of_a_run(town, area, tmp_path):
     west, south, _, _ = town.tiles[0].grid.bounds
     path = area(west + 5, south + 5, west + 20, south + 20)
+    allow = "--allow", town.path.parent / "survey"
     words = "run", "--catalog", town.path / "catalog.parquet", "--out", tmp_path / "run", "--dry-run"
-    said = call(*words, "--area", path, "--allow", town.path.parent / "survey").expected(0)
+    said = call(*allow, *words, "--area", path).expected(0)
     assert [line for line in said.out.splitlines() if line.endswith(": new")] == [f"{town.tiles[0].id}: new"]
 
 

@@ -13,7 +13,7 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.progress import step_progress
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.errors import TaskError
@@ -116,8 +116,6 @@ def test_selection_by_id_and_box(city):
     assert select(city, bbox=first.grid.bounds).tiles == (first,)
     with pytest.raises(ConfigError, match="has no finished tile to export; see `flexroad status"):
         select(city, ids=[third.id])
-    with pytest.raises(ConfigError, match="exports no variant 'plane'; it has flexroad"):
-        select(city, variant="plane")
 
 
 def test_error_ends_the_progress_lines(city, tmp_path, monkeypatch):
@@ -134,7 +132,7 @@ def test_error_ends_the_progress_lines(city, tmp_path, monkeypatch):
             ["obj"],
             OPTIONS,
             SerialExecutor(),
-            track=StepProgress(Console(quiet=True)),
+            track=step_progress(Console(quiet=True)),
         )
     assert raised.tb  # It refers to the iterator of the tiles.
     assert threading.active_count() == before
@@ -145,7 +143,5 @@ def test_formats_that_cannot_be_written_are_refused_before_any_work():
         check_formats([], OPTIONS)
     with pytest.raises(ConfigError, match="--format gltf is unknown; known are 3dtiles, landxml"):
         check_formats(["landxml", "gltf"], OPTIONS)
-    with pytest.raises(
-        ConfigError, match="3dtiles needs heights above the ellipsoid .*--height-offset METRES"
-    ):
+    with pytest.raises(ConfigError, match="3dtiles needs heights above the ellipsoid .*--vertical METRES"):
         check_formats(["3dtiles"], Options())

@@ -9,7 +9,7 @@ import rasterio
 from pyproj import CRS, Transformer
 
 from flexroad.catalog.crs import CatalogError
-from flexroad.tools.export.georeference import Datum, Ellipsoidal, Georeference, LocalFrame, geocentric
+from flexroad.tools.export.georeference import Datum, Georeference, LocalFrame, geocentric
 
 PLACE = Georeference("EPSG:25832", (295500.0, 5629250.0, 150.0), "EPSG:7837")
 
@@ -108,7 +108,7 @@ def geoid(tmp_path):
 
 
 def test_offset_is_added_and_the_place_is_that_of_pyproj():
-    longitude, latitude, height = Ellipsoidal("EPSG:25832", Datum("offset", "47.5")).geographic(*POINT)
+    longitude, latitude, height = Datum("offset", "47.5").geographic("EPSG:25832", *POINT)
     expected = Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True).transform(*POINT[:2])
     np.testing.assert_allclose((longitude, latitude), expected, atol=1e-12)
     assert height == 147.5
@@ -117,24 +117,22 @@ def test_offset_is_added_and_the_place_is_that_of_pyproj():
 def test_geoid_is_added_at_each_place(geoid):
     east = np.array([460_000.0, 500_000.0, 540_000.0])
     north, level = np.full(3, 5_600_000.0), np.array([0.0, 100.0, 200.0])
-    conversion = Ellipsoidal("EPSG:25832", Datum("geoid", str(geoid)))
-    longitude, _, height = conversion.geographic(east, north, level)
+    longitude, _, height = Datum("geoid", str(geoid)).geographic("EPSG:25832", east, north, level)
     np.testing.assert_allclose(height - level, 47 + (longitude - 9), atol=1e-4)
 
 
 def test_geoid_that_does_not_cover_the_area_raises(geoid):
-    with pytest.raises(CatalogError, match=r"no exact conversion from EPSG:25833 .*--geoid FILE"):
-        Ellipsoidal("EPSG:25833", Datum("geoid", str(geoid))).geographic(*POINT)
+    with pytest.raises(CatalogError, match=r"no exact conversion from EPSG:25833 .*--vertical FILE"):
+        Datum("geoid", str(geoid)).geographic("EPSG:25833", *POINT)
 
 
 def test_vertical_crs_without_its_grid_raises_and_is_not_ignored():
-    with pytest.raises(CatalogError, match=r"heights of EPSG:7837 .*; give the geoid's grid with --geoid"):
-        Ellipsoidal("EPSG:25832", Datum("crs", "EPSG:7837")).geographic(*POINT)
+    with pytest.raises(CatalogError, match=r"heights of EPSG:7837 .*; give the geoid's grid with --vertical"):
+        Datum("crs", "EPSG:7837").geographic("EPSG:25832", *POINT)
 
 
 def test_geocentric_agrees_with_the_equations_of_the_ellipsoid():
-    conversion = Ellipsoidal("EPSG:25832", Datum("offset", "0"))
-    longitude, latitude, height = conversion.geographic(*POINT)
+    longitude, latitude, height = Datum("offset", "0").geographic("EPSG:25832", *POINT)
     a, f = 6378137.0, 1 / 298.257223563
     e2 = f * (2 - f)
     lam, phi = np.radians(longitude), np.radians(latitude)
@@ -147,7 +145,13 @@ def test_geocentric_agrees_with_the_equations_of_the_ellipsoid():
     np.testing.assert_allclose(geocentric(longitude, latitude, height)[0], np.ravel(expected), atol=1e-6)
 
 
-@pytest.mark.parametrize(("kind", "value"), [("geoid", "none.gtx"), ("offset", "nan")])
-def test_datum_that_cannot_be_used_raises(kind, value):
-    with pytest.raises(CatalogError, match=value):
-        Datum(kind, value)
+@pytest.mark.parametrize("value", ["none.gtx", "nan"])
+def test_datum_that_cannot_be_used_raises(value):
+    with pytest.raises(CatalogError, match=f"--vertical {value}"):
+        Datum.of(value)
+
+
+def test_datum_is_a_number_a_geoid_or_a_crs(geoid):
+    assert Datum.of("-47.50") == Datum("offset", "-47.5")
+    assert Datum.of(str(geoid)) == Datum("geoid", str(geoid))
+    assert Datum.of("EPSG:7837") == Datum("crs", "EPSG:7837")

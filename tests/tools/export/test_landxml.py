@@ -193,11 +193,3 @@ def test_write_decks_are_surfaces_of_their_level():
         np.testing.assert_allclose(points[faces], truth, rtol=0, atol=0.6e-4)
     points, _ = read["road level 1"]
     assert len(np.unique(points, axis=0)) == len(points)
-
-
-def test_part_with_levels_is_read_back():
-    part = landxml.part(Crossing((40.0, 30.0)).mesh()[0])
-    ((number, deck),) = landxml.Part.decode(part.encode()).levels
-    assert number == 1
-    assert deck.surfaces[0].points == part.levels[0][1].surfaces[0].points
-    np.testing.assert_array_equal(deck.places, part.levels[0][1].places)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.finished import FileStates
+from flexroad.pipeline.run.finished import file_states
 from flexroad.tools.export.driver import export
 from flexroad.tools.export.source import Source, select
 
@@ -31,10 +31,10 @@ SPREAD_M = {"3dtiles": 1000.0}
 def many(city, number: int, spread_m: float = 0.0) -> Source:
     """The first tile of a run under many ids, all with its results."""
     whole = select(city.path, city.done[:1])
-    (tile,), (snapshot,), files = whole.tiles, whole.snapshots, FileStates(whole.run)
+    (tile,), (snapshot,), state = whole.tiles, whole.snapshots, file_states(whole.run)
     grids = (replace(tile.grid, west=tile.grid.west + k * spread_m) for k in range(number))
     tiles = tuple(replace(tile, id=f"{k:04}", grid=grid) for k, grid in enumerate(grids))
-    snapshots = tuple(replace(snapshot, files=files(one)) for one in tiles)
+    snapshots = tuple(replace(snapshot, files=state(one)) for one in tiles)
     return replace(whole, tiles=tiles, snapshots=snapshots)
 
 

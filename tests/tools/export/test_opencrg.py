@@ -5,10 +5,9 @@ from flexroad.catalog.grid import Bounds
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads.routes import CentreLine, Route
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots
-from flexroad.tools.export import opencrg
+from flexroad.tools.export import opencrg, profiles
 from flexroad.tools.export.georeference import LocalFrame
-from flexroad.tools.export.profiles import HeightGrid, height_grid
-from flexroad.tools.export.reference_line import Options as LineOptions
+from flexroad.tools.export.profiles import HeightGrid
 from flexroad.tools.export.reference_line import reference_line
 
 SOUTH_WEST = (366_000.0, 5_621_000.0)
@@ -38,11 +37,11 @@ def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return surface().height(*FRAME.to_run(x, y))
 
 
-def grid(points: np.ndarray = BENDS, **options: float) -> HeightGrid:
+def grid(points: np.ndarray = BENDS) -> HeightGrid:
     x, y = FRAME.to_local(*(points + SOUTH_WEST).T)
-    line = reference_line(Route((CentreLine(np.stack([x, y], axis=1), 6.0),)), LineOptions())
+    line = reference_line(Route((CentreLine(np.stack([x, y], axis=1), 6.0),)))
     assert line is not None
-    return height_grid(line, height, **options)
+    return profiles.height_grid(line, height)
 
 
 def read(data: bytes) -> tuple[dict[str, float], list[str], np.ndarray]:
@@ -118,10 +117,11 @@ def test_encode_without_any_height_says_where_the_road_is():
         opencrg.encode(HeightGrid(whole.line, whole.v, whole.heights * np.nan))
 
 
-def test_encode_read_by_pyopencrg_is_within_2_mm_of_the_surface(tmp_path):
+def test_encode_read_by_pyopencrg_is_within_2_mm_of_the_surface(tmp_path, monkeypatch):
     pyopencrg = pytest.importorskip("pyopencrg")
     path = tmp_path / "road.crg"
-    truth = grid(margin_m=2.0)
+    monkeypatch.setattr(profiles, "MARGIN_M", 2.0)
+    truth = grid()
     path.write_bytes(opencrg.encode(truth, "EPSG:25832"))
     for apply_mods in (False, True):
         road = pyopencrg.CrgRoad.read(path, apply_mods=apply_mods)

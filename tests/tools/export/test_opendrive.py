@@ -11,8 +11,7 @@ import pytest
 from flexroad.tasks.levels.along_route import Structure
 from flexroad.tasks.roads.routes import CentreLine, Route
 from flexroad.tools.export import opendrive
-from flexroad.tools.export.profiles import HeightAt, elevation_error, height_grid, profile_error, profiles
-from flexroad.tools.export.reference_line import Options as LineOptions
+from flexroad.tools.export.profiles import NONE, HeightAt, Profiles, height_grid, profile_error, profiles
 from flexroad.tools.export.reference_line import ReferenceLine, reference_line
 from tests.read_opendrive import numbers, plan, polynomial, quality_issues
 
@@ -28,7 +27,7 @@ def hills(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def reference(points: np.ndarray = BENDS, **known: object) -> ReferenceLine:
     parts = (CentreLine(points, 6.0, **known),)
-    line = reference_line(Route(parts), LineOptions())
+    line = reference_line(Route(parts))
     assert line is not None
     return line
 
@@ -98,7 +97,7 @@ def test_elevation_error_is_that_of_a_level_cross_section():
     line = reference(np.array([[0.0, 0.0], [60.0, 0.0]]))
     grid = height_grid(line, lambda x, y: 150 + 0.02 * x + 0.04 * y)
     fitted = profiles(grid)
-    mean_m, max_m = elevation_error(grid, fitted)
+    mean_m, max_m = profile_error(grid, Profiles(fitted.elevation, NONE))
     assert max_m == pytest.approx(0.12, abs=1e-6)
     level = np.abs(0.04 * grid.v[np.abs(grid.v) <= 3.0 + 1e-6])
     assert mean_m == pytest.approx(level.mean(), abs=1e-6)

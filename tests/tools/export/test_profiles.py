@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 
 from flexroad.tasks.roads.routes import CentreLine, Route
+from flexroad.tools.export import profiles as heights_along
+from flexroad.tools.export import reference_line as lines
 from flexroad.tools.export.profiles import (
     HeightGrid,
     Profiles,
@@ -12,17 +14,12 @@ from flexroad.tools.export.profiles import (
     profiles,
     value_at,
 )
-from flexroad.tools.export.reference_line import Options as LineOptions
-from flexroad.tools.export.reference_line import ReferenceLine, reference_line
+from flexroad.tools.export.reference_line import ReferenceLine
 
 
 def straight(length: float = 120.0) -> ReferenceLine:
     """Return a straight road to the east, 6 m wide: s is x, and v is y."""
-    line = reference_line(
-        Route((CentreLine(np.array([[0.0, 0.0], [length, 0.0]]), 6.0),)), LineOptions(increment_m=1.0)
-    )
-    assert line is not None
-    return line
+    return road(np.array([[0.0, 0.0], [length, 0.0]]))
 
 
 def grid(heights_at, length: float = 120.0) -> HeightGrid:
@@ -139,7 +136,9 @@ def test_a_cubic_is_one_piece():
 
 
 def road(points: np.ndarray, width_m: float = 6.0) -> ReferenceLine:
-    line = reference_line(Route((CentreLine(points, width_m),)), LineOptions(increment_m=1.0))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(lines, "INCREMENT_M", 1.0)
+        line = lines.reference_line(Route((CentreLine(points, width_m),)))
     assert line is not None
     return line
 
@@ -157,10 +156,11 @@ def test_height_grid_left_of_the_line_has_positive_v():
     assert grid_error(grid, tilted)[1] < 1e-9
 
 
-def test_height_grid_narrow_bend_has_no_margin_on_its_inside():
+def test_height_grid_narrow_bend_has_no_margin_on_its_inside(monkeypatch):
+    monkeypatch.setattr(heights_along, "MARGIN_M", 5.0)
     turn = np.radians(np.arange(0.0, 181.0, 5.0))
     bend = 6 * np.stack([np.sin(turn), 1 - np.cos(turn)], axis=1)
-    grid = height_grid(road(bend), tilted, margin_m=5.0)
+    grid = height_grid(road(bend), tilted)
     assert grid.v[0] == -8
     assert 3 < grid.v[-1] < 6
     # Cross-sections do not meet: all cells have an area.

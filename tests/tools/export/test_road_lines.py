@@ -12,21 +12,20 @@ from flexroad.catalog.crs import compound
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads.routes import CentreLine, Route
 from flexroad.tools.export import road_lines
-from flexroad.tools.export.reference_line import Options, ReferenceLine, reference_line
-from flexroad.tools.export.road_lines import RoadLine, stations
+from flexroad.tools.export.reference_line import ReferenceLine, reference_line
+from flexroad.tools.export.road_lines import Road, stations
 
 DATE = datetime(2025, 3, 1, tzinfo=UTC)
 
 
-def road(number: int, segments: int, lanes: int | None = None) -> RoadLine:
+def road(number: int, segments: int, lanes: int | None = None) -> Road:
     x = np.arange(segments + 1.0)
     points = np.column_stack([500_000 + x, np.full_like(x, 5_600_000 + number), 100 + x / 8])
     error = np.where(np.arange(segments) % 2, 0.05, np.nan)
     height_source = np.arange(segments, dtype=np.uint8) % 4
     columns = {"id": number, "name": f"Road {number}", "lanes": lanes}
-    return RoadLine(
-        columns, points, {"grade_percent": np.full(segments, 12.5), "error_m": error}, height_source
-    )
+    numbers = {"grade_percent": np.full(segments, 12.5), "error_m": error}
+    return columns, {"points": points, "height_source": height_source, **numbers}
 
 
 @pytest.mark.parametrize("batch", [1, 50_000])
@@ -40,13 +39,13 @@ def test_write_lines_and_segments_have_heights_and_columns(tmp_path, monkeypatch
     assert roads["lanes"].tolist() == [2, 2]
     assert CRS(roads.crs).is_compound
     np.testing.assert_array_equal(
-        shapely.get_coordinates(roads.geometry[1], include_z=True), road(2, 5).points
+        shapely.get_coordinates(roads.geometry[1], include_z=True), road(2, 5)[1]["points"]
     )
     segments = geopandas.read_file(path, layer="segments")
     assert segments.road_id.tolist() == [1] * 4 + [2] * 5
     assert segments.height_source.fillna("").tolist()[:4] == ["", "measured", "dtm", "inferred"]
     np.testing.assert_array_equal(
-        shapely.get_coordinates(segments.geometry[8], include_z=True), road(2, 5).points[-2:]
+        shapely.get_coordinates(segments.geometry[8], include_z=True), road(2, 5)[1]["points"][-2:]
     )
 
 
@@ -71,7 +70,7 @@ def test_write_equal_roads_give_equal_bytes(tmp_path):
 
 
 def line(*points: tuple[float, float], width: float = 6.0) -> ReferenceLine:
-    found = reference_line(Route((CentreLine(np.array(points), width),)), Options())
+    found = reference_line(Route((CentreLine(np.array(points), width),)))
     assert found is not None
     return found
 

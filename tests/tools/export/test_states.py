@@ -12,7 +12,6 @@ from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.run import finished
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.tools.export import source
 from flexroad.tools.export.source import select
 
 
@@ -139,8 +138,3 @@ def test_files_of_a_tile_are_looked_up_before_its_state(own_city, monkeypatch):
     monkeypatch.setattr(finished, "peek_statuses", peek)
     with pytest.raises(ConfigError, match="no longer finished"):
         list(chosen.finished())
-
-
-def test_unknown_variant_is_refused(made_city):
-    with pytest.raises(ConfigError, match="exports no variant 'plane'; it has flexroad"):
-        source.select(made_city.path, variant="plane")

@@ -56,7 +56,7 @@ def full() -> None:
 
 def words(city, name, out):
     # The run's tiles do not meet.
-    return ["export", city.path, "--format", name, "--height-offset", "47.5", "--allow-steps", "-o", out]
+    return ["export", city.path, "--format", name, "--vertical", "47.5", "--allow-steps", "-o", out]
 
 
 @pytest.fixture(scope="module")

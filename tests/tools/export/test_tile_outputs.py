@@ -37,7 +37,7 @@ def test_files_are_those_of_the_meshes(made_city, tmp_path):
     export(chosen, tmp_path, JOINED, Options(), SerialExecutor())
     meshes = [(tile.id, tile.mesh) for tile in chosen.finished()]
     with (tmp_path / "expected").open("wb") as file:
-        about = (*chosen.origin, 0.0), chosen.vertical
+        about = chosen.place.origin, chosen.vertical
         file.write(cityjson.header(chosen.crs, *about))
         file.writelines(cityjson.features(name, mesh, *about) for name, mesh in meshes)
     assert (tmp_path / "cityjson" / "city.city.jsonl").read_bytes() == (tmp_path / "expected").read_bytes()

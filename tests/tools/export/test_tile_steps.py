@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 import flexroad
-from flexroad.pipeline.run.points import length_text
+from flexroad.pipeline.run.sampler import length_text
 from tests import make_rasters, make_roads
 
 WEST, SOUTH, TILE_M = 499_980, 5_599_980, 60

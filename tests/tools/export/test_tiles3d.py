@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Transformer
 
-from flexroad.tasks.meshing.relief import Relief, sheet
-from flexroad.tasks.products import glb
-from flexroad.tools.export.georeference import Datum, Ellipsoidal, geocentric
+from flexroad.tools.export.georeference import Datum, Georeference, geocentric
+from flexroad.tools.export.relief import Relief, encode_sheet, sheet
 from flexroad.tools.export.tiles3d import (
     around,
     east_north_up,
@@ -23,42 +22,42 @@ from flexroad.tools.export.tiles3d import (
     tileset,
 )
 
-ORIGIN = 450_000.0, 5_550_000.0
+PLACE = Georeference("EPSG:25832", (450_000.0, 5_550_000.0, 0.0))
+DATUM = Datum("offset", "47.5")
 
 
 def at(east, north, size, low=100.0, high=160.0):
-    conversion = Ellipsoidal("EPSG:25832", Datum("offset", "47.5"))
     bounds = east, north, east + size, north + size
-    return placed("a.glb", bounds, (low, high), ORIGIN, conversion), conversion
+    return placed("a.glb", bounds, (low, high), PLACE, DATUM)
 
 
 @pytest.mark.parametrize(("size", "within"), [(250, 0.002), (500, 0.006)])
 @pytest.mark.parametrize("east", [500_000.0, 770_000.0])
 def test_transform_is_exact_but_for_the_curvature_of_the_earth(east, size, within):
-    leaf, conversion = at(east, 5_600_000.0, size)
+    leaf = at(east, 5_600_000.0, size)
     rng = np.random.default_rng(1)
     points = rng.uniform((east, 5_600_000.0, 100), (east + size, 5_600_000.0 + size, 160), (500, 3))
     matrix = np.reshape(leaf["transform"], (4, 4)).T
-    placed_at = (points - (*ORIGIN, 0)) @ matrix[:3, :3].T + matrix[:3, 3]
-    errors = np.linalg.norm(placed_at - geocentric(*conversion.geographic(*points.T)), axis=1)
+    placed_at = (points - PLACE.origin) @ matrix[:3, :3].T + matrix[:3, 3]
+    errors = np.linalg.norm(placed_at - geocentric(*DATUM.geographic(PLACE.crs, *points.T)), axis=1)
     assert errors.max() < within
     # Half of the sagitta of the diagonal: no affine transform can be better than a good part of it.
     assert errors.max() > (size / np.sqrt(2)) ** 2 / (2 * 6.4e6) / 3
 
 
 def test_transforms_of_neighbours_agree_on_their_border():
-    left, *_ = at(500_000.0, 5_600_000.0, 250)
-    right, *_ = at(500_250.0, 5_600_000.0, 250)
+    left = at(500_000.0, 5_600_000.0, 250)
+    right = at(500_250.0, 5_600_000.0, 250)
     border = np.array([[50_250.0, y, z, 1] for y in (50_000.0, 50_100.0, 50_250.0) for z in (100.0, 160.0)])
     both = [border @ np.reshape(leaf["transform"], (4, 4)) for leaf in (left, right)]
     assert np.linalg.norm(both[0] - both[1], axis=1).max() < 0.002
 
 
 def test_region_contains_all_vertices():
-    leaf, conversion = at(500_000.0, 5_600_000.0, 250)
+    leaf = at(500_000.0, 5_600_000.0, 250)
     rng = np.random.default_rng(2)
     points = rng.uniform((500_000, 5_600_000, 100), (500_250, 5_600_250, 160), (500, 3))
-    longitude, latitude, height = conversion.geographic(*points.T)
+    longitude, latitude, height = DATUM.geographic(PLACE.crs, *points.T)
     west, south, east, north, low, high = leaf["region"]
     assert np.radians(longitude).min() >= west
     assert np.radians(longitude).max() <= east
@@ -90,8 +89,7 @@ def sheet_of(side, east, north, spacing):
     heights = 150 + 80 * np.add.outer(np.sin(axis / 500), np.cos(axis / 700))
     cells = np.ones((number - 1, number - 1), bool)
     made = sheet(Relief((east, north, east + side, north + side), heights, cells, 1.0), 8.0)
-    conversion = Ellipsoidal("EPSG:25832", Datum("offset", "47.5"))
-    return made, *sheet_placed("b.glb", made.points, conversion), conversion
+    return made, *sheet_placed("b.glb", made.points, PLACE.crs, DATUM)
 
 
 def back(points):
@@ -104,8 +102,8 @@ def back(points):
 @pytest.mark.parametrize("east", [500_000.0, 770_000.0])
 def test_sheet_of_4_km_is_where_its_points_are_within_2_mm(east):
     """As a viewer reads it: float32 vertices with the transform of the tile."""
-    made, placed_sheet, local, _ = sheet_of(4000.0, east, 5_600_000.0, 64.0)
-    data = glb.encode_sheet(made, local, (east, 5_600_000.0, east + 4000, 5_604_000.0), b"", False)
+    made, placed_sheet, local = sheet_of(4000.0, east, 5_600_000.0, 64.0)
+    data = encode_sheet(made, local, (east, 5_600_000.0, east + 4000, 5_604_000.0), b"", False)
     scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
     x, y, z = scene.geometry["ground"].vertices.astype(np.float32).T.astype(np.float64)
     matrix = matrix_of(tile(placed_sheet, 64.0))
@@ -117,8 +115,8 @@ def test_sheet_of_4_km_is_where_its_points_are_within_2_mm(east):
 
 
 def test_sheet_region_contains_its_points():
-    made, placed_sheet, _, conversion = sheet_of(4000.0, 500_000.0, 5_600_000.0, 64.0)
-    longitude, latitude, height = conversion.geographic(*made.points.T)
+    made, placed_sheet, _ = sheet_of(4000.0, 500_000.0, 5_600_000.0, 64.0)
+    longitude, latitude, height = DATUM.geographic(PLACE.crs, *made.points.T)
     west, south, east, north, low, high = placed_sheet["region"]
     assert west < np.radians(longitude.min()) < np.radians(longitude.max()) < east
     assert south < np.radians(latitude.min()) < np.radians(latitude.max()) < north
@@ -139,7 +137,7 @@ def test_east_north_up_is_where_the_place_is():
 def test_tile_transform_of_a_child_is_relative_to_its_parent():
     """A transform applies to all tiles below it."""
     parent = sheet_of(1000.0, 500_000.0, 5_600_000.0, 16.0)[1]
-    child, _ = at(500_250.0, 5_600_250.0, 250)
+    child = at(500_250.0, 5_600_250.0, 250)
     entry = tile(parent, 16.0, children=[tile(child, 0.0, parent)])
     product = matrix_of(entry) @ matrix_of(entry["children"][0])
     points = np.array([[50_250.0, 50_250.0, 100.0, 1], [50_500.0, 50_500.0, 160.0, 1]])
@@ -149,7 +147,7 @@ def test_tile_transform_of_a_child_is_relative_to_its_parent():
 
 def test_tile_with_children_replaces_them_and_contains_them():
     parent = sheet_of(1000.0, 500_000.0, 5_600_000.0, 16.0)[1]
-    outside, _ = at(500_900.0, 5_600_900.0, 250, high=900.0)
+    outside = at(500_900.0, 5_600_900.0, 250, high=900.0)
     entry = tile(parent, 16.0, children=[tile(outside, 0.0, parent)], vertical_error_m=1.5)
     assert entry["refine"] == "REPLACE"
     assert entry["extras"] == {"vertical_error_m": 1.5}
@@ -158,7 +156,7 @@ def test_tile_with_children_replaces_them_and_contains_them():
 
 
 def test_tileset_of_a_group_has_its_children_and_their_region():
-    children = [tile(at(500_000.0 + 250 * n, 5_600_000.0, 250)[0], 0.0) for n in range(3)]
+    children = [tile(at(500_000.0 + 250 * n, 5_600_000.0, 250), 0.0) for n in range(3)]
     region = around([child["boundingVolume"]["region"] for child in children])
     made = tileset(group(children, extent_m(region)), extent_m(region), crs="EPSG:25832")
     assert made["asset"]["version"] == "1.1"

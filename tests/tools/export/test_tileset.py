@@ -16,16 +16,15 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.tasks.meshing.relief import of_mesh
 from flexroad.tasks.products import glb
 from flexroad.tools.export import tile_outputs
 from flexroad.tools.export import tileset as coarse
-from flexroad.tools.export.aerial import Aerial, joined
 from flexroad.tools.export.driver import export
-from flexroad.tools.export.georeference import Datum
-from flexroad.tools.export.source import Options, aerial_of, select
+from flexroad.tools.export.georeference import Datum, Georeference
+from flexroad.tools.export.relief import of_mesh
+from flexroad.tools.export.source import Options, select
 from flexroad.tools.export.tiles3d import placed
-from flexroad.tools.export.tileset import Node, blocks
+from flexroad.tools.export.tileset import Aerial, Node, aerial_of, blocks, joined
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests.builders import LIGHT
 from tests.validators.gltf import gltf_issues
@@ -276,20 +275,20 @@ def far_and_near(folder, place):
         a = np.arange(26 * 26).reshape(26, 26)
         quads = np.stack([a[:-1, :-1], a[:-1, 1:], a[1:, 1:], a[1:, :-1]], axis=-1).reshape(-1, 4)
         faces = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]).astype(np.int32)
-        ground = of_mesh(points, faces, coarse.TILE.spacing_m)
+        ground = of_mesh(points, faces, coarse.TILE_M[0])
         image = Aerial(ground.bounds, np.full((125, 125, 3), 10.0 * number), np.ones((125, 125)))
         files, referred = coarse.record(f"t{number}", ground, image)
         for name, data in files.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(data)
         box = (west, south, west + 250, south + 250)
-        where = placed(f"tiles/t{number}.glb", box, (90.0, 110.0), place.origin, place.conversion)
+        where = placed(f"tiles/t{number}.glb", box, (90.0, 110.0), *place)
         cell = int(west // 1000), int(south // 1000)
         yield Node(coarse.row_of(f"t{number}", cell, where, 0.0, False) | referred)
 
 
 def test_blocks_have_nested_levels_where_there_is_more_than_one_tile(tmp_path):
-    place = coarse.Place("run", "EPSG:25832", (500_000.0, 5_600_000.0), OPTIONS.datum)
+    place = Georeference("EPSG:25832", (500_000.0, 5_600_000.0, 0.0)), OPTIONS.datum
     near, far = blocks(list(far_and_near(tmp_path, place)), tmp_path, place, SerialExecutor())
     assert [near.row["uri"], far.row["uri"]] == [f"coarse/4000_{column}_1400.glb" for column in (125, 135)]
     assert [child.row["id"] for child in far.children] == ["t12"]

@@ -5,7 +5,7 @@ import pytest
 import shapely
 from shapely import LineString, Point, Polygon
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tools.lift import features
 from flexroad.tools.lift.features import Feature, grades, level_columns, lifted, wanted_levels
 from flexroad.tools.lift.network import ANY

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tools.lift.network import ANY, Network, along, filled, level_of, tagged_level
 
 S = np.arange(60.0)

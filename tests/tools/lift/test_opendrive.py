@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tools.lift import opendrive, plan_view
 from flexroad.tools.lift.plan_view import extent
 from flexroad.tools.lift.road_profiles import cross_sections

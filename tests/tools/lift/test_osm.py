@@ -6,7 +6,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift import osm
 from flexroad.tools.lift.types import Frame, Options

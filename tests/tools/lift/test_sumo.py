@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift import sumo
 from flexroad.tools.lift.types import Frame, Options

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flexroad.pipeline.run.points import Heights
+from flexroad.pipeline.run.sampler import Heights
 from flexroad.tools.lift import types
 
 
@@ -17,10 +17,11 @@ def test_each_part_has_its_heights_in_order_whatever_the_batch(monkeypatch):
     for size in (1, 4, 100):
         monkeypatch.setattr(types, "POINTS", size)
         found = types.with_heights(
-            parts, lambda part: None if isinstance(part, str) else (np.arange(part), np.ones(part)), heights
+            parts,
+            lambda part: types.NO_POINTS if isinstance(part, str) else (np.arange(part), np.ones(part)),
+            heights,
         )
-        result = [(part, own if own is None else own.ground.tolist()) for part, own in found]
+        result = [(part, own.ground.tolist()) for part, own in found]
         assert [part for part, _ in result] == parts
-        assert [own for part, own in result if isinstance(part, str)] == [None] * 3
-        assert [own for part, own in result if not isinstance(part, str)] == [[1, 2, 3], [], [1, 2, 3, 4, 5]]
+        assert [own for _, own in result] == [[], [], [1, 2, 3], [], [], [1, 2, 3, 4, 5]]
     assert asked[-1] == 8

@@ -60,7 +60,7 @@ def test_an_attribute_is_not_mistaken_for_the_end_of_another_name_or_a_value():
 )
 def test_children_are_added_at_the_end(before, after):
     (part,) = read(before, "a")
-    assert part.replaced([part.with_child("<c/>")]) == after
+    assert part.replaced([part.with_child(part.element, "<c/>")]) == after
 
 
 @pytest.mark.parametrize(

@@ -50,9 +50,7 @@ def roads(tmp_path_factory):
 
 def test_prepare_points_prints_next_command_that_runs(cloud, roads, tmp_path):
     out = tmp_path / "street"
-    output = flexroad(
-        "prepare", "points", cloud, "-o", out, "--roads", roads, "--date", "2024-05-01", "--workers", 1
-    )
+    output = flexroad("prepare", cloud, "-o", out, "--roads", roads, "--date", "2024-05-01", "--workers", 1)
     (next_line,) = (line for line in output.splitlines() if line.startswith("next: "))
     words = next_line.removeprefix("next: flexroad ").replace("RUN", str(tmp_path / "run")).split()
     assert "1 tile: 1 done" in flexroad(*words, "--executor", "serial")
@@ -68,7 +66,7 @@ def test_prepare_points_options_are_applied(cloud, tmp_path):
     import rasterio
 
     flexroad(
-        "prepare", "points", cloud, "-o", tmp_path, "--cell", 2, "--dop-cell", 1, "--ground-class", 2, 6,
+        "prepare", cloud, "-o", tmp_path, "--cell", 2, "--dop-cell", 1, "--ground-class", 2, 6,
         "--workers", 1,
     )  # fmt: skip
     with rasterio.open(tmp_path / "dtm.tif") as raster:
@@ -79,14 +77,14 @@ def test_prepare_points_options_are_applied(cloud, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["points", "nowhere.laz"], "nowhere.laz"),
-        (["points", "CLOUD", "--crs", "EPSG:4"], "EPSG:4"),
-        (["points", "CLOUD", "--to-crs", "EPSG:4326"], "EPSG:4326"),
-        (["points", "CLOUD", "--roads", "nowhere.gpkg"], "nowhere.gpkg"),
-        (["points", "CLOUD", "--dop-cell", "0.3"], "--dop-cell"),
-        (["points", "CLOUD", "--ground", "classes", "--ground-class", "9"], "class 9"),
-        (["mesh", "nowhere.obj"], "nowhere.obj"),
-        (["odm", "nowhere"], "nowhere"),
+        (["nowhere.laz"], "nowhere.laz"),
+        (["CLOUD", "--crs", "EPSG:4"], "EPSG:4"),
+        (["CLOUD", "--to-crs", "EPSG:4326"], "EPSG:4326"),
+        (["CLOUD", "--roads", "nowhere.gpkg"], "nowhere.gpkg"),
+        (["CLOUD", "--dop-cell", "0.3"], "--dop-cell"),
+        (["CLOUD", "--ground", "classes", "--ground-class", "9"], "class 9"),
+        (["nowhere.obj"], "nowhere.obj"),
+        (["nowhere"], "nowhere does not exist; give point clouds (.las, .laz), a mesh ("),
     ],
 )
 def test_prepare_invalid_input_is_one_line_and_leaves_no_folder(cloud, tmp_path, words, message):
@@ -108,22 +106,22 @@ def refusal(*words) -> str:
     return error
 
 
-@pytest.mark.parametrize("command", ["points", "mesh", "odm", "photos"])
+@pytest.mark.parametrize("command", ["odm", "photos"])
 def test_prepare_into_folder_with_raster_of_others_changes_nothing(cloud, tmp_path, command):
     (tmp_path / "dtm.tif").write_bytes(b"mine")
-    assert f"{tmp_path / 'dtm.tif'} is not of an earlier" in refusal(command, cloud, "-o", tmp_path)
+    assert f"{tmp_path / 'dtm.tif'} is not of an earlier" in refusal(cloud, "-o", tmp_path)
     assert contents(tmp_path) == {"dtm.tif": b"mine"}
 
 
 def test_prepare_again_replaces_own_outputs(cloud, tmp_path):
     for _ in range(2):
-        flexroad("prepare", "points", cloud, "-o", tmp_path, "--workers", 1)
+        flexroad("prepare", cloud, "-o", tmp_path, "--workers", 1)
     assert not (tmp_path / "lock.json").exists()
 
 
 def test_prepare_into_folder_in_use_is_refused(cloud, tmp_path):
     with run_lock(tmp_path):
-        error = refusal("points", cloud, "-o", tmp_path)
+        error = refusal(cloud, "-o", tmp_path)
         assert f"{tmp_path} is in use by pid {os.getpid()} " in error
         assert f"end it with `kill {os.getpid()}`" in error
         assert contents(tmp_path).keys() == {"lock.json"}
@@ -131,7 +129,7 @@ def test_prepare_into_folder_in_use_is_refused(cloud, tmp_path):
 
 def test_prepare_into_folder_of_killed_process_takes_over_its_lock(cloud, tmp_path):
     (tmp_path / "lock.json").write_bytes(replace(Owner.me(), pid=2**22 + 1).data)
-    said = flexroad("prepare", "points", cloud, "-o", tmp_path, "--workers", 1)
+    said = flexroad("prepare", cloud, "-o", tmp_path, "--workers", 1)
     assert "note: took over the lock of pid" in said
     assert not (tmp_path / "lock.json").exists()
 
@@ -139,18 +137,34 @@ def test_prepare_into_folder_of_killed_process_takes_over_its_lock(cloud, tmp_pa
 def test_prepare_into_folder_that_cannot_be_written_names_the_remedy(cloud, tmp_path):
     (tmp_path / "closed").mkdir(mode=0o555)
     with permissions_enforced():
-        error = refusal("points", cloud, "-o", tmp_path / "closed")
+        error = refusal(cloud, "-o", tmp_path / "closed")
     remedy = "Permission denied; correct that or choose another folder with -o"
     assert error == f"error: cannot write to {tmp_path / 'closed'}: {remedy}"
     (tmp_path / "file").write_text("mine")
-    error = refusal("points", cloud, "-o", tmp_path / "file")
+    error = refusal(cloud, "-o", tmp_path / "file")
     assert error == f"error: {tmp_path / 'file'} is a file; choose a folder with -o"
-    error = refusal("points", cloud, "-o", tmp_path / "file" / "new")
+    error = refusal(cloud, "-o", tmp_path / "file" / "new")
     assert f"cannot write to {tmp_path / 'file' / 'new'}: Not a directory; correct that" in error
 
 
 def test_prepare_misspelt_option_suggests_the_right_one(cloud, tmp_path):
-    assert "--cell" in flexroad("prepare", "points", cloud, "-o", tmp_path, "--cel", 2, expect=2)
+    assert "--cell" in flexroad("prepare", cloud, "-o", tmp_path, "--cel", 2, expect=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("a.laz", ["--density", 9], "--density has no effect on point clouds (a.laz); leave it out"),
+        ("a.laz", ["--control", "c.csv"], "--control has no effect on point clouds (a.laz); leave it out"),
+        ("a.glb", ["--ground-class", 2], "--ground-class has no effect on a mesh (a.glb); leave it out"),
+        ("a.jpg", ["--no-dop"], "--no-dop has no effect on photographs (a.jpg); leave it out"),
+        ("a.jpg", ["--crs", "EPSG:25832"], "--crs has no effect on photographs (a.jpg); leave it out"),
+    ],
+)
+def test_prepare_option_of_another_kind_is_refused(name, options, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).touch()
+    assert refusal(name, "-o", "out", *options) == f"error: {message}"
 
 
 @pytest.mark.slow
@@ -158,7 +172,7 @@ def test_prepare_misspelt_option_suggests_the_right_one(cloud, tmp_path):
 def test_prepare_interrupted_leaves_no_folder(cloud, tmp_path, number):
     out = tmp_path / "out"
     with subprocess.Popen(
-        [*PROCESS, "prepare", "points", str(cloud), "-o", str(out), "--cell", "0.05", "--dop-cell", "0.05"],
+        [*PROCESS, "prepare", str(cloud), "-o", str(out), "--cell", "0.05", "--dop-cell", "0.05"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         while not any(out.glob("*/*")):
@@ -185,6 +199,6 @@ def test_prepare_points_bridge_class_selects_bridges(tmp_path, words, is_bridge)
     # A place in the Netherlands: elsewhere a metre of their CRS is none.
     xyz = np.stack([east + 155_000, north + 463_000, np.where(kind == 26, 6.0, 0.0)], -1).reshape(-1, 3)
     path = write_cloud(tmp_path / "ahn.las", xyz, kind.ravel(), "EPSG:28992")
-    said = flexroad("prepare", "points", path, "-o", tmp_path / "out", "--workers", 1, *words)
+    said = flexroad("prepare", path, "-o", tmp_path / "out", "--workers", 1, *words)
     assert (tmp_path / "out" / "bridges.tif").is_file() == is_bridge
     assert ("--bridge-class 26 takes them" in said) == (not is_bridge)

@@ -9,12 +9,12 @@ from PIL import Image
 
 from flexroad.catalog import Catalog, CatalogError
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import SerialExecutor
 from flexroad.tasks import TaskError, memory
 from flexroad.tools.prepare import from_odm as odm
-from flexroad.tools.prepare.from_mesh import POINTS, MeshOptions
+from flexroad.tools.prepare.from_mesh import POINTS
 from flexroad.tools.prepare.from_odm import prepare_odm
 from flexroad.tools.prepare.options import PrepareOptions
+from tests.command_line import call
 
 CRS = "EPSG:32615"
 WEST, NORTH, SIDE = 576_000.0, 5_188_040.0, 40
@@ -120,7 +120,7 @@ def project(tmp_path, *makers):
 
 def prepare(folder, out, options=None):
     options = options or PrepareOptions()
-    return prepare_odm(folder, out, options, MeshOptions(), POINTS, SerialExecutor(), lambda _: None)
+    return prepare_odm(folder, out, options, POINTS, lambda _: None)
 
 
 def read(path):
@@ -197,7 +197,7 @@ def test_prepare_odm_to_other_crs_and_cells_keeps_heights(tmp_path):
 
 @pytest.mark.parametrize("make", [model, cloud])
 def test_prepare_odm_without_dsm_uses_mesh_or_points(make, tmp_path):
-    prepare(project(tmp_path, make), tmp_path / "out")
+    call("prepare", project(tmp_path, make), "-o", tmp_path / "out", "--workers", 1).expected(0)
     heights = read(tmp_path / "out" / "dsm.tif")
     x, y = centres(1.0)
     assert heights.shape == (SIDE, SIDE)

@@ -7,7 +7,7 @@ import pytest
 import rasterio
 from PIL import Image
 
-from flexroad.catalog import Catalog
+from flexroad.catalog import Catalog, CatalogError
 from flexroad.catalog.lazy import lazy
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
@@ -96,7 +96,7 @@ def test_prepare_photos_invalid_input_leaves_no_folder(tmp_path, monkeypatch, in
         "missing": "does not exist",
         "pipe": "9.jpg is not a file",
     }
-    with pytest.raises((TaskError, ConfigError), match=messages[invalid]):
+    with pytest.raises((CatalogError, TaskError, ConfigError), match=messages[invalid]):
         prepare([folder / "nowhere" if invalid == "missing" else folder], tmp_path / "out", PrepareOptions())
     assert not (tmp_path / "out").exists()
 

@@ -1,12 +1,14 @@
 """The user's roads are converted to a mask; invalid roads are an error of one line."""
 
+from pathlib import Path
+
 import geopandas
 import numpy as np
 import pytest
 import rasterio
 from shapely import LineString, Point, Polygon, box
 
-from flexroad.catalog import Catalog, Grid
+from flexroad.catalog import Catalog, CatalogError, Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import TaskError, memory
 from flexroad.tools.prepare.options import PrepareOptions
@@ -101,16 +103,16 @@ def test_burn_raster_larger_than_memory_raises_before_it_is_read(tmp_path, monke
 
 
 LAYERS = (
-    r"has 2 layers: ways \(LineString, 1 feature\), areas \(Polygon, 1 feature\); name one with --roads-layer"
+    r"has 2 layers: ways \(LineString, 1 feature\), areas \(Polygon, 1 feature\); name one, such as .*ways"
 )
 
 
-def published(folder, roads, **options):
+def published(folder, roads, layer="", **options):
     """The only tile of a flat area with these roads, and the notes."""
     with RasterWriter(folder, GRID, None, {}) as writer:
-        for layer in ("dsm", "dtm"):
-            writer.write(layer, GRID, np.zeros(GRID.shape))
-        has_mask = add_roads(writer, PrepareOptions(roads=roads, **options))
+        for name in ("dsm", "dtm"):
+            writer.write(name, GRID, np.zeros(GRID.shape))
+        has_mask = add_roads(writer, PrepareOptions(roads=Path(f"{roads}{layer}"), **options))
         dataset = writer.publish()
     (tile,) = Catalog.read(dataset.catalog, [roads.parent]).tiles
     assert has_mask == (tile.layer("road_mask") is not None)
@@ -121,15 +123,15 @@ def test_add_roads_lines_are_in_catalog_without_mask(tmp_path):
     shapes = [LineString([(400_000, 5_700_050), (400_080, 5_700_050)])]
     roads = write(tmp_path / "map.gpkg", shapes, layer="ways", kind=["road"])
     write(roads, [box(400_000, 5_700_000, 400_010, 5_700_100)], layer="areas")
-    tile, notes = published(tmp_path / "out", roads, roads_layer="ways", roads_where="kind = 'road'")
+    tile, notes = published(tmp_path / "out", roads, "|layername=ways", roads_where="kind = 'road'")
     assert tile.layer("road_mask") is None
     assert tile.paths(tile.layer("roads")) == (roads,)
     assert tile.layer("roads").sublayer == "ways"
     assert "segment: {method: vector, where: \"kind = 'road'\"}" in notes[0]
-    with pytest.raises(ConfigError, match=LAYERS):
+    with pytest.raises(CatalogError, match=LAYERS):
         published(tmp_path / "again", roads)
-    with pytest.raises(ConfigError, match="has no layer 'lanes'; it has ways"):
-        published(tmp_path / "again", roads, roads_layer="lanes")
+    with pytest.raises(CatalogError, match="has no layer 'lanes'; it has ways"):
+        published(tmp_path / "again", roads, "|layername=lanes")
 
 
 def test_add_roads_polygons_are_in_catalog_and_rasters_are_not(tmp_path):
@@ -152,7 +154,7 @@ def test_add_roads_polygons_are_in_catalog_and_rasters_are_not(tmp_path):
             lambda path: write(path, [box(5e5, 5e6, 5e5 + 9, 5e6 + 9)], crs="EPSG:4326"), None, None,
             "has the CRS EPSG:4326, but 500009 is no longitude; declare its CRS with ogr2ogr -a_srs",
         ),
-        (lambda path: write(path, [box(0, 0, 9, 9)]), "streets", None, "no layer 'streets'"),
+        (lambda path: write(path, [box(0, 0, 9, 9)]), "|layername=streets", None, "no layer 'streets'"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), None, "id = 7", "no feature where id = 7"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), None, "kind = 'road'", "--roads-where"),
     ],
@@ -160,8 +162,8 @@ def test_add_roads_polygons_are_in_catalog_and_rasters_are_not(tmp_path):
 def test_check_roads_without_usable_features_raises_one_line(tmp_path, make, layer, where, message):
     path = tmp_path / "roads.gpkg"
     make(path)
-    with pytest.raises(ConfigError, match=message) as caught:
-        check_roads(PrepareOptions(roads=path, roads_layer=layer, roads_where=where))
+    with pytest.raises((CatalogError, ConfigError), match=message) as caught:
+        check_roads(PrepareOptions(roads=Path(f"{path}{layer or ''}"), roads_where=where))
     assert "\n" not in str(caught.value)
     assert "roads" in str(caught.value)
 
@@ -192,9 +194,9 @@ def test_valid_roads_pass_the_check(tmp_path):
     check_roads(PrepareOptions(roads=tmp_path / "out" / "road_mask.tif"))
 
 
-@pytest.mark.parametrize("command", ["points", "mesh", "photos"])
-def test_prepare_checks_roads_before_it_reads_its_input(command, tmp_path):
-    broken = tmp_path / "input"
+@pytest.mark.parametrize("name", ["input.laz", "input.obj", "input.jpg"])
+def test_prepare_checks_roads_before_it_reads_its_input(name, tmp_path):
+    broken = tmp_path / name
     broken.write_text("nothing")
-    words = ("prepare", command, broken, "-o", tmp_path / "out", "--roads", tmp_path / "none.gpkg")
+    words = ("prepare", broken, "-o", tmp_path / "out", "--roads", tmp_path / "none.gpkg")
     assert call(*words).expected(2).errors == [f"error: --roads {tmp_path / 'none.gpkg'} does not exist"]

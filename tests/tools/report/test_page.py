@@ -17,8 +17,7 @@ from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import COLUMNS, METRICS, metrics_frame
-from flexroad.tasks.quality.assess import FLAGS, NO_ROAD
-from flexroad.tasks.quality.structures import STRUCTURE_FLAGS
+from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, STRUCTURE_FLAGS
 from flexroad.tools.report import _viewer_address, write_report
 from flexroad.tools.report.browser.figures import compare, histograms
 from flexroad.tools.report.browser.outcome import MEANINGS, headline, reasons, statements
@@ -81,22 +80,22 @@ def test_dropped_road_under_a_dsm_off_the_dtm_has_that_as_its_reason():
     row = {"flags": "dropped, inferred", "dropped_road": 1.0, "inferred_road": 0.6}
     notes = ("dsm resampled", "the DSM lies 47.0 m above the DTM: ellipsoidal heights?")
     dropped, inferred = reasons(row, {}, notes)
-    assert dropped.remedy == "the DSM lies 47.0 m above the DTM (ellipsoidal heights?)"
-    assert inferred.remedy == reasons(row, {})[1].remedy
+    assert dropped[1].endswith("; the DSM lies 47.0 m above the DTM (ellipsoidal heights?)")
+    assert inferred == reasons(row, {})[1]
 
 
 def test_reason_names_value_limit_place_and_remedy():
     (reason,) = reasons({"flags": "spike", "curvature_per_m": 0.31}, {"spike": (588612.4, 4519130.0)})
-    assert reason.line == (
-        "spike: the surface bends more than a road can (0.31 1/m, limit 0.2 1/m), at 588,612 / 4,519,130; "
-        "look at the mask there: it may reach over a wall, a roof or a bank"
+    assert reason == (
+        "spike",
+        "the surface bends more than a road can (0.31 1/m, limit 0.2 1/m), at 588,612 / 4,519,130; "
+        "look at the mask there: it may reach over a wall, a roof or a bank",
     )
-    (elsewhere,) = reasons({"flags": "dropped", "dropped_road": 0.75}, {})
-    assert elsewhere.line.startswith(
-        "dropped: the filter dropped 75% of the road mask (limit 50%); look whether"
-    )
+    ((flag, text),) = reasons({"flags": "dropped", "dropped_road": 0.75}, {})
+    assert flag == "dropped"
+    assert text.startswith("the filter dropped 75% of the road mask (limit 50%); look whether")
     assert reasons({"flags": np.nan}, {}) == []
-    assert reasons({"flags": "of-later-versions"}, {})[0].flag == "of-later-versions"
+    assert reasons({"flags": "of-later-versions"}, {})[0][0] == "of-later-versions"
 
 
 def test_outcome_names_states_causes_and_commands(run):
@@ -209,11 +208,13 @@ def test_comparison_with_itself_has_no_change_and_whole_triangles(run):
 
 def test_histogram_has_all_tiles_and_the_threshold():
     values = pd.Series([*np.linspace(0.01, 0.09, 50), 0.2, np.nan, 5.0])
-    (chart,) = histograms({"error_estimate_m": ("error estimate", "m", values)}, {"error_estimate_m": 0.1})
-    counted = [int(part.split(" tile")[0]) for part in chart.svg.split(": ")[1:]]
+    ((_, svg, line),) = histograms(
+        {"error_estimate_m": ("error estimate", "m", values)}, {"error_estimate_m": 0.1}
+    )
+    counted = [int(part.split(" tile")[0]) for part in svg.split(": ")[1:]]
     assert sum(counted) == 52
-    assert "flag above 0.1" in chart.svg
-    assert chart.line.endswith("52 tiles")
+    assert "flag above 0.1" in svg
+    assert line.endswith("52 tiles")
     assert list(histograms({"seconds": ("time", "s", pd.Series([1.0, 2.0]))}, {})) == []
 
 
@@ -239,10 +240,10 @@ def test_page_of_one_tile(tmp_path, made_survey):
 
 @pytest.mark.parametrize("flag", MEANINGS)
 def test_remedy_without_a_place_is_a_whole_sentence(flag):
-    (reason,) = reasons({"flags": flag}, {})
-    (placed,) = reasons({"flags": flag}, {flag: (1.0, 2.0)})
-    assert "{" not in reason.remedy + placed.remedy
-    assert not re.search(r"\b(if|whether) is\b|  | :", reason.remedy)
+    ((_, text),) = reasons({"flags": flag}, {})
+    ((_, placed),) = reasons({"flags": flag}, {flag: (1.0, 2.0)})
+    assert "{" not in text + placed
+    assert not re.search(r"\b(if|whether) is\b|  | :", text.partition("; ")[2])
 
 
 @pytest.mark.slow

@@ -13,7 +13,14 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import COLUMNS, metrics_frame, read_metrics
 from flexroad.tasks.quality.height_source import HeightSource
-from flexroad.tools.report.content import gather, held_out, highest_error_estimates, over_tiles
+from flexroad.tools.report.content import (
+    HELD_OUT,
+    WORST_ESTIMATES,
+    gather,
+    held_out,
+    highest_error_estimates,
+    over_tiles,
+)
 
 
 def rows(error_estimates, flags=()) -> pd.DataFrame:
@@ -68,7 +75,7 @@ def test_run_with_holdout_fits_twice_and_reports_its_squares(survey, tmp_path, e
     table = read_metrics(run.path)
     assert table.holdout_squares.sum() > 5
     assert table.holdout_error_m.dropna().between(0.001, 0.3).all()
-    assert gather(run).held_out["withheld squares"][0] == table.holdout_squares.sum()
+    assert gather(run).tables[HELD_OUT][0]["withheld squares"][0] == table.holdout_squares.sum()
 
 
 def test_tables_without_error_estimates_are_empty():
@@ -84,7 +91,7 @@ def test_gather_ranks_tiles_by_error_estimate(survey, quick_config, tmp_path):
     assert list(table.columns) == list(COLUMNS)
     shares = table[["measured_road", "dtm_road", "inferred_road"]].sum(axis=1)
     np.testing.assert_allclose(shares, 1)
-    worst = gather(run).worst_estimates
+    worst, _ = gather(run).tables[WORST_ESTIMATES]
     flexroad = table[table.variant == "flexroad"].set_index("tile_id")
     assert list(worst.tile) == list(flexroad.error_estimate_m.sort_values(ascending=False).index)
     # The exported map has the classes that the shares are counted on.

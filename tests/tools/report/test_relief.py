@@ -7,8 +7,7 @@ from PIL import Image
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.types import RoadMask
-from flexroad.tools.report.browser.relief import _square
-from flexroad.tools.report.pictures import webp
+from flexroad.tools.report.pictures import _square, webp
 
 CORE = Grid("EPSG:25832", 588_000.0, 5_519_250.0, 1.0, 250, 250)
 WIDE = Grid("EPSG:25832", 587_950.0, 5_519_300.0, 1.0, 350, 350)

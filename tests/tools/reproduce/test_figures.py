@@ -41,7 +41,13 @@ ABLATION = {
         "two_things": {"fit": {"degree": 2, "control_points": [8, 8]}},
     },
 }
-ROLES = tile_view.Roles("flexroad", "flat", "cells", "mixed", "bare")
+ROLES = {
+    "full": "flexroad",
+    "plane": "flat",
+    "rgt": "cells",
+    "wo_nurbs": "mixed",
+    "wo_ecsrc": "bare",
+}
 
 
 def finished_run(folder, raw, survey) -> Run:
@@ -77,9 +83,9 @@ def test_roles_of_renamed_variants_follow_from_options(run):
 
 
 def test_roles_of_shipped_configurations_are_complete():
-    assert tile_view.roles_of(load_config("paper")) == tile_view.Roles("flexroad", "plane", "rgt")
+    assert tile_view.roles_of(load_config("paper")) == {"full": "flexroad", "plane": "plane", "rgt": "rgt"}
     ablation = tile_view.roles_of(load_config("ablation"))
-    assert ablation == tile_view.Roles("flexroad", "plane", "rgt", "wo_nurbs", "wo_ecsrc")
+    assert ablation == {role: role for role in ROLES} | {"full": "flexroad"}
 
 
 def test_changes_lists_options_or_method(run):
@@ -102,17 +108,17 @@ def test_typical_tile_is_median_of_tiles_with_road():
 
 
 def test_maps_show_values_of_metrics_table(run, rows, tile, made_survey):
-    columns = {"Plane": "flat", "RGT": "cells", "FlexRoad": "flexroad"}
+    columns = {"Plane": "plane", "RGT": "rgt", "FlexRoad": "full"}
     figure = tile_figures.draw_maps(tile, columns)
     axes = np.array(figure.axes[:6]).reshape(2, 3)
-    for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
-        row = row_of(rows, tile, variant)
+    for (upper, lower), (label, role) in zip(axes.T, columns.items(), strict=True):
+        row = row_of(rows, tile, ROLES[role])
         error = upper.images[0].get_array()
         np.testing.assert_allclose(error[tile.street].mean(), row.l2_road_m, rtol=1e-9)
         np.testing.assert_allclose(error[~tile.street].mean(), row.l2_terrain_m, rtol=1e-9)
         angles = lower.collections[0].get_array()
         assert len(angles) == row.triangles
-        mesh = tile.results[variant].mesh
+        mesh = tile.results[role].mesh
         centroids = mesh.vertices[mesh.faces].mean(axis=1) + mesh.origin
         on_road = tile.street[tile.grid.cells(centroids[:, 0], centroids[:, 1])]
         if on_road.any() and not on_road.all():
@@ -134,7 +140,7 @@ def test_along_is_bilinear_and_nan_next_to_nan():
 
 
 def test_profile_shows_rasters_along_path(tile):
-    figure = tile_figures.road_profile(tile, ROLES).figure
+    figure = tile_figures.road_profile(tile)[1]
     path, *_ = next(axes for axes in figure.axes if axes.images).lines
     east, north = tile.grid.west + path.get_xdata(), tile.grid.south + path.get_ydata()
     row, col = tile.grid.cells(east, north)
@@ -142,7 +148,7 @@ def test_profile_shows_rasters_along_path(tile):
     heights, errors = (axes for axes in figure.axes if not axes.images)
     lines = {line.get_label(): line for line in heights.lines}
     # Heights are interpolated between cells, which is exact on a plane.
-    plane = tile.results["flat"].mesh
+    plane = tile.results["plane"].mesh
     fit = np.linalg.lstsq(np.c_[plane.vertices[:, :2], np.ones(len(plane.vertices))], plane.vertices[:, 2])[0]
     expected = fit @ np.array([east - plane.origin[0], north - plane.origin[1], np.ones(east.size)])
     assert len(plane.vertices) == 4
@@ -150,7 +156,7 @@ def test_profile_shows_rasters_along_path(tile):
     for line in errors.lines:
         whole = lines[line.get_label()].get_ydata()
         np.testing.assert_allclose(line.get_ydata(), whole - lines["reference surface"].get_ydata())
-    measured = tile_figures.road_profile(replace(tile, against="the DTM"), ROLES).figure
+    measured = tile_figures.road_profile(replace(tile, against="the DTM"))[1]
     assert "DTM" in [line.get_label() for axes in measured.axes for line in axes.lines]
 
 
@@ -201,10 +207,10 @@ def test_trajectory_on_tiny_road_is_empty_or_short(cells):
 
 
 def test_vertex_colours_match_error_below(tile):
-    colours = tile_figures.vertex_colours(tile, "cells")
-    mesh = tile.results["cells"].mesh
+    colours = tile_figures.vertex_colours(tile, "rgt")
+    mesh = tile.results["rgt"].mesh
     row, col = tile.grid.cells(mesh.vertices[:, 0] + mesh.origin[0], mesh.vertices[:, 1] + mesh.origin[1])
-    error = tile.error("cells")[row, col]
+    error = tile.error("rgt")[row, col]
     colour = colormaps[tile_figures.ERROR_COLOURS]
     worst = np.argmax(error)
     assert tuple(colours[worst]) == colour(tile_figures.ERROR_NORM(error[worst]), bytes=True)[:3]
@@ -229,7 +235,7 @@ def test_busiest_is_square_with_most_dropped_cells():
 
 
 def test_trade_off_shows_means_of_metrics_table(run, rows):
-    figure = figures.trade_off(run.config, "flexroad", rows).figure
+    figure = figures.trade_off(run.config, "flexroad", rows)[1]
     expected = {
         "Control grid": ["coarse", "flexroad", "fine"],
         "Degree p = q": ["quadratic", "flexroad"],
@@ -350,14 +356,13 @@ def test_write_figures_leaves_out_tiles_with_failed_variant(made_survey, tmp_pat
         figures.write_figures(part, tmp_path / "out")
 
 
-def test_write_figures_unknown_tile_or_variant_raises(run, tmp_path):
+def test_write_figures_unknown_tile_raises(run, tmp_path):
     with pytest.raises(CatalogError, match="0_0"):
         figures.write_figures(run, tmp_path, "0_0")
-    with pytest.raises(ConfigError, match="no variant 'nobody'"):
-        figures.write_figures(run, tmp_path, roles=tile_view.Roles("flexroad", plane="nobody"))
 
 
+@pytest.mark.usefixtures("quick_renders")
 def test_write_figures_leaves_run_unchanged(run, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*")}
-    figures.write_figures(run, tmp_path, roles=tile_view.Roles("flexroad"))
+    figures.write_figures(run, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} == before

@@ -5,10 +5,9 @@ from dataclasses import replace
 import pandas as pd
 
 from flexroad.tools.report.content import FIGURES
-from flexroad.tools.reproduce.comparison import compare
 from flexroad.tools.reproduce.metrics_data import FIGURE_DTYPE, MetricsData, write_metrics_data
 from flexroad.tools.reproduce.published import TABLE_I, TABLE_II, published
-from flexroad.tools.reproduce.tables import pages
+from flexroad.tools.reproduce.tables import compare, pages
 from tests.stored_metrics import read_metrics_data
 
 VARIANTS = [row.variant for row in (*TABLE_II, *TABLE_I[:2])]
@@ -33,14 +32,14 @@ def test_compare_with_literal_run_adds_column_and_factors():
     # Ours differs on tiles that the literal run lacks: these do not count.
     data.rows.loc[(data.rows.tile_id == "t3") & (data.rows.variant == "wo_dtm"), "l2_road_m"] *= 100
     comparison = compare(replace(data, literal=literal))
-    sections = {section.title: section for section in comparison.sections}
-    table = sections["Table II: L2"].table.set_index("variant")
+    sections = {title: (table, line) for title, table, line in comparison.sections}
+    table = sections["Table II: L2"][0].set_index("variant")
     assert table.at["w/o DTM Support", "L2 road (m), literal (2 tiles)"].startswith("9.344 [")
-    factors = sections["Table II: factors from the paper"].table.set_index("variant")
+    factors = sections["Table II: factors from the paper"][0].set_index("variant")
     # Two of the row's four figures are 16 times the paper's: the mean factor is 16 to the power of a half.
     assert factors.loc["w/o DTM Support"].tolist() == ["1.00", "4.00", "1.00", "4.00"]
     assert factors.at["all", "figures, literal"] == f"{4 ** (1 / 19):.2f}"
-    assert "2 tiles" in sections["Table II: factors from the paper"].line
+    assert "2 tiles" in sections["Table II: factors from the paper"][1]
     assert comparison.numbers.data.str.endswith("; read literally").sum() == (3 + 19) * len(FIGURES)
 
 

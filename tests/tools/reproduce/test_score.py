@@ -5,9 +5,9 @@ import pandas as pd
 from flexroad.pipeline.config.loading import load_config
 from flexroad.tools.report.content import FIGURES
 from flexroad.tools.reproduce.claims import NOT_DECIDED
-from flexroad.tools.reproduce.comparison import compare
 from flexroad.tools.reproduce.metrics_data import MetricsData
 from flexroad.tools.reproduce.published import published
+from flexroad.tools.reproduce.tables import compare
 
 VARIANTS = list(load_config("ablation").chains)
 
@@ -26,7 +26,7 @@ def as_published(tiles: int = 3, classes: str = "segmented") -> MetricsData:
 
 def score(data: MetricsData) -> dict[str, pd.DataFrame]:
     """Return the tables that score the changes of Table II, by their titles."""
-    return {section.title: section.table for section in compare(data).sections if "change" in section.title}
+    return {title: table for title, table, _ in compare(data).sections if "change" in title}
 
 
 def test_compare_published_figures_score_all_changes_within():

@@ -30,10 +30,9 @@ from flexroad.tools.reproduce.claims import (
     check,
     percent,
 )
-from flexroad.tools.reproduce.comparison import compare
 from flexroad.tools.reproduce.metrics_data import FIGURE_DTYPE, MetricsData, collect, write_metrics_data
 from flexroad.tools.reproduce.published import TABLE_I_DSC3D, TABLE_II, Claim, published
-from flexroad.tools.reproduce.tables import pages, write_comparison
+from flexroad.tools.reproduce.tables import compare, pages, write_comparison
 from tests.stored_metrics import read_metrics_data
 
 VARIANTS = list(load_config("ablation").chains)
@@ -176,13 +175,13 @@ def test_compare_flexroad_alone_raises():
 
 def test_compare_main_variants_alone_has_no_table_ii():
     rows = as_published().rows
-    titles = [s.title for s in compare(MetricsData(rows[rows.variant.isin(VARIANTS[:3])])).sections]
+    titles = [title for title, _, _ in compare(MetricsData(rows[rows.variant.isin(VARIANTS[:3])])).sections]
     assert "Table I: L2" in titles
     assert not any("Table II" in title for title in titles)
 
 
 def test_compare_table_of_changes_matches_the_papers_text():
-    table = next(s.table for s in compare(as_published()).sections if "changes" in s.title)
+    table = next(table for title, table, _ in compare(as_published()).sections if "changes" in title)
     without = table[table.variant == "w/o ECSRC"].iloc[0]
     assert (without["L2 road, paper"], without["MAD road, ours"]) == ("+111%", "+135%")
     assert len(table) == len(TABLE_II) - 1
@@ -192,7 +191,7 @@ def test_compare_adds_one_table_per_stratum():
     data = as_published(3)
     rural = (data.rows.stratum == "rural") & (data.rows.variant == "rgt")
     data.rows.loc[rural, "l2_road_m"] = 9.0
-    tables = {s.title: s.table for s in compare(data).sections}
+    tables = {title: table for title, table, _ in compare(data).sections}
     assert tables["Our figures, rural: 1 tile"]["L2 road (m)"][1] == "9.000"
     assert tables["Our figures, urban: 2 tiles"]["L2 road (m)"][1] == "0.415"
 
@@ -397,15 +396,15 @@ def stand_in(dataset: str, factor: float = 1.0) -> MetricsData:
 def test_compare_with_stand_in_adds_dsc3d_tables_and_claims():
     data = replace(as_published(), dsc3d=(stand_in(CIRCULAR), stand_in(TRUTH, factor=3.0)))
     comparison = compare(data)
-    sections = {section.title: section for section in comparison.sections}
-    table = sections["Table I, DSC3D rows (synthetic stand-in): L2"].table.set_index("variant")
+    sections = {title: (table, line) for title, table, line in comparison.sections}
+    table = sections["Table I, DSC3D rows (synthetic stand-in): L2"][0].set_index("variant")
     assert table.at["FlexRoad", "L2 road (m), ours (circular)"].startswith("0.106 [")
     assert table.at["FlexRoad", "L2 road (m), ours (true)"].startswith("0.318 [")
-    claims = sections["The paper's claims about DSC3D (synthetic stand-in)"]
-    assert list(claims.table.verdict) == [HELD] * 4
-    assert list(claims.table["verdict, true"]) == [NOT_HELD, HELD, HELD, HELD]
-    assert CIRCULAR in claims.line
-    assert TRUTH in claims.line
+    claims, line = sections["The paper's claims about DSC3D (synthetic stand-in)"]
+    assert list(claims.verdict) == [HELD] * 4
+    assert list(claims["verdict, true"]) == [NOT_HELD, HELD, HELD, HELD]
+    assert CIRCULAR in line
+    assert TRUTH in line
     # The main claims are about GeRoD, and all of them are tested.
     assert "36 claims about GeRoD: 36 held" in " ".join(comparison.notes)
     assert not (comparison.claims.verdict == NOT_TESTED).any()
@@ -432,7 +431,7 @@ def test_pages_with_stand_in_name_its_data(tmp_path):
 
 def test_compare_with_dsc3d_itself_has_no_stand_in():
     comparison = compare(replace(as_published(), dsc3d=(stand_in("DSC3D"),)))
-    titles = [section.title for section in comparison.sections]
+    titles = [title for title, _, _ in comparison.sections]
     assert "Table I, DSC3D rows: L2" in titles
     assert not any("stand-in" in text for text in (*titles, *comparison.notes))
 

@@ -283,7 +283,7 @@ def test_query_of_csv_in_another_encoding_gives_one_error(run, flexroad, tmp_pat
         ("--line", [Point(0, 0)], UTM, "", "type Point, not lines; points go to --points"),
         ("--points", [Point(0, 0)], None, "", "carries no CRS; give it with --crs"),
         ("--points", [Point(0, 0)], UTM, "--crs EPSG:4326", "is in EPSG:25832, not EPSG:4326"),
-        ("--points", [Point(0, 0)], UTM, "--layer b", "no layer 'b'; it has points"),
+        ("--points", [Point(0, 0)], UTM, "|layername=b", "no layer 'b'; it has points"),
         ("--line", [LineString([(0, 0), (0, 0)])], UTM, "", "has no length"),
         ("--line", [LineString([(200, 95), (201, 96)])], "EPSG:4326", "", "cannot be transformed"),
         ("--line", [LineString([(0, 0), (9e9, 1)])], UTM, "", "at most 10000000"),
@@ -295,7 +295,8 @@ def test_query_of_unusable_features_gives_one_error(
 ):
     path = tmp_path / "points.gpkg"
     geopandas.GeoDataFrame(geometry=shapes, crs=crs).to_file(path)
-    said = flexroad("query", run, option, path, *words.split()).expected(2)
+    layer = words if words.startswith("|") else ""
+    said = flexroad("query", run, option, f"{path}{layer}", *words.removeprefix(layer).split()).expected(2)
     assert message in said.err
     assert said.err.count("\n") == 1
 
@@ -305,8 +306,9 @@ def test_query_of_geopackage_with_layers_names_them(run, flexroad, tmp_path):
     for layer, shift in (("old", 1.0), ("new", 0.0)):
         frame = geopandas.GeoDataFrame(geometry=[Point(*point + shift) for point in POINTS], crs=UTM)
         frame.to_file(path, layer=layer)
-    assert "has the layers old, new; name one with --layer" in flexroad("query", run, "--points", path).err
-    assert_truth(answer(flexroad("query", run, "--points", path, "--layer", "new")))
+    example = f"name one, such as '{path}|layername=old'"
+    assert example in flexroad("query", run, "--points", path).expected(2).err
+    assert_truth(answer(flexroad("query", run, "--points", f"{path}|layername=new")))
 
 
 def test_query_of_vector_file_that_leads_elsewhere_is_refused(run, flexroad, tmp_path):

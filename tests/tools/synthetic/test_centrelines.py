@@ -5,7 +5,7 @@ import shapely
 from flexroad.catalog import Grid
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tools.synthetic import SceneOptions, make_scene
-from flexroad.tools.synthetic.centrelines import centre_lines
+from flexroad.tools.synthetic.scene import centre_lines
 
 GRID = Grid("EPSG:25832", 295500, 5629500, 1.0, 200, 200)
 

@@ -8,9 +8,17 @@ from flexroad.catalog.grid import Grid
 from flexroad.tools.prepare.mesh.sample import orthophoto as mesh_orthophoto
 from flexroad.tools.prepare.mesh.sample import project_down
 from flexroad.tools.synthetic import Kind
-from flexroad.tools.synthetic.dsc3d import SITES, SIZE_M, survey
+from flexroad.tools.synthetic.dsc3d import (
+    BUMPS_M,
+    FRAGMENTS,
+    GSD_M,
+    MELT_M,
+    SITES,
+    SIZE_M,
+    photogrammetry,
+    survey,
+)
 from flexroad.tools.synthetic.orthophoto import orthophoto
-from flexroad.tools.synthetic.photogrammetry import GSD_M, photogrammetry
 
 SEED = 3
 
@@ -68,15 +76,15 @@ def test_mesh_fills_square_with_requested_triangles(scene, place):
 
 @pytest.mark.slow
 def test_mesh_away_from_faults_is_surface_plus_bumps(scene, place, height):
-    faults, surface, made = place.site.faults, scene.surface.dsm, scene.reconstruction
-    far = round(4 * faults.melt_m / scene.surface.grid.cell)
+    surface, made = scene.surface.dsm, scene.reconstruction
+    far = round(4 * MELT_M / scene.surface.grid.cell)
     free = ndimage.maximum_filter(surface - scene.surface.reference, 2 * far + 1) < 0.05
     intact = free & ~ndimage.binary_dilation(made.open | made.bridged, iterations=far)
     error = (height - surface)[intact & np.isfinite(height)]
     assert error.size > 5_000
     # The best 90%: a few fragments float above.
     kept = np.sort(np.abs(error))[: int(0.9 * error.size)]
-    assert 0.3 * faults.bumps_m < np.sqrt(np.mean(kept**2)) < 1.2 * faults.bumps_m
+    assert 0.3 * BUMPS_M < np.sqrt(np.mean(kept**2)) < 1.2 * BUMPS_M
     assert abs(np.median(error)) < 0.02
     # Bumps are longer than a cell, unlike noise.
     bumps = np.where(intact, made.height - surface, 0.0)
@@ -132,7 +140,7 @@ def test_reconstruct_holes_are_open_or_bridged(scene, height):
 
 @pytest.mark.slow
 def test_mesh_fragments_float_above_surface(scene, place):
-    pieces = place.site.faults.fragments
+    pieces = FRAGMENTS
     count = 8 * pieces
     floating = scene.mesh.vertices[-count:].reshape(pieces, 8, 3)
     cells = scene.surface.grid.cells(floating[:, 0, 0], floating[:, 0, 1])

@@ -120,21 +120,6 @@ def test_write_tile_failed_keeps_old_file(tmp_path):
     assert (tmp_path / "dsm" / "a.tif").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("tile_id", "layers", "line"),
-    [
-        ("a/b", {}, r"'a/b' is not a valid file name.*slashes"),
-        ("", {}, "'' is not a valid file name"),
-        ("a", {"dem": heights()}, "no layer 'dem'.*layers are dsm, dtm"),
-        ("a", {"dsm": heights()[:-1]}, r"dsm of tile a is \(19, 25\), but its grid is \(20, 25\)"),
-    ],
-)
-def test_write_tile_invalid_input_writes_nothing(tmp_path, tile_id, layers, line):
-    with pytest.raises(CatalogError, match=line):
-        write_tile(tmp_path, tile_id, GRID, {"dtm": heights(), **layers})
-    assert not list(tmp_path.iterdir())
-
-
 def photo(rows: int = 40, columns: int = 50) -> np.ndarray:
     return np.random.default_rng(2).integers(0, 256, (3, rows, columns), dtype=np.uint8)
 
@@ -155,12 +140,6 @@ def test_write_tile_photo_with_odd_pixel_size_fits(tmp_path):
     tile = write_tile(tmp_path, "a", GRID, {"dsm": heights(), "dop": photo(28, 35)})
     with rasterio.open(tile.paths(tile.layer("dop"))[0]) as file:
         assert file.bounds == pytest.approx(GRID.bounds)
-
-
-@pytest.mark.parametrize("wrong", [photo()[0], photo()[:2], photo().astype(float), photo(40, 40)])
-def test_write_tile_invalid_photo_raises_error(tmp_path, wrong):
-    with pytest.raises(CatalogError, match="layer dop of tile a is .* over 25 x 20 cells"):
-        write_tile(tmp_path, "a", GRID, {"dop": wrong})
 
 
 def block(folder, names, size=60, gap=0.0, **options):

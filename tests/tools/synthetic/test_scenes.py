@@ -1,4 +1,3 @@
-import re
 from pathlib import Path
 
 import geopandas
@@ -15,7 +14,7 @@ from flexroad.tools.synthetic import make_scene
 from flexroad.tools.synthetic.crossings import Crossings, make_crossings
 from flexroad.tools.synthetic.dsc3d import survey as survey_of_scenes
 from flexroad.tools.synthetic.gerod import survey
-from flexroad.tools.synthetic.prepared import HEIGHTS, MASKS, PHOTO
+from flexroad.tools.synthetic.prepared import HEIGHTS
 from flexroad.tools.synthetic.scenes import write_scenes
 
 
@@ -72,8 +71,6 @@ def test_write_scenes_roads_are_true_and_repeatable(benchmark, tmp_path):
 
 
 def test_write_scenes_invalid_preset_options_raise(tmp_path):
-    with pytest.raises(ConfigError, match=re.escape("--preset paper: unknown, there are gerod, dsc3d")):
-        write_scenes(tmp_path, 1, seed=0, preset="paper")
     with pytest.raises(ConfigError, match="--tile-size 60: tiles of gerod have 250 m; leave --tile-size out"):
         write_scenes(tmp_path, 1, seed=0, size_m=60, preset="gerod")
     with pytest.raises(ConfigError, match="--tile-size 60: tiles of dsc3d have 150 m; leave --tile-size out"):
@@ -103,7 +100,7 @@ def test_stand_in_catalogs_share_layers_of_prepare_mesh(scene):
     circular, true = scene
     assert circular.id == true.id == survey_of_scenes(1, 4)[0].site.name
     assert circular.grid == true.grid == survey_of_scenes(1, 4)[0].grid
-    assert {layer.name for layer in circular.layers} == {*HEIGHTS, *MASKS, PHOTO}
+    assert {layer.name for layer in circular.layers} == {*HEIGHTS, "road_mask", "reference_road", "dop"}
     prefix = "synthetic photogrammetry, stand-in for DSC3D, seed 4; "
     assert circular.dataset == prefix + "reference by ECSRC itself (circular)"
     assert true.dataset == prefix + "true reference"

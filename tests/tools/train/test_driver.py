@@ -18,8 +18,7 @@ from flexroad.tasks import load
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.segment.dinov2 import segment
 from flexroad.tools.synthetic.scenes import write_scenes
-from flexroad.tools.train.driver import LabelledTiles, Samples, TrainOptions, train
-from flexroad.tools.train.spatial_split import inside, split
+from flexroad.tools.train.driver import LabelledTiles, TrainOptions, inside, samples, split, train
 from tests.command_line import call
 from tests.make_backbone import save_backbone
 from tests.pipeline.cli.test_main import flexroad
@@ -144,7 +143,7 @@ def test_training_samples_keep_off_edges_and_validation_tiles(land):
     catalog = Catalog.read(land)
     blocks = [block for tile in catalog.tiles for block in tiles.blocks(tile, [tile.grid.bounds])]
     sides = split(blocks, 0.3, 30.0, 0)
-    for sample in Samples(tiles, sides, "train"):
+    for sample in samples(tiles, sides.train, sides.training_cells):
         grid = sample.data.grid
         assert sample.labelled.any()
         assert not (sample.labelled & ~inside(grid, sample.data.core.bounds)).any()

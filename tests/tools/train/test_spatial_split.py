@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.errors import ConfigError
-from flexroad.tools.train.spatial_split import Block, inside, split, split_tile
+from flexroad.tools.train.driver import Block, inside, split, split_tile
 
 
 def make_block(col, row, road=10, ground=10, size=100):

@@ -136,7 +136,7 @@ def test_interrupted_writing_leaves_no_page(city, folder, tmp_path, monkeypatch)
     write_viewer(Run.open(city), tmp_path, SerialExecutor())
     assert (tmp_path / PAGE).exists()
 
-    def fails(*_):
+    def fails(*_, **__):
         raise OSError("disk full")
 
     monkeypatch.setattr(viewer, "write_outputs", fails)

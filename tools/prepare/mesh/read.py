@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import FARTHEST
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.scan.inputs import MESHES
 from flexroad.catalog.text import access_reason
 from flexroad.tasks import memory
 from flexroad.tasks.errors import TaskError
@@ -30,7 +31,6 @@ from flexroad.tools.prepare.mesh.textures import FACTOR, Beside, Textures
 
 trimesh = lazy("trimesh")
 
-SUFFIXES = (".obj", ".ply", ".glb", ".gltf")
 UPRIGHT = 2.0
 """Limit of side area to plan area; above it the upward axis of the mesh is wrong."""
 AXES = "xyz"
@@ -84,9 +84,7 @@ def read_mesh(
             raise resolver.refused
         parts = list(_parts(path, scene, Textures(path) if colours else None))
     if not parts:
-        raise TaskError(
-            f"{path} has no faces; export a mesh, or use its points: prepare points", file=str(path)
-        )
+        raise TaskError(f"{path} has no faces; export a mesh, or its points as LAS or LAZ", file=str(path))
     vertices = np.concatenate([part.vertices for part in parts])
     if (up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")) == "y":
         # Rotated, so that faces keep their orientation.
@@ -124,9 +122,9 @@ def _errors(path: Path, resolver: Beside) -> Iterator[None]:
 
 def _scene(path: Path, resolver: Beside) -> Any:
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
+    if suffix not in MESHES:
         raise TaskError(
-            f"{path} is not a mesh of a supported format ({', '.join(SUFFIXES)}); convert it", file=str(path)
+            f"{path} is not a mesh of a supported format ({', '.join(MESHES)}); convert it", file=str(path)
         )
     if not path.is_file():
         raise TaskError(f"{path} does not exist, or is not a file", file=str(path))

@@ -104,20 +104,13 @@ def _line(table: TileTable, before: pd.DataFrame, name: str) -> str:
     return f"Compared with {name}: {', '.join(parts)}."
 
 
-@dataclass(frozen=True)
-class _Histogram:
-    """One chart."""
-
-    title: str
-    svg: Markup
-    line: str
-    """Median, 95th percentile and number of tiles in words."""
-
-
 def histograms(
     columns: dict[str, tuple[str, str, pd.Series]], limits: dict[str, float]
-) -> Iterator[_Histogram]:
-    """Yield histograms of the main columns (label, unit, values); ``limits`` are the flags' thresholds."""
+) -> Iterator[tuple[str, Markup, str]]:
+    """Yield title, chart and description of the main columns (label, unit, values).
+
+    - `limits`: the flags' thresholds.
+    """
     shown = 0
     for name in SHOWN:
         if name not in columns or shown == MOST:
@@ -129,7 +122,7 @@ def histograms(
             continue
         shown += 1
         median, high = np.percentile(values, [50, 95])
-        yield _Histogram(
+        yield (
             f"{label} ({unit})" if unit else label,
             _svg(values, limits.get(name), label),
             f"median {short(median)}, 95% below {short(high)}; {count(len(values), 'tile')}",

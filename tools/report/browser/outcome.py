@@ -7,18 +7,25 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
 from flexroad.catalog.text import count, printable
 from flexroad.tasks.io.dsm_and_dtm import is_offset
-from flexroad.tasks.quality.assess import FLAGS, LIMITS, NO_ROAD
+from flexroad.tasks.quality.assess import (
+    BELOW,
+    FLAGS,
+    LEAST_RISE_M,
+    LIMITS,
+    NO_ABUTMENT,
+    NO_RISE,
+    NO_ROAD,
+)
 from flexroad.tasks.quality.flagged import Place
-from flexroad.tasks.quality.structures import BELOW, LEAST_RISE_M, NO_ABUTMENT, NO_RISE
 from flexroad.tools.report.browser.tiles import STATES, TileTable, short
-from flexroad.tools.report.content import Content
+from flexroad.tools.report.content import MESHES, STEPS, Content
 
 OF_HEIGHTS = ("dropped", NO_ROAD)
 """Flags that a DSM far from the DTM gives."""
@@ -104,26 +111,10 @@ MEANINGS = {
 """Meaning of each flag."""
 
 
-@dataclass(frozen=True)
-class Reason:
-    """One flag of one tile in words."""
-
-    flag: str
-    words: str
-    """What is wrong, with the value and the limit."""
-    place: Place | None
-    """Where to look (easting, northing, m); None if it concerns the complete tile or is not known."""
-    remedy: str
-
-    @property
-    def line(self) -> str:
-        """All in one line."""
-        at = f", at {coordinates(*self.place)}" if self.place else ""
-        return f"{self.flag}: {self.words}{at}; {self.remedy}"
-
-
-def reasons(row: Mapping[str, Any], places: Mapping[str, Place], notes: Sequence[str] = ()) -> list[Reason]:
-    """Return a tile's flags in words.
+def reasons(
+    row: Mapping[str, Any], places: Mapping[str, Place], notes: Sequence[str] = ()
+) -> list[tuple[str, str]]:
+    """Return a tile's flags, each with what is wrong, where, and what to do.
 
     - `row`: the tile's row of metrics.parquet.
     - `places`: place of each flag, as far as known (`flexroad.tasks.quality.flagged.places`).
@@ -132,25 +123,24 @@ def reasons(row: Mapping[str, Any], places: Mapping[str, Place], notes: Sequence
     """
     given = row.get("flags")
     names = given.split(", ") if isinstance(given, str) and given else []
-    found = [_reason(name, row, places) for name in names]
-    offset = next(filter(is_offset, notes), None)
-    if offset is None:
-        return found
-    what, _, cause = offset.partition(": ")
-    return [replace(one, remedy=f"{what} ({cause})") if one.flag in OF_HEIGHTS else one for one in found]
+    what, _, cause = next(filter(is_offset, notes), "").partition(": ")
+    offset = f"{what} ({cause})" if what else ""
+    return [
+        (name, _reason(name, row, places.get(name), offset if name in OF_HEIGHTS else "")) for name in names
+    ]
 
 
-def _reason(name: str, row: Mapping[str, Any], places: Mapping[str, Place]) -> Reason:
+def _reason(name: str, row: Mapping[str, Any], place: Place | None, remedy: str) -> str:
     meaning = MEANINGS.get(name)
     if meaning is None:
         # A run of another version may have flags of its own.
-        return Reason(name, "docs/quality.md explains this flag", None, "look at the tile")
+        return "docs/quality.md explains this flag; look at the tile"
     column = FLAGS.get(name)
     value = row.get(column) if column else None
     limit = _number(LIMITS.get(name), meaning.percent)
     words = meaning.words.format(value=_number(value, meaning.percent), limit=limit)
-    place = places.get(name)
-    return Reason(name, words, place, meaning.remedy.format(there=" there" if place else ""))
+    at = f", at {coordinates(*place)}" if place else ""
+    return f"{words}{at}; {remedy or meaning.remedy.format(there=' there' if place else '')}"
 
 
 def described() -> dict[str, dict[str, Any]]:
@@ -311,16 +301,17 @@ def _without_roads(number: int) -> Iterator[_Statement]:
 
 def _surfaces(content: Content) -> Iterator[_Statement]:
     """Say whether neighbouring tiles meet and meshes have no fault."""
-    steps = content.steps.check
+    steps, _ = content.tables[STEPS]
     own = steps[steps.variant == content.variant] if len(steps) else steps
     if len(own):
         row = own.iloc[0]
         bad = str(row.result).startswith("error")
         text = f"Neighbouring tiles ({count(int(row.edges), 'common edge')}): {row.result}."
         yield _Statement("failed" if bad else "good", text)
-    meshes = content.meshes[content.meshes.method == content.variant]
-    if len(meshes):
-        row = meshes.iloc[0]
+    meshes, _ = content.tables[MESHES]
+    own = meshes[meshes.method == content.variant]
+    if len(own):
+        row = own.iloc[0]
         bad = bool(row["meshes with faults"])
         text = f"Meshes: {count(int(row.meshes), 'mesh').replace('meshs', 'meshes')} checked, {row.result}."
         yield _Statement("failed" if bad else "good", text)

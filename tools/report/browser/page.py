@@ -6,7 +6,6 @@ import base64
 import hashlib
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -21,9 +20,9 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.tasks.quality.assess import FLAGS, LIMITS
 from flexroad.tools.report.browser.figures import Comparison, compare, histograms
-from flexroad.tools.report.browser.outcome import Reason, cards, described, headline, reasons, statements
-from flexroad.tools.report.browser.relief import relief
+from flexroad.tools.report.browser.outcome import cards, described, headline, reasons, statements
 from flexroad.tools.report.browser.tiles import (
+    LABELS,
     TileTable,
     as_script,
     errors,
@@ -31,9 +30,9 @@ from flexroad.tools.report.browser.tiles import (
     numeric_columns,
     tile_table,
 )
-from flexroad.tools.report.content import ESTIMATE_MEANING, WORST, Content
-from flexroad.tools.report.pages import MAIN, WORST_ESTIMATES, TilePictures, sections, template
-from flexroad.tools.report.pictures import tile_pictures
+from flexroad.tools.report.content import ESTIMATE_MEANING, MAIN, WORST, WORST_ESTIMATES, Content
+from flexroad.tools.report.pages import TilePictures, sections, template
+from flexroad.tools.report.pictures import relief, tile_pictures
 
 pyproj = lazy("pyproj")
 
@@ -43,33 +42,6 @@ SCRIPT = HERE.resolve().parents[2] / "viewer" / "dist" / "report" / "page.js"
 NAMED = 5
 """Tiles without a position that are named."""
 ESTIMATE, TRUE_ERROR = "error_estimate_m", "l2_road_m"
-
-
-@dataclass(frozen=True, eq=False)
-class _Look:
-    """A tile to look at."""
-
-    tile_id: str
-    number: int
-    """Its position in the catalog."""
-    figure: str
-    """The figure by which it is ranked, in words."""
-    reasons: list[Reason]
-    tile: TilePictures | None
-    """Its pictures; None if there are none."""
-    view: str
-    """Address of the tile in the 3D viewer; empty without one."""
-
-    @property
-    def pair(self) -> tuple[tuple[str, bytes], ...]:
-        """The two most telling pictures: the first and the last."""
-        pictures = () if self.tile is None else self.tile.pictures
-        return tuple(dict.fromkeys((*pictures[:1], *pictures[-1:])))
-
-    @property
-    def more(self) -> tuple[tuple[str, bytes], ...]:
-        """The other pictures."""
-        return () if self.tile is None else self.tile.pictures[1:-1]
 
 
 def html_page(
@@ -97,6 +69,7 @@ def html_page(
     script = SCRIPT.read_text(encoding="utf-8")
     return template("page.html.j2", HERE).render(
         content=content,
+        main=content.tables[MAIN][0],
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
         script=Markup(script),
         script_hash=f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}",
@@ -109,7 +82,7 @@ def html_page(
         relief=background.webp if background else None,
         charts=list(histograms(numeric_columns(table), _limits())),
         comparison=comparison,
-        looks=[_look(name, table, numbers, pictures, viewer) for name in first],
+        looks=[_look(name, table, numbers[name], pictures.get(name), viewer) for name in first],
         ranked_by=ranked_by,
         meaning=ESTIMATE_MEANING.replace("`", ""),
         viewer=viewer,
@@ -157,30 +130,33 @@ def _data(
 
 def _limits() -> dict[str, float]:
     """Return the thresholds of the flags by column, in the unit of the page."""
-    shares = {"off_dtm_road", "inferred_road", "dropped_road", "bounded_weights"}
-    return {name: LIMITS[flag] * (100 if name in shares else 1) for flag, name in FLAGS.items()}
+    return {name: LIMITS[flag] * (100 if LABELS[name][1] == "%" else 1) for flag, name in FLAGS.items()}
 
 
 def _look(
     name: str,
     table: TileTable,
-    numbers: Mapping[str, int],
-    pictures: Mapping[str, TilePictures],
+    number: int,
+    found: TilePictures | None,
     viewer: str,
-) -> _Look:
+) -> dict[str, Any]:
+    """Return what the page shows of a tile to look at."""
     row: dict[str, Any] = dict(table.frame.loc[name])
-    found = pictures.get(name)
     estimate, true = row[ESTIMATE], row[TRUE_ERROR]
     parts = [f"Error estimate {estimate:.2g} m"] if np.isfinite(estimate) else []
     parts += [f"road error (L2) {true:.2g} m"] if np.isfinite(true) else []
-    return _Look(
-        name,
-        numbers[name],
-        f"{'; '.join(parts)}.",
-        reasons(row, found.places if found else {}, found.notes if found else ()),
-        found,
-        f"{viewer}#tile={quote(name, safe='')}" if viewer else "",
-    )
+    pictures = found.pictures if found else ()
+    return {
+        "tile_id": name,
+        "number": number,
+        "figure": f"{'; '.join(parts)}.",
+        "reasons": reasons(row, found.places if found else {}, found.notes if found else ()),
+        # The first picture and the last are the most telling.
+        "pair": tuple(dict.fromkeys((*pictures[:1], *pictures[-1:]))),
+        "more": pictures[1:-1],
+        "notes": found.notes if found else (),
+        "view": f"{viewer}#tile={quote(name, safe='')}" if viewer else "",
+    }
 
 
 def _crs_name(crs: str) -> str:

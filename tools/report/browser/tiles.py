@@ -18,8 +18,7 @@ from flexroad.catalog import Tile
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import printable
 from flexroad.pipeline.store.records import needs_look
-from flexroad.tasks.quality.assess import FLAGS, NO_ROAD
-from flexroad.tasks.quality.structures import STRUCTURE_FLAGS
+from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, STRUCTURE_FLAGS
 from flexroad.tools.report.content import Content
 
 pyproj = lazy("pyproj")

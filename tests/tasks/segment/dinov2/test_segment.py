@@ -22,7 +22,7 @@ from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
 from flexroad.tasks.segment.dinov2.segment import Options, files, segment
 from flexroad.tasks.types import TileData
 from flexroad.tools.train import fit_head as training
-from flexroad.tools.train.fit_head import THRESHOLDS, Labels, Line, Sample, Windows, at_cells, best_threshold
+from flexroad.tools.train.fit_head import THRESHOLDS, Sample, Windows, at_cells, best_threshold
 from tests.gpu import needs_gpu
 from tests.make_backbone import save_backbone
 
@@ -55,7 +55,7 @@ def train_options(folder: Path, **options) -> training.Options:
 def model(backbones, sample, tmp_path_factory) -> Path:
     """A head trained on the sample tile."""
     path = tmp_path_factory.mktemp("heads") / "head.safetensors"
-    path.write_bytes(training.train([sample], [sample], train_options(backbones[0])).model)
+    path.write_bytes(training.train([sample], [sample], train_options(backbones[0]), print)[0])
     return path
 
 
@@ -114,19 +114,22 @@ def test_train_small_scene_reproduces_labels(model, sample):
 
 
 def test_train_again_with_other_labels_in_unlabelled_cells_gives_equal_models(backbones, sample, tmp_path):
-    reports = []
+    lines = []
     labelled = np.zeros_like(sample.labelled)
     labelled[:, 20:] = True
     right, wrong = (
         replace(sample, labelled=labelled, road=road) for road in (sample.road, sample.road ^ ~labelled)
     )
     options = train_options(backbones[0], epochs=5)
-    first = training.train([right], [right], options, lambda *report: reports.append(report))
-    assert first.model == training.train([wrong], [wrong], options).model
-    assert reports == [(n + 1, 5, past) for n, past in enumerate(first.history)]
-    assert first.history[-1].validation_loss < first.history[0].validation_loss
-    path = tmp_path / f"head{first.suffix}"
-    path.write_bytes(first.model)
+    first, history = training.train([right], [right], options, lines.append)
+    assert first == training.train([wrong], [wrong], options, print)[0]
+    assert lines == [
+        f"epoch {n} of 5: loss {loss:.4f}, validation {validation:.4f}"
+        for n, (loss, validation) in enumerate(history, 1)
+    ]
+    assert history[-1][1] < history[0][1]
+    path = tmp_path / "head.safetensors"
+    path.write_bytes(first)
     about = read_head(path).about
     assert (about.gsd_m, about.window_px, about.layers, about.classes) == (GSD, WINDOW, 3, ("road",))
     assert about.trained["train_cells"] == labelled.sum()
@@ -137,17 +140,17 @@ def test_train_again_with_other_labels_in_unlabelled_cells_gives_equal_models(ba
 def test_train_stops_early_and_keeps_best_epoch_and_needs_labels(backbones, sample):
     """The labels of the validation tile are the inverse of the training labels."""
     inverse = replace(sample, road=~sample.road)
-    full = training.train([sample], [inverse], train_options(backbones[0], patience=3))
-    best = 1 + int(np.argmin([past.validation_loss for past in full.history]))
-    assert len(full.history) == best + 3 < 60
-    until = training.train([sample], [inverse], train_options(backbones[0], epochs=best))
-    np.testing.assert_array_equal(*(safetensors.numpy.load(one.model)["weight"] for one in (full, until)))
+    full, history = training.train([sample], [inverse], train_options(backbones[0], patience=3), print)
+    best = 1 + int(np.argmin([validation for _, validation in history]))
+    assert len(history) == best + 3 < 60
+    until, _ = training.train([sample], [inverse], train_options(backbones[0], epochs=best), print)
+    np.testing.assert_array_equal(*(safetensors.numpy.load(one)["weight"] for one in (full, until)))
     no_road = replace(sample, road=np.zeros_like(sample.road))
     with pytest.raises(TaskError, match="no training tile has an orthophoto and labels of both road"):
-        training.train([no_road], [sample], train_options(backbones[0]))
+        training.train([no_road], [sample], train_options(backbones[0]), print)
     no_photo = replace(sample, data=replace(sample.data, dop=None))
     with pytest.raises(TaskError, match="no validation tile has an orthophoto"):
-        training.train([sample], [no_photo], train_options(backbones[0]))
+        training.train([sample], [no_photo], train_options(backbones[0]), print)
 
 
 def test_at_cells_interpolates_like_predictor(backbones, model):
@@ -159,7 +162,7 @@ def test_at_cells_interpolates_like_predictor(backbones, model):
     predicted = predictor(head, backbone)(windows)[0]
     centres = 2 * (np.arange(56, dtype=np.float32) + 0.5) / 56 - 1
     position = np.stack(np.meshgrid(centres, centres), axis=-1).reshape(-1, 2)
-    labels = Labels(position, np.zeros(len(position), np.float32))
+    labels = position, np.zeros(len(position), np.float32)
     tokens = backbone.tokens(windows, 3).numpy()
     line = torch.from_numpy(head.weight[0]), torch.tensor(float(head.bias[0]))
     logits, _ = at_cells(Windows(tokens, [labels], []), np.array([0]), *line)
@@ -167,16 +170,18 @@ def test_at_cells_interpolates_like_predictor(backbones, model):
 
 
 def test_best_threshold_maximises_iou():
+    import torch
+
     rng = np.random.default_rng(2)
     tokens = rng.normal(size=(1, 8, 8, 2)).astype(np.float16)
     centres = 2 * (np.arange(8, dtype=np.float32) + 0.5) / 8 - 1
     position = np.stack(np.meshgrid(centres, centres), axis=-1).reshape(-1, 2)
-    line = Line(np.array([1.5, -1], np.float32), 0.3)
-    level = 1 / (1 + np.exp(-(tokens[0].astype(float) @ line.weight + line.bias))).ravel()
+    weight, bias = np.array([1.5, -1], np.float32), 0.3
+    level = 1 / (1 + np.exp(-(tokens[0].astype(float) @ weight + bias))).ravel()
     road = level + rng.normal(0, 0.2, 64) > 0.7
-    windows = Windows(tokens, [Labels(position, road.astype(np.float32))], [])
+    windows = Windows(tokens, [(position, road.astype(np.float32))], [])
     each = [iou(level >= threshold, road) for threshold in THRESHOLDS]
-    threshold, best = best_threshold(windows, line)
+    threshold, best = best_threshold(windows, torch.from_numpy(weight), torch.tensor(bias))
     assert threshold == THRESHOLDS[np.argmax(each)]
     assert best == pytest.approx(max(each))
 

@@ -16,8 +16,10 @@ import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
+from flexroad.tasks.meshing.normals import vertex_normals
 from flexroad.tasks.metrics.mesh_distance import at_nodes
-from flexroad.tasks.types import Bools, Floats
+from flexroad.tasks.products.glb import encode_ground
+from flexroad.tasks.types import Bools, Floats, Mesh
 
 Faces = NDArray[np.int32]
 ON_LINE = 1e-9
@@ -51,6 +53,14 @@ class Relief:
         number = np.arange(self.heights.size, dtype=np.int32).reshape(self.heights.shape)
         nw, ne, sw, se = (part[self.cells] for part in _corners(number))
         return np.stack([nw, sw, se, nw, se, ne], axis=-1).reshape(-1, 3)
+
+
+def highest_first(mesh: Mesh) -> NDArray[np.int32]:
+    """Return the faces of a mesh, ``(F, 3)``, those of the highest level first.
+
+    Where several faces are above a place, a relief takes the height of the first.
+    """
+    return mesh.faces if mesh.level is None else mesh.faces[np.argsort(-mesh.level, kind="stable")]
 
 
 def of_mesh(points: Floats, faces: Faces, spacing_m: float) -> Relief:
@@ -118,6 +128,22 @@ def sheet(relief: Relief, depth_m: float) -> Sheet:
         np.concatenate([np.arange(len(points)), rim]),
         len(faces),
     )
+
+
+def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes, photo: bool) -> bytes:
+    """Return a coarse copy of meshes with its image as GLB.
+
+    The skirt has the colours and normals of the edge above it, so that it does not show.
+
+    - `local` ``(V, 3)``: its points in a frame of their own: east, north and up (m).
+    - `bounds`: west, south, east and north of the image's outer edges (m, in the CRS of the sheet).
+    - `image`: the image seen from above, JPEG.
+    - `photo`: whether the image is made of photos, which are shown without a light.
+    """
+    top = vertex_normals(local[: sheet.top.max() + 1], sheet.faces[: sheet.count])
+    west, south, east, north = bounds
+    uv = (sheet.points[sheet.top, :2] - (west, south)) / (east - west, north - south)
+    return encode_ground(local, top[sheet.top], uv, sheet.faces, image, photo)
 
 
 def _shape(bounds: Bounds, spacing_m: float) -> tuple[int, int]:

@@ -1,12 +1,19 @@
 """Reliefs cover the meshes that they stand for; their error is the largest vertical distance from them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 
-from flexroad.tasks.meshing.relief import Relief, joined, of_mesh, sheet
+from flexroad.catalog.grid import Grid
 from flexroad.tasks.meshing.triangulate import delaunay
+from flexroad.tasks.metrics.mesh_distance import drape
+from flexroad.tasks.products import glb
+from flexroad.tools.export.relief import Relief, Sheet, encode_sheet, highest_first, joined, of_mesh, sheet
+from tests import crossing
+from tests.tasks.products.test_glb import attribute, gltf_json
 
 WEST, SOUTH = 500_000.0, 5_600_000.0
 
@@ -140,3 +147,45 @@ def test_sheet_skirt_hangs_from_the_whole_rim_and_looks_outward():
         outward = np.cross(*(made.points[face[1:]] - made.points[face[0]]))[:2]
         x, y = made.points[face].mean(axis=0)[:2] - 0.5 * outward / np.linalg.norm(outward)
         assert cells[int((40 - y) // 10), int(x // 10)]
+
+
+def coarse(jpeg: bytes, photo: bool = False) -> tuple[bytes, Sheet]:
+    """Return the GLB of a slope of 3 x 2 cells of 10 m with a skirt of 4 m."""
+    heights = np.add.outer(np.arange(3.0), 2 * np.arange(4.0))
+    made = sheet(Relief((100.0, 200.0, 130.0, 220.0), heights, np.ones((2, 3), bool), 0.5), 4.0)
+    local = made.points - (100, 200, 0)
+    return encode_sheet(made, local, (100.0, 200.0, 130.0, 220.0), jpeg, photo), made
+
+
+def test_encode_sheet_skirt_has_normals_and_colours_of_the_edge():
+    data, made = coarse(glb.jpeg(np.full((8, 8, 3), 90, np.uint8), 85))
+    position, normal, uv = (attribute(data, "ground", name) for name in ("POSITION", "NORMAL", "TEXCOORD_0"))
+    np.testing.assert_allclose(
+        np.column_stack([position[:, 0], -position[:, 2]]), made.points[:, :2] - (100, 200)
+    )
+    np.testing.assert_allclose(normal, normal[made.top])
+    np.testing.assert_allclose(uv, uv[made.top])
+    # Per cell of 10 m, heights rise by 2 m to the east and by 1 m to the south.
+    slope = np.array([-0.2, 1.0, -0.1])
+    np.testing.assert_allclose(normal, np.tile(slope / np.linalg.norm(slope), (len(normal), 1)), atol=1e-6)
+    np.testing.assert_allclose(uv, np.column_stack([position[:, 0] / 30, 1 + position[:, 2] / 20]), atol=1e-6)
+
+
+@pytest.mark.parametrize("photo", [False, True])
+def test_encode_sheet_is_unlit_if_it_has_photos(photo):
+    tree = gltf_json(coarse(b"", photo)[0])
+    assert tree.get("extensionsUsed") == (["KHR_materials_unlit"] if photo else None)
+    assert [material.get("extensions") for material in tree["materials"]] == [
+        {"KHR_materials_unlit": {}} if photo else None
+    ]
+
+
+def test_height_over_faces_of_the_highest_level_is_that_of_the_deck():
+    mesh, _ = crossing.Crossing((40.0, 30.0)).mesh()
+    grid = Grid(mesh.crs, crossing.WEST + 35, crossing.SOUTH + 32, 1.0, 10, 4)
+    top = drape(replace(mesh, faces=highest_first(mesh)), grid) + mesh.origin[2]
+    np.testing.assert_allclose(
+        top, crossing.DECK_M + crossing.RISE * np.tile(grid.eastings - crossing.WEST, (4, 1)), atol=2e-3
+    )
+    ground = mesh.at(0)
+    assert highest_first(ground) is ground.faces

@@ -1,4 +1,8 @@
-"""Solve the normal equations of a tensor-product spline by conjugate gradients with a multigrid cycle.
+"""Solve the normal equations of a tensor-product spline.
+
+The border of a tile is a long strip. If its control points are numbered across it, the matrix has few
+diagonals beside the main one, and `solve_banded` factorises this band. Others are solved by `Multigrid`,
+conjugate gradients with a multigrid cycle.
 
 Where there are cells with a height, the matrix is well conditioned and a few Gauss-Seidel sweeps would do. In
 a void only the bending energy is left, a differential equation of fourth order over many control points,
@@ -16,21 +20,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
+from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.spline.banded import RIDGE, undetermined
+from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.stencil import (
     Lags,
     add_lower,
     add_upper,
+    from_lines,
     line_width,
     multiply,
     to_lines,
 )
 from flexroad.tasks.types import Bools, Floats
+
+WIDEST = 64
+"""Largest number of diagonals on one side of the main one: above, `Multigrid` is faster."""
+RIDGE = 1e-9
+"""Share of the diagonal's mean that is added to it: undetermined control points then keep their height."""
 
 COARSEST = 8
 """Splines with at most this many control points along an axis are not made coarser."""
@@ -46,15 +58,68 @@ Levels = NDArray[np.int64]
 """Number of lines, their width, and the start of the level's lines and stencil in the buffers, per level."""
 
 
+def _undetermined(point: int) -> TaskError:
+    """Return the error that says which control point, counted from 1, the equations do not determine."""
+    return TaskError(
+        f"control point {point} of the surface is undetermined; use fewer control points (a larger "
+        "fit.spacing_m), or raise fit.bending_m3"
+    )
+
+
+def is_narrow(shape: tuple[int, ...], degree: int) -> bool:
+    """Return whether a spline of so many control points is narrow enough for `solve_banded`."""
+    return degree * (min(shape) + 1) <= WIDEST
+
+
+def solve_banded(stencil: Floats, right: Floats, held: Bools) -> Floats:
+    """Return the solution, exact up to rounding; the parameters are as of `Multigrid`."""
+    (m, n), p = held.shape, stencil.shape[1] - 1
+    free = (~held).astype(np.float64)
+    band = np.zeros((m * n, p * (min(m, n) + 1) + 1))
+    ridge = RIDGE * float(stencil[:, 0, 0, p : p + m].mean()) + 1e-300
+    _to_band(stencil, free, ridge, band)
+    # Numbered from the south for a strip to the east, and from the west for one to the north.
+    order: Literal["C", "F"] = "F" if m <= n else "C"
+    values = (from_lines(right, m, p) * free).ravel(order)
+    factor, failed = scipy.linalg.lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
+    if failed:
+        raise _undetermined(failed)
+    solution, _ = scipy.linalg.lapack.dpbtrs(factor, values, lower=1)
+    return to_lines(solution.reshape((m, n), order=order), p)
+
+
+@compiled(error_model="numpy")
+def _to_band(stencil: Floats, free: Floats, ridge: float, band: Floats) -> None:
+    """Write the main diagonal and those below it of the matrix, by columns, ``(points, diagonals)``.
+
+    Held points have the equation 0 = 0.
+    """
+    (m, n), lags = free.shape, stencil.shape[1]
+    p = lags - 1
+    # Steps from one point to the next along u and along v.
+    step_u, step_v = (m, 1) if m <= n else (1, n)
+    for j in range(n):
+        for l in range(min(lags, n - j)):  # noqa: E741
+            for k in range(lags):
+                for i in range(m - k):
+                    value = stencil[j, l, k, p + i]
+                    # Two pairs of points have these distances: one falls along u while the other rises.
+                    a, b = j * step_u + i * step_v, (j + l) * step_u + (i + k) * step_v
+                    band[a, b - a] = value * free[i, j] * free[i + k, j + l]
+                    a, b = j * step_u + (i + k) * step_v, (j + l) * step_u + i * step_v
+                    band[min(a, b), abs(b - a)] = value * free[i + k, j] * free[i, j + l]
+    for j in range(n):
+        for i in range(m):
+            band[j * step_u + i * step_v, 0] += ridge if free[i, j] > 0.0 else 1.0
+
+
 @dataclass(frozen=True, eq=False)
 class Multigrid:
     """Splines over the same ground, each with every other knot of the one before."""
 
-    shape: tuple[int, int]
-    """Number of control points along northing and easting, (m, n)."""
     degree: int
-    held: Bools | None
-    """Control points that keep their height, ``(m, n)``; None if all are free."""
+    held: Bools
+    """Control points that keep their height, ``(m, n)``."""
 
     def solve(self, stencil: Floats, right: Floats, tolerance: float, refresh: bool) -> Floats:
         """Return the solution for one right-hand side, lines ``(n, width)``; 0 at held control points.
@@ -71,7 +136,7 @@ class Multigrid:
         depth = len(self.levels) if refresh else 1
         failed = _prepare(stencils, bands, free, self.levels, depth, self._weights, self._lags, RIDGE)
         if failed:
-            raise undetermined(failed)
+            raise _undetermined(failed)
         return _conjugate_gradients(
             stencils, bands, vectors, free, self.levels, self._weights, right, tolerance, SMALLEST_M,
             MAX_ITERATIONS, COARSEST_SWEEPS, self._lags,
@@ -80,7 +145,7 @@ class Multigrid:
     @cached_property
     def levels(self) -> Levels:
         """The sizes of the splines."""
-        (m, n), p = self.shape, self.degree
+        (m, n), p = self.held.shape, self.degree
         rows, lines, elements = [], 0, 0
         while True:
             width = line_width(m, p)
@@ -107,7 +172,7 @@ class Multigrid:
         p, (n, width, lines, elements) = self.degree, self.levels[-1]
         size = lines + n * width
         free = np.zeros(size)
-        fine = np.ones(self.shape) if self.held is None else (~self.held).astype(float)
+        fine = (~self.held).astype(float)
         for count, wide, first, _ in self.levels:
             free[first : first + count * wide] = to_lines(fine, p).ravel()
             fine = self._coarse_free(fine)

@@ -6,12 +6,9 @@ import numpy as np
 import trimesh
 
 from flexroad.tasks.meshing.normals import vertex_normals
-from flexroad.tasks.meshing.parts import highest_first, part, texture_coordinates, with_levels
 from flexroad.tasks.meshing.triangulate import delaunay
-from flexroad.tasks.metrics.mesh_distance import drape
+from flexroad.tasks.sample import with_levels
 from flexroad.tasks.types import Mesh
-from tests.builders import make_grid
-from tests.crossing import DECK_M, RISE, SOUTH, WEST, Crossing
 
 VERTICES = np.array([[0, 0, 1], [10, 0, 2], [10, 10, 3], [0, 10, 4], [5, 15, 5]], float)
 FACES = np.array([[0, 1, 2], [0, 2, 3], [3, 2, 4]], np.int32)
@@ -19,15 +16,15 @@ MESH = Mesh("EPSG:25832", (295500.0, 5629250.0, 150.0), VERTICES, FACES, np.arra
 
 
 def test_part_has_the_same_triangles_and_only_their_vertices():
-    used, corners = part(MESH, MESH.road)
+    used, corners = MESH.part(MESH.road)
     np.testing.assert_array_equal(used, [0, 2, 3])
     np.testing.assert_array_equal(VERTICES[used][corners], VERTICES[FACES[MESH.road]])
-    used, corners = part(MESH, np.zeros(3, bool))
+    used, corners = MESH.part(np.zeros(3, bool))
     assert (used.shape, corners.shape) == ((0,), (0, 3))
 
 
 def test_texture_coordinates_run_from_the_south_west():
-    uv = texture_coordinates(MESH, (295495.0, 5629250.0, 295515.0, 5629290.0))
+    uv = MESH.texture_coordinates((295495.0, 5629250.0, 295515.0, 5629290.0))
     np.testing.assert_allclose(uv, [[0.25, 0], [0.75, 0], [0.75, 0.25], [0.25, 0.25], [0.5, 0.375]])
 
 
@@ -46,14 +43,6 @@ def test_meshes_of_levels_as_one_can_be_taken_apart():
     assert with_levels({0: MESH}) is MESH
     assert MESH.numbers == (0,)
     assert MESH.at(0) is MESH
-
-
-def test_height_over_faces_of_the_highest_level_is_that_of_the_deck():
-    mesh, _ = Crossing((40.0, 30.0)).mesh()
-    grid = make_grid(10, 4, west=WEST + 35, north=SOUTH + 32)
-    top = drape(replace(mesh, faces=highest_first(mesh)), grid) + mesh.origin[2]
-    np.testing.assert_allclose(top, DECK_M + RISE * np.tile(grid.eastings - WEST, (4, 1)), atol=2e-3)
-    assert highest_first(MESH) is FACES
 
 
 def test_normals_equal_those_of_trimesh():
