@@ -18,8 +18,6 @@ from typing import Any
 
 import numpy as np
 import psutil
-import rasterio
-from numpy.typing import NDArray
 
 from bench.timing import resident_mb
 from flexroad.catalog import Catalog, Grid
@@ -31,6 +29,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from tests.made_result import done
+from tests.make_rasters import write
 
 TILES = 2000
 """Default number of tiles."""
@@ -62,22 +61,14 @@ def survey(folder: Path, side: int) -> None:
     # Dense streets, so that every tile has one.
     scene = make_scene(grid, 7, options=SceneOptions(block_m=20))
     cells = side * TILE_M
-    write(folder / "dsm.tif", scene.dsm, cells)
-    write(folder / "dtm.tif", scene.dtm, cells)
-    write(folder / "road.tif", scene.reference_road.astype(np.uint8), cells)
-
-
-def write(path: Path, patch: NDArray[Any], cells: int) -> None:
-    """Write a raster of repeated copies of a patch."""
     repeat = math.ceil(cells / PATCH_M)
-    data = np.tile(patch, (repeat, repeat))[:cells, :cells]
-    data = data.astype(np.float32) if data.dtype == np.float64 else data
-    layout = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
-    place = {"crs": "EPSG:25832", "transform": rasterio.transform.from_origin(300_000, 5_700_000, 1, 1)}
-    with rasterio.open(
-        path, "w", height=cells, width=cells, count=1, dtype=data.dtype, **layout, **place
-    ) as raster:
-        raster.write(data, 1)
+    layout = {"tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
+    for name, patch in (
+        ("dsm", scene.dsm.astype(np.float32)),
+        ("dtm", scene.dtm.astype(np.float32)),
+        ("road", scene.reference_road.astype(np.uint8)),
+    ):
+        write(folder / f"{name}.tif", np.tile(patch, (repeat, repeat))[:cells, :cells], **layout)
 
 
 def busy(processes: list[psutil.Process]) -> float:

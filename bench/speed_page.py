@@ -100,10 +100,7 @@ def stages(rows: list[bench_tile.Row], top: Peak, options: argparse.Namespace) -
 def state(rows: list[bench_tile.Row], sent: dict[str, Any], scan: dict[str, float]) -> str:
     """Return the estimate for a state as Markdown: sums of measured parts.
 
-    Parameters
-    ----------
-    scan : dict
-        CPU time of `points_ms` by ground method.
+    - `scan`: CPU time of `points_ms` by ground method.
     """
     tile_ms = next(row.ms for row in rows if (row.config, row.stage) == ("production", "tile of a mosaic"))
     worker_ms, client_ms = (1000 * sent["per_tile"][name] for name in ("worker_s", "client_s"))
