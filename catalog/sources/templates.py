@@ -199,7 +199,7 @@ def _named(root: Path, layout: Layout, derived: Path | None) -> tuple[_ByLayer, 
 def _rasters(
     root: Path, found: Sequence[layouts.Found], derived: Path | None, crs: str
 ) -> tuple[dict[Path, layouts.Found], list[Skipped]]:
-    """Return the files that are rasters, with those made of points, and the points that are left out."""
+    """Return the rasters, also rasters made from points, and the point files that are left out."""
     paths, left_out = dict[Path, layouts.Found](), list[Skipped]()
     for file in found:
         if not file.name.lower().endswith(layouts.POINTS):
@@ -216,7 +216,7 @@ def _rasters(
 
 
 def _of_points(source: Path, file: layouts.Found, derived: Path, crs: str) -> dict[Path, layouts.Found]:
-    """Write the arrays of points as rasters; return these. Rasters of the same file are written once."""
+    """Write the arrays of points as rasters, once per file; return the rasters."""
     folder = derived / file.tile
     made = {path: path.stem.rpartition(".")[2] for path in sorted(folder.glob(f"{source.stem}.*.tif"))}
     if not made or not all(is_current(source, path) for path in made):
@@ -232,7 +232,7 @@ def _of_points(source: Path, file: layouts.Found, derived: Path, crs: str) -> di
 
 
 def _without_metres(root: Path, dsm: dict[str, _MatchedFile]) -> list[Skipped]:
-    """Remove the files that are not in metres, and return them; one must be left."""
+    """Remove the files that are not in metres, and return them; raise an error if no file remains."""
     errors = dict[str, CatalogError]()
     for tile_id, match in dsm.items():
         try:
@@ -269,7 +269,7 @@ def _opened(
 ) -> tuple[dict[str, _MatchedFile], list[Skipped]]:
     """Return the files of a layer by tile id, and skipped files.
 
-    ``parts`` gives id and stratum of each path, ``remedy`` what to do with two files of a tile.
+    ``parts`` gives id and stratum of each path, ``remedy`` the advice for two files of a tile.
     """
     files, skipped = opened(root, layer, parts, crs)
     by_tile: dict[str, _MatchedFile] = {}
