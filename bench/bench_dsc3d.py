@@ -1,7 +1,6 @@
 """Plane and RGT rows of the DSC3D stand-in beside the paper's, and the time to make its scenes.
 
-Plane, RGT and FlexRoad's T depend only on the data and the mask. The scenes were tuned to these rows and to
-nothing else.
+Plane, RGT and FlexRoad's T depend only on the data and the mask. The scenes were tuned only to these rows.
 Usage: ``PYTHONPATH=. python bench/bench_dsc3d.py [SEED]``; the default seed is 0.
 """
 

@@ -1,9 +1,9 @@
 """Plane and RGT rows of the synthetic benchmark beside the paper's, and the time to make its tiles.
 
-Plane, RGT and FlexRoad's T depend only on the data and the mask. The preset was tuned to them and to nothing
-else. Heights are compared with the DTM extended by bridges, as in the paper.
-Usage: ``PYTHONPATH=. python bench/bench_gerod.py [TILES SEED]``; the default is 48 tiles of seed 0,
-the complete survey of seed 1 is ``240 1``.
+Plane, RGT and FlexRoad's T depend only on the data and the mask. The preset was tuned only to them. Heights
+are compared with the DTM extended by bridges, as in the paper. Usage: ``PYTHONPATH=. python
+bench/bench_gerod.py [TILES SEED]``; the default is 48 tiles of seed 0, the complete survey of seed 1 is ``240
+1``.
 """
 
 import sys

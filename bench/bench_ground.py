@@ -126,7 +126,7 @@ def row(title: str, scenes: list[Scene], classify: Filter) -> None:
 def terrain_error(scene: Scene, classify: Filter) -> tuple[float, float, float]:
     """Return the mean vertical distance to the truth over all cells and over roads, without bridges (m).
 
-    And the share of the cells of bridge decks that are ground by the filter, NaN without decks.
+    The third value is the share of bridge deck cells that are ground by the filter, NaN without decks.
     """
     is_ground = classify(cells(scene)).reshape(scene.dsm.shape)
     tin = LinearNDInterpolator(np.argwhere(is_ground), scene.dsm[is_ground])
@@ -233,7 +233,7 @@ def real() -> Iterator[Case]:
 
 
 def with_low_points(case: Case) -> Case:
-    """Add points below others, as multipath echoes cause them; they are not scored."""
+    """Add low points, as multipath echoes cause them; they are not scored."""
     rng = np.random.default_rng(SEED)
     low = case.points[rng.choice(len(case.points), round(LOW_SHARE * len(case.points)), replace=False)]
     low = low - np.column_stack([np.zeros((len(low), 2)), rng.uniform(*LOW_M, len(low))])

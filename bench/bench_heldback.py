@@ -1,8 +1,8 @@
 """Errors at points and cells withheld from DSM and DTM: both configurations, real places and synthetic scans.
 
 Squares of 5 m (`SIDE_M`) are taken out of the points or cells of a place, the place is prepared and run, and
-the surface is compared with what was taken out. Points count if they are ground: by their class or, without
-classes, within 0.3 m of the terrain model of all points. Of Autzen, the ground points of another
+the surface is compared with the removed points or cells. Only ground points are used: by their class or,
+without classes, within 0.3 m of the terrain model of all points. In Autzen, the ground points of another
 classification are withheld and compared, too. They lie 4 cm below the plane through all points around them,
 which is a second truth. Synthetic scans have a scanner's noise, and are compared with the true surface.
 
@@ -14,7 +14,7 @@ Small places have few such squares, so they are run with several draws of them (
 Usage: ``python bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...] [--draw NUMBER]``;
 each NAME is a further configuration, production with options: ``--set soft=fit.bending_m3=20``. Another
 number of the first draw gives other squares and other synthetic scenes. Real places need FLEXROAD_REAL_DATA.
-Intervals are 95% intervals of a bootstrap over the squares, those of MAD and T over the tiles.
+Intervals are 95% intervals of a bootstrap over the squares; intervals of MAD and T are over the tiles.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A catalog of which parts were withheld, and these parts by name."""
+    """A catalog with withheld parts, and these parts by name."""
 
     catalog: Path
     truths: dict[str, Truth]
@@ -94,7 +94,7 @@ Maker = Callable[[Path, int], Place]
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """A configuration's errors and error estimates at what was withheld, and the figures of its tiles."""
+    """A configuration's errors and error estimates at the withheld places, and the figures of its tiles."""
 
     errors: dict[str, Floats]
     """By the name of the truth."""
@@ -108,7 +108,7 @@ def squares(x: Floats, y: Floats, draw: int) -> tuple[Floats, Bools]:
     """Return the number of the square of each point, and whether it is withheld."""
     column, row = (np.floor(np.asarray(axis) / SIDE_M).astype(np.int64) for axis in (x, y))
     number = column * 10**7 + row
-    # A hash of the number: which squares are withheld does not depend on the others.
+    # A hash of the number decides, so that the choice of a square does not depend on other squares.
     mixed = ((number * np.int64(2654435761) + draw) ^ (number >> 7)) % 1_000_003
     mixed = (mixed * 48271 + draw) % 1_000_003
     return number, mixed < SHARE * 1_000_003
@@ -344,7 +344,7 @@ def by_ground(held: str, truth: Truth, error: Floats) -> Iterator[tuple[str, Flo
 
 
 def estimates(folder: Path, place: Place, truth: Truth) -> Floats:
-    """Return the error estimate (m) of a run at what was withheld; NaN off the raw road mask."""
+    """Return the error estimate (m) of a run at the withheld places; NaN off the raw road mask."""
     estimate = np.full(truth.x.shape, np.nan)
     for tile in select(str(folder), allow=[str(place.catalog.anchor)]).finished():
         west, south, east, north = tile.tile.grid.bounds
@@ -369,7 +369,7 @@ def doubt(truth: Truth, error: Floats, estimate: Floats) -> str:
 
 
 def pooled(truths: Sequence[Truth]) -> Truth:
-    """Return the truths of several draws as one; squares of different draws are different ones."""
+    """Return the truths of several draws as one; squares of different draws get different numbers."""
     joined = {
         name: np.concatenate([getattr(truth, name) for truth in truths]) for name in ("x", "y", "z", "road")
     }
@@ -378,7 +378,7 @@ def pooled(truths: Sequence[Truth]) -> Truth:
 
 
 def compared(places: Sequence[Place], base: str, options: Sequence[str], folder: Path) -> Compared:
-    """Run a configuration over the draws of a place and compare it with what was withheld."""
+    """Run a configuration over the draws of a place and compare it with the withheld points or cells."""
     errors: dict[str, list[Floats]] = {name: [] for name in places[0].truths}
     expected, mad, triangles = [], [], []
     for number, place in enumerate(places):
@@ -394,7 +394,7 @@ def compared(places: Sequence[Place], base: str, options: Sequence[str], folder:
 
 
 def compare(name: str, places: Sequence[Place], folder: Path, configs: Configs) -> None:
-    """Print the figures of each configuration, and what production changes."""
+    """Print the figures of each configuration, and their differences to production."""
     truths = {held: pooled([place.truths[held] for place in places]) for held in places[0].truths}
     results: dict[str, Compared] = {}
     for config, (base, options) in configs.items():

@@ -4,7 +4,7 @@ A peer gets the cells with a height of one tile (DSM on the filtered road, valid
 heights at the tile's cells; these are meshed and evaluated against the true surface like ours. Peers that are
 not installed are left out: ``pip install verde geomdl``, ``apt install gmt grass-core``.
 
-geomdl is written in Python: it gets one cell of 25, and its time is that of these alone.
+geomdl is written in Python: it gets only one cell of 25, so its time is lower than for all cells.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Case:
     road: RoadMask
     clusters: RoadClusters
     ground: Floats
-    """Heights to fit on the tile's core, ``(H, W)``, m; NaN where there are none."""
+    """Heights to fit on the tile's core, ``(H, W)``, m; NaN where unknown."""
 
     @property
     def core(self) -> Grid:
@@ -114,7 +114,7 @@ def show(name: str, seconds: float, ours: float, case: Case, surface: Surface) -
 
 
 def scattered(x: Floats, y: Floats, heights: Floats) -> tuple[Floats, Floats]:
-    """Return places ``(n, 2)`` and heights ``(n,)`` of the cells that have one."""
+    """Return places ``(n, 2)`` and heights ``(n,)`` of the cells with a height."""
     known = np.isfinite(heights)
     places = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
     return places[known], heights[known]

@@ -1,9 +1,8 @@
-"""What commands cost that look at every tile of a finished survey: CPU time and memory of each process.
+"""CPU time and memory of commands that look at every tile of a finished survey.
 
-The tiles are those of `production`, with borders, 250 m wide with cells of 5 m, on four layers of rasters in
-sheets of 1 km. Only the first tile is computed. The others get its stored results, moved to their places,
-and its row, and their markers are without products: writing and reading of meshes is not measured. CPU time
-counts, not the time on the wall.
+The tiles are computed with `production`, with borders. They are 250 m wide with cells of 5 m, on four layers
+of rasters in sheets of 1 km. Only the first tile is computed. The other tiles get its stored results, moved
+to their places, and its row. Their markers have no products: writing and reading of meshes is not measured.
 
 Usage: ``python bench/bench_planning.py [TILES] [--only COMMAND ...]``
 """
@@ -139,10 +138,10 @@ def write(path: Path, values: NDArray[Any], west: float, north: float) -> None:
 
 
 class Copied:
-    """An executor that gives each tile the results of one that was computed, moved to its place.
+    """An executor that gives each tile the results of one computed tile, moved to its place.
 
-    Only what the commands read of all tiles is stored: no meshes, and nothing of borders. The arrays of a
-    result are compressed once, because only the header names the place.
+    Only results that the commands read are stored: no meshes, and no borders. The arrays of a result are
+    compressed once, because only the header names the place.
     """
 
     def __init__(self, run: Run, tile_id: str) -> None:

@@ -1,8 +1,8 @@
 """``prepare`` of points beside the decoding of its file: with classes, with the slope filter, by workers.
 
-CPU seconds of complete commands: the lowest of some rounds, with those of their worker processes. A synthetic
-scan always; with FLEXROAD_REAL_DATA also the north of Autzen, whose ground the slope filter then classifies.
-With another checkout both run in turn, A B A B, and their rasters are compared.
+CPU seconds of complete commands, with their worker processes: the lowest of some rounds. The input is a
+synthetic scan. With FLEXROAD_REAL_DATA it is also the north of Autzen, whose ground the slope filter then
+classifies. With another checkout both run in turn, A B A B, and their rasters are compared.
 
 Usage: ``python bench/bench_points.py [--rounds 3] [--million 5] [--workers 1 2] [--other CHECKOUT]``
 """
@@ -40,12 +40,12 @@ GROUND, PLANTS, HOUSE = 2, 5, 6
 
 @dataclass(frozen=True)
 class Cost:
-    """What one command took."""
+    """The cost of one command."""
 
     cpu_s: float
     wall_s: float
     peak_mb: float
-    """Of the command's own process."""
+    """Cost of the command's own process."""
 
 
 def main() -> None:
@@ -61,7 +61,8 @@ def main() -> None:
         # Written in the first round, as the installation of a package does.
         os.environ["PYTHONPYCACHEPREFIX"] = str(folder / "bytecode")
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-        # In a process of its own: Linux counts the memory of this one as that of the commands it starts.
+        # A process of its own makes the scan: Linux adds the memory of this process to the commands it
+        # starts.
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
             files = pool.submit(clouds, folder, round(options.million * 1e6)).result()
         for file in files:

@@ -1,9 +1,9 @@
 """Samplings of the same surfaces: size, CPU time and smoothness of meshes, and their distance from them.
 
-Usage: ``PYTHONPATH=. python bench/bench_sampling.py CATALOG...``; each catalog gives a table, the mean
-over its tiles. Surfaces, masks and frames are those of production. Distances are those of
-`tasks.metrics.evaluate`, with the 99th percentile on roads and that of terrain from the surface without
-the steps that a mesh without breaklines leaves out.
+Usage: ``PYTHONPATH=. python bench/bench_sampling.py CATALOG...``; each catalog gives a table, the mean over
+its tiles. Surfaces, masks and frames come from production. Distances are computed as in
+`tasks.metrics.evaluate`, with the 99th percentile on roads. On terrain the surface has no steps, because a
+mesh without breaklines leaves them out.
 """
 
 import os
@@ -47,7 +47,7 @@ Inputs = tuple[Surface, RoadMask, RoadClusters, Frame | None]
 
 
 def inputs(catalog: Path, store: ArtefactStore) -> Iterator[Inputs]:
-    """Yield what `sample` takes, for each tile that can be fitted."""
+    """Yield the arguments of `sample` for each tile that can be fitted."""
     pattern = Pattern.of(load_config("production"))
     for tile in Catalog.read(catalog, [Path("/")]).tiles:
         graph = pattern.graph(tile)
@@ -62,7 +62,7 @@ def inputs(catalog: Path, store: ArtefactStore) -> Iterator[Inputs]:
 
 
 def p99_road_m(mesh: Mesh, surface: Surface, road: RoadMask) -> float:
-    """Return the 99th percentile of the distances of which `mesh_distances` gives the 95th (m)."""
+    """Return the 99th percentile of the distances in `mesh_distances` (m)."""
     core, shift = road.core, OFF_CENTRE * road.core.cell
     places = replace(core, west=core.west + shift, north=core.north + shift)
     heights = surface.lattice(places.eastings, places.northings) - mesh.origin[2]

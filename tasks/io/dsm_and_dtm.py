@@ -161,7 +161,7 @@ def offset_note(dsm: Floats, dtm: Floats) -> str | None:
             (metres, f"the DTM in {unit}, the DSM in metres?", (dsm, dtm * metres)),
         ):
             if _agree(*scaled, offset):
-                return f"{RATIO}{ratio:.{2 if ratio > 0.05 else 3}f} times those of the DTM: {which}"
+                return f"{RATIO}{ratio:.{2 if ratio > 0.05 else 3}f} times the DTM heights: {which}"
     median_m, spread_m = offset or (0.0, 0.0)
     if abs(median_m) < FAR_M or spread_m > CONSTANT_M:
         return None

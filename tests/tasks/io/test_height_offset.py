@@ -50,10 +50,10 @@ def test_feet_against_metres_is_a_ratio_on_flat_and_steep_ground():
     steep = 300 + 0.3 * COL
     for ground in (GROUND, steep):
         assert offset_note(ground / 0.3048, ground) == (
-            "the heights of the DSM are 3.28 times those of the DTM: the DSM in feet, the DTM in metres?"
+            "the heights of the DSM are 3.28 times the DTM heights: the DSM in feet, the DTM in metres?"
         )
         assert offset_note(ground, ground / 0.3048) == (
-            "the heights of the DSM are 0.30 times those of the DTM: the DTM in feet, the DSM in metres?"
+            "the heights of the DSM are 0.30 times the DTM heights: the DTM in feet, the DSM in metres?"
         )
 
 
@@ -72,7 +72,7 @@ def test_other_unit_of_a_town_is_a_ratio(unit, metres, ratios):
         ((town() / metres, GROUND), ratios[0], f"the DSM in {unit}, the DTM in metres?"),
         ((town(), GROUND / metres), ratios[1], f"the DTM in {unit}, the DSM in metres?"),
     ):
-        assert offset_note(*models) == f"the heights of the DSM are {ratio} times those of the DTM: {which}"
+        assert offset_note(*models) == f"the heights of the DSM are {ratio} times the DTM heights: {which}"
 
 
 @pytest.mark.parametrize("stratum", ["urban", "suburban", "rural"])
@@ -80,7 +80,7 @@ def test_feet_of_a_survey_are_a_ratio(stratum):
     """In feet its differences between neighbours are more than those of open ground in metres."""
     scene = make_scene(GRID, 3, stratum)
     assert offset_note(scene.dsm / 0.3048, scene.dtm) == (
-        "the heights of the DSM are 3.28 times those of the DTM: the DSM in feet, the DTM in metres?"
+        "the heights of the DSM are 3.28 times the DTM heights: the DSM in feet, the DTM in metres?"
     )
 
 
