@@ -1,6 +1,6 @@
 """Errors at points and cells withheld from DSM and DTM: both configurations, real places and synthetic scans.
 
-Squares of 5 m (`SIDE_M`) are taken out of the points or cells of a place, the place is prepared and run, and
+Squares of 5 m (`SIDE_M`) are taken out of the points or cells of a place. The place is prepared and run, and
 the surface is compared with the removed points or cells. Only ground points are used: by their class or,
 without classes, within 0.3 m of the terrain model of all points. In Autzen, the ground points of another
 classification are withheld and compared, too. They lie 4 cm below the plane through all points around them,

@@ -1,6 +1,6 @@
 """Production's fit beside other libraries on the same filtered cells: CPU time, and error of roads.
 
-A peer gets the cells with a height of one tile (DSM on the filtered road, valid DTM elsewhere) and returns
+A peer gets the cells with a height of one tile (DSM on the filtered road, valid DTM elsewhere). It returns
 heights at the tile's cells; these are meshed and evaluated against the true surface like ours. Peers that are
 not installed are left out: ``pip install verde geomdl``, ``apt install gmt grass-core``.
 

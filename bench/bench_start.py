@@ -1,7 +1,7 @@
 """Start of commands: CPU time of whole processes, relative to ``python -c "import numpy"``.
 
 Targets: ``flexroad --help`` at most 3, ``flexroad config show`` at most 8, a run with nothing to do over ten
-tiles at most 15, a rerun of one tile at most 25, all with the default number of workers. Two workers must not
+tiles at most 15, a rerun of one tile at most 25, with the default number of workers. Two workers must not
 take longer than one over 48 small tiles, wall time and CPU time: ``bench_start.py --tiles``.
 """
 

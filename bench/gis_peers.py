@@ -2,7 +2,7 @@
 
 On Debian: ``apt install gmt grass-core``. Both get the same points as the libraries, as text. Their CPU time
 includes only the module, not reading the points into GRASS and writing the raster. The settings have the
-lowest road error among a few that were tried on the same tile, so the peers do at least as well as by
+lowest road error among a few that were tried on the same tile. So the peers do at least as well as by
 default.
 """
 

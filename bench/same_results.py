@@ -1,8 +1,9 @@
 """Compare the results of this checkout with the results of another checkout, byte by byte.
 
 Both run each configuration over the same synthetic tiles, with the same interpreter. Compared are the
-fingerprints (names of the files in the store), the bytes of all products and mosaics, the metrics without
-times, and the sources, nodes and versions in each tile's item. The exit code is 1 if something differs.
+fingerprints (names of the files in the store), the bytes of all products and mosaics. Also compared are the
+metrics without times, and the sources, nodes and versions in each tile's item. The exit code is 1 if
+something differs.
 
 Usage: ``python bench/same_results.py OTHER_CHECKOUT [--tiles 12] [--configs production paper]``, with
 ``--other-options`` if the checkouts have different options: fingerprints and nodes are then not compared.

@@ -4,8 +4,8 @@ dynamic: points at ``road_m`` on the road and at ``terrain_m`` elsewhere, joined
 uniform: a regular grid of triangles (RGT); corners: the two triangles of a plane.
 
 The lattices are anchored at the south-west corner of the domain. The domain is the hull of the core's cell
-centres if the tile has neither frame nor halo, else the core's bounds, so that neighbouring tiles meet. With
-a frame, neighbours have the same points and heights on the border: the meshes join without a gap.
+centres if the tile has neither frame nor halo. Otherwise it is the core's bounds, so that neighbouring tiles
+meet. With a frame, neighbours have the same points and heights on the border: the meshes join without a gap.
 
 A dynamic mesh has edges along the limit of the survey and ends there (`tasks.meshing.survey_limit`). If the
 roads are polygons, it has edges along their outlines, too (`tasks.meshing.road_outline`).

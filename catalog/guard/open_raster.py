@@ -105,7 +105,7 @@ def open_alone(path: Path) -> Any | None:
 def has_own_blocks(path: Path) -> bool:
     """Return whether each block of a raster can be read by itself: only blocks of a GeoTIFF can.
 
-    Text grids and pictures are decoded from their beginning, and GDAL does not return from reading a row of
+    Text grids and pictures are decoded from their beginning. GDAL does not return from reading a row of
     an ASCII grid behind a damaged one.
     """
     try:

@@ -6,7 +6,7 @@ A template is a path relative to the folder. ``{tile}`` is the tile's id, ``{str
 The paper's datasets are read so: GeRoD, 240 tiles of 250 x 250 m of North Rhine-Westphalia, and DSC3D, the
 DeepScenario Open 3D Dataset, as rasters made from the meshes of its scenes with separate true heights. The
 names of their files are not fixed: without templates the files of GeRoD are found by the words in their paths
-(`catalog.layouts`), and the templates in ``configs/dsc3d.yaml`` are a guess, to be adapted to the folder.
+(`catalog.layouts`). The templates in ``configs/dsc3d.yaml`` are a guess and must be adapted to the folder.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The adaptive executor runs jobs in this process as long as worker processes would not save time. If ``n`` jobs
 of ``t`` seconds each are left, they take ``n * t`` seconds here and ``START_S + n * t / w`` seconds on ``w``
 workers. Workers are started if they save a multiple of their start time. They are also started for more than
-`MANY` jobs, so that a job that ends or blocks its process does not end or block the run. Each job done here
+`MANY` jobs: a job that ends or blocks its process must not end or block the run. Each job done here
 refines ``t``. Workers that were started stay.
 
 All times are CPU times: other programs delay both jobs here and the start of workers, so that wall times

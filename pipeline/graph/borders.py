@@ -1,7 +1,7 @@
 """Corners and edges of tiles as nodes of the graph; `tasks.border` computes them.
 
 The fingerprint of such a node depends on its position, the options of its stages and the files that reach the
-ground around it, but not on a tile. So neighbouring tiles have the same node, and the first tile stores its
+ground around it. So neighbouring tiles have the same node, and the first tile stores its
 result.
 """
 

@@ -8,8 +8,8 @@ In addition, `assess` rates the fitted surface without ground truth; it is not p
 
 A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``; the method is one of
 the options. Module names are not part of it, so stores stay valid when files move. A stage that lists a
-source layer in its module's `READS` also hashes the layer's files as (path relative to the catalog, size,
-mtime), or by their bytes. Files that only the options name, such as a model (the module's `files`), are
+source layer in its module's `READS` also hashes the layer's files: (path relative to the catalog, size,
+mtime), or their bytes. Files that only the options name, such as a model (the module's `files`), are
 hashed by their bytes. Rasters that `load` reads are hashed only if they reach the tile or its halo. Variants
 with equal options up to a stage share its node, so it is computed once. A node whose artefact is in the store
 is not computed.

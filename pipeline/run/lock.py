@@ -3,7 +3,7 @@
 ``RUN/lock.json`` names the owner: host, process id and start time. If the owner is on this machine, the
 process table shows whether it is alive, independent of any clock. An owner on another machine renews the
 file's time every 30 s; the age of the file is measured with the storage's clock. Before such a lock is taken
-over, it is observed for a while, so that a clock that jumped cannot make a living owner lose it.
+over, it is observed for a while: a clock that jumped cannot make a living owner lose it.
 
 Machines made from one image may have the same name and machine id, but never the same boot id. So an owner
 with another boot id ran before the last restart of this machine, or runs on another machine. It is on another

@@ -1,6 +1,6 @@
 """Artefacts: the results of stages, stored by fingerprint.
 
-Every file of a store or run is written to a temporary name in the same folder and then renamed, or put into
+Every file of a store or run is written to a temporary name in the same folder and renamed, or put into
 a bucket by one request. A reader therefore never reads an incomplete file, even if the writer was killed. ::
 
     STORE/<stage>/<ab>/<fingerprint>.npz        artefacts

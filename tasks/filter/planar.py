@@ -105,10 +105,10 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     Returns
     -------
     RoadClusters
-        Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if
-        no cluster is large enough. ``dtm_invalid`` marks the shoulder, and dropped cells where the DTM does
-        not show the road either (under a car on a bridge it shows the valley). ``beside`` marks the shoulder
-        and cells up to `BEYOND_M` from it. With levels, there are clusters for each level.
+        Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if no
+        cluster is large enough. ``dtm_invalid`` marks the shoulder and dropped cells where the DTM shows
+        other ground, such as the valley below a bridge. ``beside`` marks the shoulder and cells up to
+        `BEYOND_M` from it. With levels, there are clusters for each level.
     """
     return ecsrc_near(data, road, options, (slice(0, data.grid.height), slice(0, data.grid.width)))
 

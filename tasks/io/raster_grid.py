@@ -123,7 +123,7 @@ class RasterGrid:
     def before(self, step: int) -> tuple[int, int]:
         """Return the numbers of rows and columns between the start of the first step and this lattice.
 
-        Steps are counted from the origin of the coordinates, so that cells are joined in the same way in
+        Steps are counted from the origin of the coordinates. So cells are joined in the same way in
         every window and in all files of one lattice.
         """
         row, col = SHIFT - self.north / self.dy, SHIFT + self.west / self.dx

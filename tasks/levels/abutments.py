@@ -2,7 +2,7 @@
 
 A note is made on roads of one level that cross in plan, because a level has one height at each place.
 
-All decisions depend only on the vectors and on cells near each abutment, so that a tile, its neighbour and
+All decisions depend only on the vectors and on cells near each abutment. So a tile, its neighbour and
 their edge find the same levels.
 """
 

@@ -1,8 +1,8 @@
 """The limit of the survey as lines: meshes end there, and not at the next vertex of a coarse lattice.
 
 The lines run half-way between the centres of cells with data and of cells beyond the survey ("marching
-squares"), and are simplified by less than the distance to any centre. So every centre with data stays inside,
-every other centre outside, and the lines follow the limit to within a cell.
+squares"). They are simplified by less than the distance to any centre. So every centre with data stays
+inside, every other centre outside, and the lines follow the limit to within a cell.
 
 The edges of kerbs and walls are found in the same way. Each edge is two lines side by side, one per height.
 """

@@ -6,7 +6,7 @@ An orthophoto is embedded as one JPEG image that both nodes share. It is shown w
 (``KHR_materials_unlit``): it already has the sun of the flight, and a viewer's light would darken it again.
 
 This module writes the file itself: trimesh takes four times as long for the same arrays, mostly for comparing
-them with each other, and its import takes as long as a complete tile.
+them with each other. Its import takes as long as a complete tile.
 """
 
 from __future__ import annotations

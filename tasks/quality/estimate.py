@@ -3,7 +3,7 @@
 Noise of single cells averages out in a smooth surface. The misfit of larger pieces of ground remains, so
 residuals are first averaged over squares. If a surface misses the heights around a place, it also misses
 heights there that were not measured. The two constants were chosen on squares of 5 m that were withheld from
-DSM and DTM of eight places, so that 90% of the squares are within the interval (docs/quality.md).
+DSM and DTM of eight places: 90% of the squares are within the interval (docs/quality.md).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 At a node, where ends of lines meet, the two ends that form the straightest continuation belong to one route.
 No route turns sharply, crosses itself, changes its number of lanes or is longer than a limit. Lines join only
-at their ends. So a route ends where its line ends on the middle of another line, and lines that cross without
+at their ends. So a route ends where its line ends on the middle of another line. Lines that cross without
 a common end, such as on bridges, stay apart.
 """
 

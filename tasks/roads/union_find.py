@@ -1,6 +1,6 @@
 """Clusters of cells as a union-find forest.
 
-A cluster is a tree whose root is its first cell in row-major order, so the result does not depend on the
+A cluster is a tree whose root is its first cell in row-major order. So the result does not depend on the
 order of the merges.
 """
 

@@ -184,8 +184,8 @@ def border_points(
 ) -> Floats:
     """Return the vertices on the border of a tile, ``(n, 2)``; corners are included twice.
 
-    They include the places where the mesh of the tile or its neighbour ends with the survey, and where the
-    outline of a road crosses the border.
+    They include the places where the mesh of the tile or its neighbour ends with the survey, and crossings
+    of road outlines with the border.
 
     - `frame`: has the road cells along the border.
     - `local`: west, south, east and north of the tile (m).

@@ -1,6 +1,6 @@
 """The splines of a tile, the lattice of knots that tiles share, and the start heights of a fit.
 
-Tiles of one size T have n intervals of T / n along each axis, so that every edge of a tile is a line of
+Tiles of one size T have n intervals of T / n along each axis. So every edge of a tile is a line of
 knots. A basis function of degree p has a support of p + 1 intervals. At a line exactly p functions are not
 zero. Other functions on its two sides have disjoint supports.
 """

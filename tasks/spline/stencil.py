@@ -1,7 +1,7 @@
 """The matrix of a tensor-product spline's quadratic form, kept as a stencil.
 
 Two basis functions overlap only if their indices differ by at most the degree p along both axes. The matrix
-is a sum over cells of products along u times products along v, so an element depends on the unordered pair
+is a sum over cells of products along u times products along v. So an element depends on the unordered pair
 of indices along each axis: ``(p + 1)^2`` numbers per control point are enough. ``S[j, l, k, i]`` is the
 element of functions j and j + l along u, and i and i + k along v.
 

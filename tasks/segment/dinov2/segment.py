@@ -69,8 +69,8 @@ def files(options: Options) -> tuple[Path, ...]:
 def segment(data: TileData, options: Options) -> RoadMask:
     """Return the road mask predicted from the orthophoto.
 
-    Windows lie on a lattice fixed to the ground and extend beyond the tile and its halo where the photo does,
-    so neighbouring tiles agree along their common edge.
+    Windows lie on a lattice fixed to the ground and extend beyond the tile and its halo where the photo does.
+    So neighbouring tiles agree along their common edge.
 
     Raises
     ------

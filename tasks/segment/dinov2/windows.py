@@ -2,7 +2,7 @@
 
 Windows lie on a lattice fixed to the ground, not to the tile: neighbouring tiles use the same windows along
 their common edge, and results do not depend on the tiling. The weight of a window falls towards its sides
-as a raised cosine over the overlap, so that the weights of all windows at a pixel sum to one.
+as a raised cosine over the overlap. So the weights of all windows at a pixel sum to one.
 """
 
 from __future__ import annotations
