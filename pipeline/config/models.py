@@ -75,7 +75,7 @@ class Cluster(Options):
         None,
         ge=1,
         le=100_000,
-        description="largest number of worker processes, of one thread each; local: by default one per core",
+        description="largest number of worker processes; local: by default one per core",
     )
     memory: ByteSize | None = Field(
         None,

@@ -87,8 +87,8 @@ class Options(base.Options):
         0.0,
         ge=0,
         le=50,
-        description="distance beside the road up to which the DTM is ignored (m): terrain models smooth "
-        "kerbs and banks, which would lift the edge of the road surface",
+        description="distance beside the road up to which the DTM is ignored (m). Terrain models smooth "
+        "kerbs and banks, which would lift the road's edge",
     )
 
 
