@@ -1,6 +1,6 @@
 """The table of docs/filter.md: the share of each kind of road cell that a filter keeps, and the road error.
 
-24 tiles of the benchmark with a halo of 50 m, of which the core is scored. With FLEXROAD_REAL_DATA, two real
+24 tiles of the benchmark with a halo of 50 m; the core is scored. With FLEXROAD_REAL_DATA, two real
 towns follow; canopies are added to their DSM, and road is all paved ground. A cell is sound if the DSM shows
 the ground, with noise, or is within `SOUND_M` of the truth.
 """
@@ -74,7 +74,7 @@ def show(cases: list[Case]) -> None:
 
 
 def counted(case: Case, kept: Bools) -> pd.DataFrame:
-    """Return the numbers of kept and of all cells by kind; precision is sound cells among the kept ones."""
+    """Return the numbers of kept and of all cells by kind; precision is the share of sound kept cells."""
     data, core = case.data, case.data.grid.window(case.data.core)
     off = np.abs(data.dsm - data.reference)
     points = case.road.mask & np.isfinite(data.dsm)

@@ -1,9 +1,8 @@
 """The production settings against the paper's: on the benchmark and in two real towns.
 
-``PYTHONPATH=. python bench/bench_production.py 240`` gives the table of docs/fit.md; without a number
-4 tiles of the benchmark are used. Stages and options are those of configs/paper.yaml and
-configs/production.yaml, tile by tile as in a run; only the benchmark's tiles, which have no neighbours, have
-no halo.
+``PYTHONPATH=. python bench/bench_production.py 240`` gives the table of docs/fit.md; without a number 4 tiles
+of the benchmark are used. Stages and options come from configs/paper.yaml and configs/production.yaml, tile
+by tile as in a run. Only the benchmark's tiles have no halo, because they have no neighbours.
 
 If FLEXROAD_REAL_DATA is set, Barbican and Gothenburg follow. Their canopies are added to the DSM, and their
 DTM is degraded (noise and scars); truth is the original DTM. Intervals are 95% intervals of a bootstrap over
@@ -37,7 +36,7 @@ from flexroad.tools.synthetic.spoilers import Kind
 
 TILES, SEED = 4, 1
 OVER_M = 2.0
-"""A road cell counts as hidden if the DSM is this much above the true road (m)."""
+"""A road cell is hidden if the DSM is this much above the true road (m)."""
 BLOCK_M = 50
 NOISE_M, SCAR_M, SCAR_SHARE_M2 = 0.1, 0.5, 2500
 """Degraded DTM: white noise (m), depth of a scar (m), area per scar (m2)."""

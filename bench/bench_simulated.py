@@ -1,4 +1,4 @@
-"""Tiles that return at once: what client, scheduler and workers cost per tile, and the client's memory.
+"""Tiles that return at once: CPU time of client, scheduler and workers per tile, and the client's memory.
 
 The tiles are tiny parts of two large rasters and a mask. Usage:
 ``python bench/bench_simulated.py [TILES]``; 100,000 tiles take an hour.
@@ -38,7 +38,7 @@ PATCH_M = 400
 """Size of the synthetic scene of which the rasters are repeated copies."""
 WORKERS = 2
 STARTED = 0.3
-"""Share of the tiles after which CPU time counts: code is loaded."""
+"""Share of the tiles after which CPU time is measured, because code is then loaded."""
 LAYERS = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_mask": "road.tif"}
 CONFIG = {
     "fit": {"control_points": [12, 12], "iterations": 30},
@@ -132,7 +132,8 @@ def simulated(folder: Path, tiles: int) -> dict[str, Any]:
             f"  {sample['tiles']:9,.0f} tiles: client {sample['client_mb']:6.0f} MB, "
             f"largest worker {sample['worker_mb']:6.0f} MB"
         )
-    # From the middle on, because Dask fills logs of recent messages before; without the end of the run.
+    # The growth is measured from the middle on, because Dask fills logs before; the end of the run is left
+    # out.
     middle, late = executor.samples[len(executor.samples) // 2], executor.samples[-2]
     grown = (late["client_mb"] - middle["client_mb"]) * 2**20 / (late["tiles"] - middle["tiles"])
     print(f"  growth of the client in the second half: {grown:.0f} bytes a tile", flush=True)

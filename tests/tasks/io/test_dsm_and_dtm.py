@@ -46,7 +46,7 @@ def test_survey_has_a_note_only_if_swapped_or_in_feet(stratum):
     assert offset_note(scene.dsm, scene.dtm) is None
     assert offset_note(scene.dtm, scene.dsm) is None
     in_feet = offset_note(scene.dsm / 0.3048, scene.dtm)
-    assert in_feet.startswith("the heights of the DSM are 3.28 times those of the DTM: the DSM in feet")
+    assert in_feet.startswith("the heights of the DSM are 3.28 times the DTM heights: the DSM in feet")
 
 
 def test_ground_dug_off_between_the_surveys_is_not_noted():
@@ -88,7 +88,7 @@ def test_offset_over_a_coast_is_no_ratio():
 @pytest.mark.parametrize(("dsm", "dtm"), [(town(), GROUND), (300 + 0.3 * COL,) * 2], ids=["town", "steep"])
 def test_other_unit_is_a_ratio(unit, metres, ratios, dsm, dtm):
     """The difference of neighbouring cells is that many times as large, too."""
-    said = "the heights of the DSM are {} times those of the DTM: the {} in {}, the {} in metres?"
+    said = "the heights of the DSM are {} times the DTM heights: the {} in {}, the {} in metres?"
     assert offset_note(dsm / metres, dtm) == said.format(ratios[0], "DSM", unit, "DTM")
     assert offset_note(dsm, dtm / metres) == said.format(ratios[1], "DTM", unit, "DSM")
 
