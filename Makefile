@@ -6,7 +6,7 @@ VENV := .venv
 VALIDATORS := .validators
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# At these sizes more than one BLAS thread per process is a loss.
+# At these sizes more than one BLAS thread per process is slower.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
@@ -39,16 +39,16 @@ endif
 LITERAL := $(REPRODUCED)/literal
 # The same meshes against the DSM in place of the reference.
 BY_DSM := $(REPRODUCED)/dsm
-# The column of the paper read literally has fewer tiles: tiles of a smaller number are the first of a larger one.
+# The column of the paper read literally has fewer tiles: a smaller survey has the first tiles of a larger survey.
 LITERAL_TILES ?= $(shell [ $(TILES) -lt 6 ] && echo $(TILES) || echo 6)
 SURVEY := $(REPRODUCED)/survey/catalog.parquet
 # The same tiles with the true heights and roads as reference, in place of the paper's extended DTM.
 TRUE_SURVEY := $(REPRODUCED)/survey/catalog_true.parquet
 LITERAL_SURVEY := $(if $(GEROD_ROOT),$(SURVEY),runs/synthetic-$(LITERAL_TILES)-$(SEED)/survey/catalog.parquet)
 RESULTS ?= $(REPRODUCED)/results
-# The published dataset lies elsewhere than its catalog; an archive is unpacked beside itself.
+# The published dataset lies elsewhere than its catalog; an archive is unpacked into a folder beside it.
 ABLATE = $(BIN)/flexroad $(if $(GEROD_ROOT),--allow $(GEROD_ROOT:.zip=)) run --store $(REPRODUCED)/store
-# DSC3D cannot be had as rasters: five synthetic scenes stand in for it, by the paper's reference and by the truth.
+# DSC3D is not available as rasters: five synthetic scenes replace it, with the paper's reference and the truth.
 STANDIN := runs/standin-$(SEED)
 SCENES := $(STANDIN)/scenes/catalog.parquet
 STAND_IN = $(BIN)/flexroad run --config dsc3d --store $(STANDIN)/store
@@ -63,7 +63,7 @@ reproduce: $(SURVEY) $(SCENES) $(LITERAL_SURVEY) ## The paper's tables and figur
 	$(BIN)/flexroad tables $(REPRODUCED)/segmented $(if $(TRUE),--true $(TRUE)) --dsm $(BY_DSM) --literal $(LITERAL) --dsc3d $(STANDIN)/circular --dsc3d-true $(STANDIN)/true -o $(RESULTS)
 	$(BIN)/flexroad figures $(REPRODUCED)/segmented -o $(RESULTS)
 
-# Made once: rasters written anew have new times, and all that hangs on them would be computed again.
+# Made once: rasters that are written again have new times, and all results from them would be computed again.
 MESHED := $(addprefix tools/synthetic/,command.py dsc3d.py)
 MADE := $(filter-out $(MESHED),$(wildcard tools/synthetic/*.py))
 runs/synthetic-%-$(SEED)/survey/catalog.parquet: $(MADE) | $(STAMP)
@@ -98,7 +98,7 @@ $(COMPILED): $(STAMP) $(wildcard tasks/*.py tasks/*/*.py)
 	rm -rf $(COMPILING)
 	touch $@
 
-test: $(STAMP) $(if $(AREA),,$(COMPILED)) ## Run the tests but for the slow ones: minutes; or those of one folder: make test AREA=lift
+test: $(STAMP) $(if $(AREA),,$(COMPILED)) ## Run the tests except slow tests (minutes), or the tests of one folder: make test AREA=lift
 	$(PYTEST) -m "not slow" $(TESTED)
 
 test-all: $(STAMP) $(COMPILED) ## Run all tests

@@ -1,6 +1,6 @@
-"""``make bench``: stages and floors, peers, start of commands, ``make reproduce``; then what else there is.
+"""``make bench``: stages and floors, peers, start of commands, ``make reproduce``; then a list of the others.
 
-Usage: ``python -m bench [NAME ... | all]``; a name is that of a file, without ``bench_``.
+Usage: ``python -m bench [NAME ... | all]``; NAME is the name of a file without ``bench_``.
 """
 
 from __future__ import annotations

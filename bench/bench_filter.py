@@ -1,6 +1,6 @@
 """The table of docs/filter.md: the share of each kind of road cell that a filter keeps, and the road error.
 
-24 tiles of the benchmark with a halo of 50 m, of which the core is scored. With FLEXROAD_REAL_DATA, two real
+24 tiles of the benchmark with a halo of 50 m; the core is scored. With FLEXROAD_REAL_DATA, two real
 towns follow; canopies are added to their DSM, and road is all paved ground. A cell is sound if the DSM shows
 the ground, with noise, or is within `SOUND_M` of the truth.
 """
@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import os
 import tempfile
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import rasterio
 
+from bench.towns import ARCHIVES, PAVED, Town
 from flexroad.catalog import Grid
 from flexroad.tasks import sample
 from flexroad.tasks.filter import ecsrc, planar
 from flexroad.tasks.fit import nurbs
 from flexroad.tasks.metrics import evaluate
-from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import Bools, RoadClusters, RoadMask, TileData
 from flexroad.tools.synthetic import gerod, make_scene
 from flexroad.tools.synthetic.spoilers import BARE, Kind
 
@@ -36,11 +35,6 @@ SPOILERS = {
     "roofs": Kind.BUILDING,
     "plants": Kind.PLANTS,
 }
-TOWNS = {
-    "Barbican": ("London_BNG", "dsm_barb*.tif", "dem_barb*.tif", "cdsm_barb*.tif", "landcover*.tif"),
-    "Gothenburg": ("Goteborg", "DSM_KRbig.tif", "DEM_KRbig.tif", "CDSM_KRbig.asc", "landcover.tif"),
-}
-PAVED = 1
 
 Filter = Callable[[TileData, RoadMask], RoadClusters]
 FILTERS: dict[str, Filter] = {
@@ -64,9 +58,9 @@ def main() -> None:
     print(f"{TILES} tiles of the benchmark, seed {SEED}; cells kept (%)")
     show(cases)
     if folder := os.environ.get("FLEXROAD_REAL_DATA"):
-        for name, files in TOWNS.items():
+        for name in ARCHIVES:
             print(f"\n{name}: DSM and canopies; truth is the DTM")
-            show([town(Path(folder) / "umep", *files)])
+            show([town(name, Path(folder))])
 
 
 def show(cases: list[Case]) -> None:
@@ -80,7 +74,7 @@ def show(cases: list[Case]) -> None:
 
 
 def counted(case: Case, kept: Bools) -> pd.DataFrame:
-    """Return the numbers of kept and of all cells by kind; precision is sound cells among the kept ones."""
+    """Return the numbers of kept and of all cells by kind; precision is the share of sound kept cells."""
     data, core = case.data, case.data.grid.window(case.data.core)
     off = np.abs(data.dsm - data.reference)
     points = case.road.mask & np.isfinite(data.dsm)
@@ -108,23 +102,15 @@ def benchmark(tile_id: str, core: Grid, stratum: str, options: gerod.Options) ->
     return Case(data, RoadMask(grid, core, mask, np.zeros_like(mask)), scene.kind)
 
 
-def town(folder: Path, name: str, *patterns: str) -> Case:
+def town(name: str, data: Path) -> Case:
     with tempfile.TemporaryDirectory() as scratch:
-        with zipfile.ZipFile(next(folder.glob(f"{name}*.zip"))) as archive:
-            archive.extractall(scratch)
-        dsm, dem, canopy, cover = (read(next(Path(scratch).rglob(pattern))) for pattern in patterns)
-    grid = Grid("EPSG:25832", 0.0, float(dem.shape[0]), 1.0, dem.shape[1], dem.shape[0])
-    covered = (canopy > 0) & (dem + canopy > dsm)
-    kind = np.where(covered, Kind.CROWN, np.where(dsm - dem > SOUND_M, Kind.BUILDING, Kind.GROUND))
-    mask = (cover == PAVED) & np.isfinite(dsm) & np.isfinite(dem)
-    data = TileData(name, grid, grid, np.where(covered, dem + canopy, dsm), dem, mask, dem)
-    return Case(data, RoadMask(grid, grid, mask, ~np.isfinite(dem)), kind)
-
-
-def read(path: Path) -> Floats:
-    with rasterio.open(path) as raster:
-        values: Floats = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-        return values
+        made = Town.unpacked(name, data, Path(scratch))
+    grid = Grid("EPSG:25832", 0.0, float(made.dtm.shape[0]), 1.0, made.dtm.shape[1], made.dtm.shape[0])
+    high = np.where(made.dsm - made.dtm > SOUND_M, Kind.BUILDING, Kind.GROUND)
+    kind = np.where(made.covered, Kind.CROWN, high)
+    mask = (made.cover == PAVED) & np.isfinite(made.dsm) & np.isfinite(made.dtm)
+    tile = TileData(name, grid, grid, made.dsm, made.dtm, mask, made.dtm)
+    return Case(tile, RoadMask(grid, grid, mask, ~np.isfinite(made.dtm)), kind)
 
 
 if __name__ == "__main__":

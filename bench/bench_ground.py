@@ -19,7 +19,6 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator
 
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.prepare.points import morphological
@@ -29,8 +28,6 @@ from flexroad.tools.synthetic.spoilers import BARE, Kind
 
 SEED, TILES = 2, 24
 SIDE_M = 500
-CHOSEN_ON, PER_STRATUM = 1, 3
-"""Seed and tiles per stratum from which the default slope was chosen."""
 VAGUE_M = 0.3
 """Plants and mixed echoes nearer to the ground than this are not scored."""
 UNCLASSIFIED, GROUND, NOISE = 1, 2, 7
@@ -66,9 +63,6 @@ def main() -> None:
             show(case, name, classify)
         if case.name.endswith("low points"):
             show(case, "low kept", ours(Options(low_m=None)))
-    sensitivity([case for case in cases if not case.name.endswith("low points")])
-    choice()
-    noise()
 
 
 def show(case: Case, name: str, classify: Filter) -> None:
@@ -91,71 +85,10 @@ def errors(result: Bools, case: Case) -> tuple[float, float, float, float]:
     return float(np.mean(~result[truth])), float(np.mean(result[~truth])), float(total), float(kappa)
 
 
-def sensitivity(cases: list[Case]) -> None:
-    """Print our type I and type II errors by slope and radius."""
-    for case in cases:
-        print(f"\n{case.name}: type I / type II by slope (down) and radius")
-        radii = (10.0, 20.0, 30.0, 50.0)
-        print(f"{'':6}" + "".join(f"{radius:14.0f} m" for radius in radii))
-        for slope in (0.15, 0.2, 0.3, 0.35, 0.4, 0.5):
-            results = [ours(Options(slope=slope, radius_m=radius))(case.points) for radius in radii]
-            pairs = [errors(result, case)[:2] for result in results]
-            print(f"{slope:<6}" + "".join(f"{first:8.2%} {second:7.2%}" for first, second in pairs))
-
-
-def choice() -> None:
-    """Print the error of a terrain model of the ground by slope; the default slopes were chosen from this."""
-    places = gerod.survey(TILES, CHOSEN_ON)
-    tiles = [place for name in gerod.STRATA for place in [p for p in places if p[2] == name][:PER_STRATUM]]
-    scenes = [make_scene(grid, CHOSEN_ON, name, options) for _, grid, name, options in tiles]
-    print(f"\nmean |TIN of the ground - truth| (m) of {len(scenes)} synthetic tiles, seed {CHOSEN_ON}")
-    print(f"{'filter':8}{'slope':>6} {'confidence':>10} {'all':>7} {'roads':>7}  decks accepted")
-    for slope, confidence in ((0.2, 1.65), (0.3, 1.65), (0.35, 1.65), (0.4, 1.65), (0.5, 1.65), (0.35, 3.0)):
-        row(
-            f"{'slope':8}{slope:6} {confidence:10}", scenes, ours(Options(slope=slope, confidence=confidence))
-        )
-    for slope in (0.05, 0.1, 0.15, 0.2, 0.3):
-        row(f"{'opening':8}{slope:6} {'':10}", scenes, opening(morphological.Options(slope=slope)))
-
-
-def row(title: str, scenes: list[Scene], classify: Filter) -> None:
-    error = np.nanmean([terrain_error(scene, classify) for scene in scenes], axis=0)
-    print(f"{title} {error[0]:7.3f} {error[1]:7.3f} {error[2]:10.0%}", flush=True)
-
-
-def terrain_error(scene: Scene, classify: Filter) -> tuple[float, float, float]:
-    """Return the mean vertical distance to the truth over all cells and over roads, without bridges (m).
-
-    And the share of the cells of bridge decks that are ground by the filter, NaN without decks.
-    """
-    is_ground = classify(cells(scene)).reshape(scene.dsm.shape)
-    tin = LinearNDInterpolator(np.argwhere(is_ground), scene.dsm[is_ground])
-    error = np.abs(tin(*np.indices(is_ground.shape)) - scene.reference)
-    deck = scene.kind == Kind.DECK
-    valid = np.isfinite(error) & ~deck
-    taken = is_ground[deck].mean() if deck.any() else np.nan
-    return float(error[valid].mean()), float(error[valid & scene.reference_road].mean()), float(taken)
-
-
 def cells(scene: Scene) -> Floats:
     """Return the points of a surface model, one in the middle of each cell, ``(n, 3)``."""
     easting, northing = np.meshgrid(scene.grid.eastings, scene.grid.northings)
     return np.column_stack([easting.ravel(), northing.ravel(), scene.dsm.ravel()])
-
-
-def noise() -> None:
-    """Print the errors that noise causes on a level plane, by confidence and point density."""
-    print("\na level plane with noise: ground kept and its offset in noise_m, by confidence (across)")
-    rng = np.random.default_rng(SEED)
-    confidences = (1.65, 2.3, 3.0)
-    print(f"{'':12}" + "".join(f"{confidence:15.2f}" for confidence in confidences))
-    for density in (1, 10, 30, 100, 240):
-        n = 50_000
-        x, y = rng.uniform(0, np.sqrt(n / density), (2, n))
-        z = rng.normal(0, Options().noise_m, n)
-        results = [ground(x, y, z, Options(confidence=confidence)) for confidence in confidences]
-        row = "".join(f"{is_.mean():8.1%} {z[is_].mean() / Options().noise_m:+6.2f}" for is_ in results)
-        print(f"{density:4} per m2 {row}")
 
 
 def ours(options: Options) -> Filter:

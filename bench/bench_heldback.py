@@ -2,9 +2,8 @@
 
 Squares of 5 m (`SIDE_M`) are taken out of the points or cells of a place, the place is prepared and run, and
 the surface is compared with what was taken out. Points count if they are ground: by their class or, without
-classes, within 0.3 m of the terrain model of all points. Of Autzen, the ground points of another
-classification are withheld and compared, too. They lie 4 cm below the plane through all points around them,
-which is a second truth. Synthetic scans have a scanner's noise, and are compared with the true surface.
+classes, within 0.3 m of the terrain model of all points. Synthetic scans have a scanner's noise, and are
+compared with the true surface.
 
 The error estimates of the road's squares are compared with their errors: how many squares have a mean error
 within the 90% interval, and how many of the worst tenth are among the tenth with the largest estimate.
@@ -21,29 +20,26 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import tempfile
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import laspy
 import numpy as np
 import rasterio
-from scipy.spatial import cKDTree
+from scipy.ndimage import map_coordinates
 
 import flexroad
+from bench.towns import ARCHIVES, PAVED, Town
 from flexroad.catalog import Catalog, Grid
-from flexroad.catalog.sources import rasters
-from flexroad.pipeline.cli.main import main as command
 from flexroad.tasks.quality.estimate import INTERVAL
 from flexroad.tasks.types import Bools, Floats
 from flexroad.tools.export.source import select
 from flexroad.tools.prepare.points.to_rasters import Options
 from flexroad.tools.synthetic import SceneOptions, make_scene, prepared
 from flexroad.tools.synthetic.scene import DECK, GROUND, scan
+from tests.command_line import call
 from tests.make_clouds import rasterise
 
 SIDE_M, SHARE, FIRST = 5.0, 0.06, 7
@@ -52,9 +48,7 @@ DRAWN = {"IGN": 6, "Brighton Beach": 6}
 """Number of draws of a place, else 1."""
 NEAR_M = 0.3
 """Points without classes are ground within this distance of the terrain model of all points."""
-FOOT_M, SAME_M = 0.3048, 0.02
-AROUND_M, PLANE_M, FEWEST = 1.5, 0.25, 10
-"""Points up to this far in plan and height from a place make its plane (m), if there are so many."""
+FOOT_M = 0.3048
 CONFIGS = {
     "paper": ("paper", ()),
     "dsm": ("production", ("load.road_height=dsm",)),
@@ -83,10 +77,10 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A catalog of which parts were withheld, and these parts by name."""
+    """A catalog of which parts were withheld, and these parts."""
 
     catalog: Path
-    truths: dict[str, Truth]
+    truth: Truth
 
 
 Maker = Callable[[Path, int], Place]
@@ -96,8 +90,7 @@ Maker = Callable[[Path, int], Place]
 class Compared:
     """A configuration's errors and error estimates at what was withheld, and the figures of its tiles."""
 
-    errors: dict[str, Floats]
-    """By the name of the truth."""
+    errors: Floats
     estimates: Floats
     """Of the squares."""
     mad: Floats
@@ -116,8 +109,6 @@ def squares(x: Floats, y: Floats, draw: int) -> tuple[Floats, Bools]:
 
 def bilinear(path: Path, x: Floats, y: Floats, nearest: bool = False) -> Floats:
     """Return the values of a raster at points."""
-    from scipy.ndimage import map_coordinates
-
     with rasterio.open(path) as raster:
         values = raster.read(1).astype(np.float64)
         columns, rows = ~raster.transform * (np.asarray(x), np.asarray(y))
@@ -126,110 +117,47 @@ def bilinear(path: Path, x: Floats, y: Floats, nearest: bool = False) -> Floats:
     return found
 
 
-def call(*words: object) -> None:
-    """Run a command of the program, without its output."""
-    before, sys.argv = sys.argv, ["flexroad", *map(str, words)]
-    try:
-        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-            command()
-    except SystemExit as end:
-        if end.code:
-            raise SystemExit(f"failed: flexroad {' '.join(map(str, words))}") from end
-    finally:
-        sys.argv = before
-
-
 def scanned(
-    files: Sequence[Path],
-    roads: Sequence[object],
-    options: Sequence[object],
-    folder: Path,
-    draw: int,
-    unit: float = 1.0,
-    others: Path | None = None,
+    files: Sequence[Path], options: Sequence[object], folder: Path, draw: int, unit: float = 1.0
 ) -> Place:
     """Withhold points of a scan and prepare it without them."""
-    call("prepare", *files, *options, *roads, "-o", folder / "whole", "--workers", 1)
+    common = (*options, "--workers", 1, "-o")
+    call("prepare", *files, *common, folder / "whole").expected(0)
     clouds = [laspy.read(file) for file in files]
     x, y, z = (np.concatenate([np.asarray(cloud[a]) for cloud in clouds]) * unit for a in "xyz")
     kind = np.concatenate([np.asarray(cloud.classification) for cloud in clouds])
     number, out = squares(x, y, draw)
-    extra = _other_ground(others, x, y, z) if others else None
-    gone = out if extra is None else out | extra
     start = 0
     for file, cloud in zip(files, clouds, strict=True):
-        kept = ~gone[start : start + len(cloud.points)]
+        kept = ~out[start : start + len(cloud.points)]
         start += len(cloud.points)
         left = laspy.LasData(cloud.header, cloud.points[kept])
         (folder / "points").mkdir(exist_ok=True)
         left.write(folder / "points" / file.name)
     kept_files = [folder / "points" / file.name for file in files]
-    call("prepare", *kept_files, *options, *roads, "-o", folder / "left", "--workers", 1)
+    call("prepare", *kept_files, *common, folder / "left").expected(0)
     dtm, mask = folder / "whole" / "dtm.tif", folder / "whole" / "road_mask.tif"
     has_classes = (kind == GROUND).mean() > 0.01
     ground = np.isin(kind, (GROUND, DECK)) if has_classes else np.abs(bilinear(dtm, x, y) - z) < NEAR_M
 
-    def truth(chosen: Bools) -> Truth:
-        road = bilinear(mask, x[chosen], y[chosen], nearest=True) > 0
-        return Truth(x[chosen], y[chosen], z[chosen], road, number[chosen])
-
-    truths = {"squares": truth(out & ground)}
-    if extra is not None:
-        other = truth(extra)
-        truths["other classification"] = other
-        level = plane_at(np.column_stack([x, y, z])[~extra], np.column_stack([other.x, other.y, other.z]))
-        truths["plane around these"] = replace(other, z=level)
-    return Place(folder / "left" / "catalog.parquet", truths)
+    chosen = out & ground
+    road = bilinear(mask, x[chosen], y[chosen], nearest=True) > 0
+    truth = Truth(x[chosen], y[chosen], z[chosen], road, number[chosen])
+    return Place(folder / "left" / "catalog.parquet", truth)
 
 
-def plane_at(points: Floats, places: Floats) -> Floats:
-    """Return the height of the plane through the points around each place, NaN with fewer than `FEWEST`."""
-    levels = np.full(len(places), np.nan)
-    near = cKDTree(points[:, :2]).query_ball_point(places[:, :2], AROUND_M)
-    for number, (place, found) in enumerate(zip(places, near, strict=True)):
-        offset = points[found] - place
-        offset = offset[np.abs(offset[:, 2]) < PLANE_M]
-        if len(offset) >= FEWEST:
-            terms = np.column_stack([np.ones(len(offset)), offset[:, :2]])
-            levels[number] = place[2] + np.linalg.lstsq(terms, offset[:, 2], rcond=None)[0][0]
-    return levels
-
-
-def _other_ground(file: Path, x: Floats, y: Floats, z: Floats) -> Bools:
-    """Return which points are ground in another classification of the same survey."""
-    cloud = laspy.read(file)
-    ground = np.asarray(cloud.classification) == GROUND
-    points = np.column_stack([np.asarray(cloud[axis])[ground] * FOOT_M for axis in "xyz"])
-    distance, _ = cKDTree(points).query(np.column_stack([x, y, z]), distance_upper_bound=SAME_M)
-    return np.isfinite(distance)
-
-
-def town(archive: Path, crs: str, patterns: dict[str, str], folder: Path, draw: int) -> Place:
-    """Withhold cells of a town's DSM, with canopies, and DTM; truth is its DTM, and road is paved ground."""
-    zipfile.ZipFile(archive).extractall(folder)
-    root = folder / archive.stem
-    paths = {layer: next(root.glob(pattern)) for layer, pattern in patterns.items()}
-    with rasterio.open(paths["dtm"]) as raster:
-        profile = {**raster.profile, "driver": "GTiff", "dtype": "float64", "nodata": -9999.0}
-        columns, rows = np.meshgrid(np.arange(raster.width), np.arange(raster.height))
-        x, y = (
-            np.asarray(axis).reshape(rows.shape) for axis in raster.transform * (columns + 0.5, rows + 0.5)
-        )
-    layers = {}
-    for name, path in paths.items():
-        with rasterio.open(path) as raster:
-            layers[name] = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-    dtm = layers["dtm"]
-    dsm = np.fmax(layers["dsm"], dtm + np.nan_to_num(layers["canopy"]))
+def town(name: str, data: Path, folder: Path, draw: int) -> Place:
+    """Withhold cells of a town's DSM and DTM; truth is its DTM."""
+    found = Town.unpacked(name, data, folder)
+    transform = found.profile["transform"]
+    columns, rows = np.meshgrid(np.arange(found.dtm.shape[1]), np.arange(found.dtm.shape[0]))
+    x, y = (np.reshape(axis, rows.shape) for axis in transform * (columns + 0.5, rows + 0.5))
     number, out = squares(x, y, draw)
-    for name, heights in (("left_dsm.tif", dsm), ("left_dtm.tif", dtm)):
-        with rasterio.open(root / name, "w", **profile) as raster:
-            raster.write(np.where(out | np.isnan(heights), -9999.0, heights), 1)
-    files = {"dsm": "left_dsm.tif", "dtm": "left_dtm.tif", "road_mask": patterns["cover"]}
-    Catalog(rasters.index(root, files, road_values=(1,), crs=crs).tiles).write(folder / "catalog.parquet")
-    there = out & np.isfinite(dtm) & (layers["cover"] != 4)
-    truth = Truth(x[there], y[there], dtm[there], layers["cover"][there] == 1, number[there])
-    return Place(folder / "catalog.parquet", {"squares": truth})
+    left = (np.where(out, np.nan, heights) for heights in (found.dsm, found.dtm))
+    found.catalog(*left).write(folder / "catalog.parquet")
+    there = out & np.isfinite(found.dtm) & (found.cover != 4)
+    truth = Truth(x[there], y[there], found.dtm[there], found.cover[there] == PAVED, number[there])
+    return Place(folder / "catalog.parquet", truth)
 
 
 def made(stratum: str, folder: Path, draw: int) -> Place:
@@ -251,9 +179,7 @@ def made(stratum: str, folder: Path, draw: int) -> Place:
     x, y = np.meshgrid(whole.eastings, whole.northings)
     number, out = squares(x, y, draw)
     z, road = scene.reference, scene.reference_road
-    return Place(
-        folder / "catalog.parquet", {"squares": Truth(x[out], y[out], z[out], road[out], number[out])}
-    )
+    return Place(folder / "catalog.parquet", Truth(x[out], y[out], z[out], road[out], number[out]))
 
 
 def places(data: Path | None, roads: Path) -> dict[str, Maker]:
@@ -264,39 +190,22 @@ def places(data: Path | None, roads: Path) -> dict[str, Maker]:
     }
     if data is None:
         return found
-    where = "class = 'road' AND certainty <> 'low' AND visible_in IS NOT 'rgb'"
     drawn = data / "autzen" / "roads" / "autzen_north_roads.gpkg"
+    autzen = ["--crs", "EPSG:2994", "--roads", f"{drawn}|layername=road_polygons"]
+    autzen += ["--roads-where", "class = 'road' AND certainty <> 'low' AND visible_in IS NOT 'rgb'"]
     found["Autzen north"] = lambda folder, draw: scanned(
-        [data / "autzen" / "autzen_north.laz"],
-        ["--roads", f"{drawn}|layername=road_polygons", "--roads-where", where],
-        ["--crs", "EPSG:2994"], folder, draw, FOOT_M, data / "autzen" / "autzen-thin.las",
-    )  # fmt: skip
+        [data / "autzen" / "autzen_north.laz"], autzen, folder, draw, FOOT_M
+    )
+    ign = sorted((data / "ign_crops" / "l93_770500_6277500").glob("*.la[sz]"))
     found["IGN"] = lambda folder, draw: scanned(
-        sorted((data / "ign_crops" / "l93_770500_6277500").glob("*.la[sz]")),
-        ["--roads", roads / "ign_l93.geojson"], ["--cell", 0.5], folder, draw,
-    )  # fmt: skip
+        ign, ["--roads", roads / "ign_l93.geojson", "--cell", 0.5], folder, draw
+    )
+    beach = ["--roads", roads / "brighton_beach.geojson", "--cell", 0.5, "--dop-cell", 0.25]
     found["Brighton Beach"] = lambda folder, draw: scanned(
-        [data / "brighton_beach" / "model.laz"],
-        ["--roads", roads / "brighton_beach.geojson"], ["--cell", 0.5, "--dop-cell", 0.25], folder, draw,
-    )  # fmt: skip
-    barbican = {
-        "dsm": "dsm_barb*.tif",
-        "dtm": "dem_barb*.tif",
-        "canopy": "cdsm_barb*.tif",
-        "cover": "landcover*.tif",
-    }
-    found["Barbican"] = lambda folder, draw: town(
-        data / "umep" / "London_BNG.zip", "EPSG:27700", barbican, folder, draw
+        [data / "brighton_beach" / "model.laz"], beach, folder, draw
     )
-    gothenburg = {
-        "dsm": "DSM_KR*.tif",
-        "dtm": "DEM_KR*.tif",
-        "canopy": "CDSM_KR*.asc",
-        "cover": "landcover.tif",
-    }
-    found["Gothenburg"] = lambda folder, draw: town(
-        data / "umep" / "Goteborg_SWEREF99_1200.zip", "EPSG:3007", gothenburg, folder, draw
-    )
+    for name in ARCHIVES:
+        found[name] = lambda folder, draw, name=name: town(name, data, folder, draw)
     return found
 
 
@@ -305,8 +214,8 @@ def run(place: Place, config: str, options: Sequence[str], folder: Path) -> flex
     file = folder.with_suffix(".yaml")
     file.write_text(f"extends: {config}\nvariants: {{flexroad: {{}}}}\n")
     chosen = [word for option in options for word in ("--set", option)]
-    call("--allow", place.catalog.anchor, "run", "--config", file, *chosen, "--executor", "serial",
-         "--catalog", place.catalog, "--out", folder)  # fmt: skip
+    inputs = ["--config", file, *chosen, "--catalog", place.catalog]
+    call("--allow", place.catalog.anchor, "run", *inputs, "--out", folder, "--executor", "serial").expected(0)
     return flexroad.open_run(folder, allow=[place.catalog.anchor])
 
 
@@ -335,16 +244,17 @@ def rmse_of(errors: Floats, groups: Floats) -> str:
     return f"{rmse:.4f} ({low:.4f} {high:.4f})"
 
 
-def by_ground(held: str, truth: Truth, error: Floats) -> Iterator[tuple[str, Floats, Floats]]:
+def by_ground(truth: Truth, error: Floats) -> Iterator[tuple[str, Floats, Floats]]:
     """Yield a title, the errors that are known, and their squares, for road and terrain."""
     for ground, cells in (("road", truth.road), ("terrain", ~truth.road)):
         there = cells & np.isfinite(error)
         if there.any():
-            yield f"  {held}, {ground}:", error[there], truth.square[there]
+            yield f"  {ground}:", error[there], truth.square[there]
 
 
-def estimates(folder: Path, place: Place, truth: Truth) -> Floats:
+def estimates(folder: Path, place: Place) -> Floats:
     """Return the error estimate (m) of a run at what was withheld; NaN off the raw road mask."""
+    truth = place.truth
     estimate = np.full(truth.x.shape, np.nan)
     for tile in select(str(folder), allow=[str(place.catalog.anchor)]).finished():
         west, south, east, north = tile.tile.grid.bounds
@@ -379,23 +289,20 @@ def pooled(truths: Sequence[Truth]) -> Truth:
 
 def compared(places: Sequence[Place], base: str, options: Sequence[str], folder: Path) -> Compared:
     """Run a configuration over the draws of a place and compare it with what was withheld."""
-    errors: dict[str, list[Floats]] = {name: [] for name in places[0].truths}
-    expected, mad, triangles = [], [], []
+    errors, expected, mad, triangles = [], [], [], []
     for number, place in enumerate(places):
         out = folder / f"{folder.name}_{number}"
-        view = run(place, base, options, out)
+        view, truth = run(place, base, options, out), place.truth
         mad.append(view.metrics.mad_road_deg.to_numpy())
         triangles.append(view.metrics.triangles.to_numpy(np.float64))
-        expected.append(estimates(out, place, place.truths["squares"]))
-        for name, truth in place.truths.items():
-            errors[name].append(view.height(truth.x, truth.y) - truth.z)
-    joined = {name: np.concatenate(parts) for name, parts in errors.items()}
-    return Compared(joined, *map(np.concatenate, (expected, mad, triangles)))
+        expected.append(estimates(out, place))
+        errors.append(view.height(truth.x, truth.y) - truth.z)
+    return Compared(*map(np.concatenate, (errors, expected, mad, triangles)))
 
 
 def compare(name: str, places: Sequence[Place], folder: Path, configs: Configs) -> None:
     """Print the figures of each configuration, and what production changes."""
-    truths = {held: pooled([place.truths[held] for place in places]) for held in places[0].truths}
+    truth = pooled([place.truth for place in places])
     results: dict[str, Compared] = {}
     for config, (base, options) in configs.items():
         (folder / config).mkdir()
@@ -403,18 +310,15 @@ def compare(name: str, places: Sequence[Place], folder: Path, configs: Configs) 
         number, seen = np.arange(len(result.mad)), np.isfinite(result.mad)
         mad, faces = mean_of(result.mad[seen], number[seen]), mean_of(result.triangles, number)
         print(f"{name}, {config}: MAD {mad} deg, T {faces}")
-        for held, truth in truths.items():
-            for title, error, group in by_ground(held, truth, result.errors[held]):
-                l2, bias = mean_of(np.abs(error), group), mean_of(error, group)
-                where = f"{error.size} in {np.unique(group).size} squares"
-                print(f"{title} {where}: L2 {l2} RMSE {rmse_of(error, group)} bias {bias}", flush=True)
-        text = doubt(truths["squares"], result.errors["squares"], result.estimates)
-        print(f"  squares, road: {text}", flush=True)
-    for held, truth in truths.items():
-        for other in (config for config in configs if config != "production"):
-            gain = np.abs(results["production"].errors[held]) - np.abs(results[other].errors[held])
-            for title, change, group in by_ground(held, truth, gain):
-                print(f"{title} L2 of production minus {other} {mean_of(change, group)}", flush=True)
+        for title, error, group in by_ground(truth, result.errors):
+            l2, bias = mean_of(np.abs(error), group), mean_of(error, group)
+            where = f"{error.size} in {np.unique(group).size} squares"
+            print(f"{title} {where}: L2 {l2} RMSE {rmse_of(error, group)} bias {bias}", flush=True)
+        print(f"  road: {doubt(truth, result.errors, result.estimates)}", flush=True)
+    for other in (config for config in configs if config != "production"):
+        gain = np.abs(results["production"].errors) - np.abs(results[other].errors)
+        for title, change, group in by_ground(truth, gain):
+            print(f"{title} L2 of production minus {other} {mean_of(change, group)}", flush=True)
 
 
 def main() -> None:

@@ -2,9 +2,7 @@
 
 A peer gets the cells with a height of one tile (DSM on the filtered road, valid DTM elsewhere) and returns
 heights at the tile's cells; these are meshed and evaluated against the true surface like ours. Peers that are
-not installed are left out: ``pip install verde geomdl``, ``apt install gmt grass-core``.
-
-geomdl is written in Python: it gets one cell of 25, and its time is that of these alone.
+not installed are left out: ``pip install verde``, ``apt install gmt grass-core``.
 """
 
 from __future__ import annotations
@@ -36,8 +34,6 @@ NOISE_M = 0.05
 """Standard deviation of heights, from which scipy's spline on a grid chooses its knots."""
 BLOCK_M, DAMPING = 3.6, 1e-8
 """Cells are averaged in blocks as wide as the distance of our control points: verde's spline is dense."""
-THINNED = 5
-"""geomdl gets every fifth row and column."""
 
 Peer = Callable[[Floats, Floats, Floats], Floats]
 """Takes x, y ``(n,)`` and heights ``(H, W)`` with NaN; returns heights at all cells ``(H, W)``, m."""
@@ -68,7 +64,7 @@ def main() -> None:
     seconds = cpu_s(lambda: fit(case.data, case.clusters, options))
     print(f"{'fit of one tile':34}{'CPU s':>8}{'ratio':>8}{'road L2 m':>11}{'road MAD deg':>14}")
     show("FlexRoad, production", seconds, seconds, case, ours)
-    for name, peer in {**of_scipy(), **of_verde(), **of_geomdl()}.items():
+    for name, peer in {**of_scipy(), **of_verde()}.items():
         heights: list[Floats] = []
         spent = one_cpu_s(lambda peer=peer, out=heights: out.append(heights_by(peer, case)))
         show(name, spent, seconds, case, surface_of(heights[0], case.core))
@@ -158,28 +154,6 @@ def of_verde() -> dict[str, Peer]:
         return np.asarray(chain.predict(np.broadcast_arrays(x, y[:, None])))
 
     return {"verde, spline of block means": spline}
-
-
-def of_geomdl() -> dict[str, Peer]:
-    try:
-        from geomdl import fitting
-    except ImportError:
-        return {}
-
-    def approximated(x: Floats, y: Floats, heights: Floats) -> Floats:
-        from scipy.interpolate import RegularGridInterpolator
-
-        rows, cols = y[::-THINNED], x[::THINNED]
-        thin = filled(heights)[::-THINNED, ::THINNED]
-        points = [(u, v, float(thin[j, i])) for i, u in enumerate(cols) for j, v in enumerate(rows)]
-        sizes = {"ctrlpts_size_u": len(cols) // 2, "ctrlpts_size_v": len(rows) // 2}
-        surface = fitting.approximate_surface(points, len(cols), len(rows), 3, 3, **sizes)
-        surface.sample_size_u, surface.sample_size_v = len(cols), len(rows)
-        z = np.array(surface.evalpts)[:, 2].reshape(len(cols), len(rows))
-        inside = RegularGridInterpolator((cols, rows), z, bounds_error=False, fill_value=None)
-        return inside(np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1))
-
-    return {"geomdl, 1 cell of 25": approximated}
 
 
 if __name__ == "__main__":

@@ -2,9 +2,8 @@
 
 CPU seconds of complete commands: the lowest of some rounds, with those of their worker processes. A synthetic
 scan always; with FLEXROAD_REAL_DATA also the north of Autzen, whose ground the slope filter then classifies.
-With another checkout both run in turn, A B A B, and their rasters are compared.
 
-Usage: ``python bench/bench_points.py [--rounds 3] [--million 5] [--workers 1 2] [--other CHECKOUT]``
+Usage: ``python bench/bench_points.py [--rounds 3] [--million 5] [--workers 1 2]``
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-import rasterio
 
 from flexroad.pipeline import ONE_THREAD
 from flexroad.tools.prepare.points.ground_filter import Options, ground
@@ -53,9 +51,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--million", type=float, default=5, help="points of the synthetic scan")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--other", type=Path, help="folder of another checkout")
     options = parser.parse_args()
-    checkouts = {"this": HERE} | ({"other": options.other.resolve()} if options.other else {})
     with tempfile.TemporaryDirectory(prefix="points-") as scratch:
         folder = Path(scratch)
         # Written in the first round, as the installation of a package does.
@@ -65,11 +61,14 @@ def main() -> None:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
             files = pool.submit(clouds, folder, round(options.million * 1e6)).result()
         for file in files:
-            decoding = min(run([DECODE, str(file)], HERE).cpu_s for _ in range(options.rounds + 1))
+            decoding = min(run([DECODE, str(file)]).cpu_s for _ in range(options.rounds + 1))
             print(f"{file.name}: decoding {decoding:.2f} CPU s")
             for method in METHODS:
                 for workers in options.workers:
-                    compare(checkouts, file, method, workers, options.rounds, folder, decoding)
+                    # The first round compiles code, or loads compiled code; it is not counted.
+                    rounds = range(options.rounds + 1)
+                    costs = [prepare(file, folder / "out", method, workers) for _ in rounds][1:]
+                    show(f"  {method:8} {workers} workers", costs, decoding)
 
 
 def clouds(folder: Path, n: int) -> list[Path]:
@@ -99,51 +98,27 @@ def synthetic(file: Path, n: int) -> Path:
     return write_cloud(file, xyz, kind[order], "EPSG:25832", rng.integers(256, 2**16, (n, 3)))
 
 
-def compare(
-    checkouts: dict[str, Path],
-    file: Path,
-    method: str,
-    workers: int,
-    rounds: int,
-    folder: Path,
-    decoding_s: float,
-) -> None:
-    costs: dict[str, list[Cost]] = {name: [] for name in checkouts}
-    # The first round compiles code, or loads compiled code; it is not counted.
-    for number in range(rounds + 1):
-        for name, root in checkouts.items():
-            cost = prepare(file, folder / f"out-{name}", method, workers, root)
-            if number:
-                costs[name].append(cost)
-    for name, measured in costs.items():
-        cpu_s, wall_s, peak_mb = (
-            pick(getattr(cost, field) for cost in measured)
-            for pick, field in ((min, "cpu_s"), (min, "wall_s"), (max, "peak_mb"))
-        )
-        print(
-            f"  {method:8} {workers} workers {name:6}{cpu_s:7.2f} CPU s{cpu_s / decoding_s:6.1f} x decoding"
-            f"{wall_s:7.2f} s{peak_mb:6.0f} MB",
-            flush=True,
-        )
-    if len(checkouts) > 1:
-        print(f"  rasters: {difference(*(folder / f'out-{name}' for name in checkouts))}", flush=True)
+def show(title: str, costs: list[Cost], decoding_s: float) -> None:
+    cpu_s, wall_s = (min(getattr(cost, field) for cost in costs) for field in ("cpu_s", "wall_s"))
+    peak_mb = max(cost.peak_mb for cost in costs)
+    times = f"{cpu_s:7.2f} CPU s{cpu_s / decoding_s:6.1f} x decoding{wall_s:7.2f} s{peak_mb:6.0f} MB"
+    print(f"{title}{times}", flush=True)
 
 
-def prepare(file: Path, out: Path, method: str, workers: int = 1, root: Path = HERE) -> Cost:
+def prepare(file: Path, out: Path, method: str, workers: int = 1) -> Cost:
     """Run the command from one file into a new folder."""
     shutil.rmtree(out, ignore_errors=True)
     words = f"prepare {file} -o {out} --ground {method} --workers {workers} --date 2020-01-01"
-    return run([COMMAND, *words.split()], root)
+    return run([COMMAND, *words.split()])
 
 
-def run(words: list[str], root: Path) -> Cost:
-    """Run Python code with arguments in a checkout; the CPU time includes that of its child processes."""
-    environment = os.environ | ONE_THREAD | {"PYTHONPATH": str(root)}
+def run(words: list[str]) -> Cost:
+    """Run Python code with arguments; the CPU time includes that of its child processes."""
     start = time.perf_counter()
     process = subprocess.Popen(
         [sys.executable, "-c", *words],
-        cwd=root,
-        env=environment,
+        cwd=HERE,
+        env=os.environ | ONE_THREAD | {"PYTHONPATH": str(HERE)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -151,18 +126,6 @@ def run(words: list[str], root: Path) -> Cost:
     if process.returncode or status:
         raise SystemExit(f"{' '.join(words[1:])} failed")
     return Cost(used.ru_utime + used.ru_stime, time.perf_counter() - start, used.ru_maxrss / 1024)
-
-
-def difference(one: Path, other: Path) -> str:
-    """Return how the rasters of two folders differ."""
-    names = [{path.name for path in folder.glob("*.tif")} for folder in (one, other)]
-    if names[0] != names[1]:
-        return f"other files: {sorted(names[0] ^ names[1])}"
-    for name in sorted(names[0]):
-        with rasterio.open(one / name) as a, rasterio.open(other / name) as b:
-            if not np.array_equal(a.read().view(np.uint8), b.read().view(np.uint8)):
-                return f"{name} differs"
-    return "equal bit by bit"
 
 
 if __name__ == "__main__":

@@ -1,14 +1,12 @@
-"""The production settings against the paper's: on the benchmark, in two real towns, on a real survey.
+"""The production settings against the paper's: on the benchmark and in two real towns.
 
-``PYTHONPATH=. python bench/bench_production.py 240`` gives the table of docs/fit.md; without a number
-4 tiles of the benchmark are used. Stages and options are those of configs/paper.yaml and
-configs/production.yaml, tile by tile as in a run; only the benchmark's tiles, which have no neighbours, have
-no halo.
+``PYTHONPATH=. python bench/bench_production.py 240`` gives the table of docs/fit.md; without a number 4 tiles
+of the benchmark are used. Stages and options come from configs/paper.yaml and configs/production.yaml, tile
+by tile as in a run. Only the benchmark's tiles have no halo, because they have no neighbours.
 
-If FLEXROAD_REAL_DATA is set, two more comparisons follow. Barbican and Gothenburg have their canopies added
-to the DSM and a degraded DTM (noise and scars); truth is the original DTM. The north of Autzen has roads
-drawn by hand and is compared with ground points of another classification. Intervals are 95% intervals of a
-bootstrap over tiles, over squares of `BLOCK_M`, or over points.
+If FLEXROAD_REAL_DATA is set, Barbican and Gothenburg follow. Their canopies are added to the DSM, and their
+DTM is degraded (noise and scars); truth is the original DTM. Intervals are 95% intervals of a bootstrap over
+tiles or over squares of `BLOCK_M`.
 """
 
 from __future__ import annotations
@@ -19,19 +17,15 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_N
 
 import sys
 import tempfile
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import laspy
 import numpy as np
 import pandas as pd
-import rasterio
 
+from bench.towns import ARCHIVES, Town
 from flexroad.catalog import Catalog, Tile
-from flexroad.catalog.sources.rasters import index
-from flexroad.pipeline.cli.main import main as flexroad
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.config.stages import STAGE_NAMES, STAGES
 from flexroad.tasks.options import stage_function
@@ -42,12 +36,10 @@ from flexroad.tools.synthetic.spoilers import Kind
 
 TILES, SEED = 4, 1
 OVER_M = 2.0
-"""A road cell counts as hidden if the DSM is this much above the true road (m)."""
+"""A road cell is hidden if the DSM is this much above the true road (m)."""
 BLOCK_M = 50
 NOISE_M, SCAR_M, SCAR_SHARE_M2 = 0.1, 0.5, 2500
 """Degraded DTM: white noise (m), depth of a scar (m), area per scar (m2)."""
-PAVED = 1
-FOOT_M = 0.3048
 CHAINS = {name: load_config(name).chains["flexroad"] for name in ("paper", "production")}
 
 
@@ -134,13 +126,11 @@ def benchmark(tiles: int, scratch: Path) -> None:
     )
 
 
-def town(name: str, archive: Path, crs: str, patterns: dict[str, str], scratch: Path) -> None:
+def town(name: str, data: Path, scratch: Path) -> None:
     """Compare in a real town, cell by cell of its tiles' cores."""
-    zipfile.ZipFile(archive).extractall(scratch)
-    folder = scratch / archive.stem
-    write_degraded(folder, patterns)
-    layers = {"dsm": "spoiled_dsm.tif", "dtm": "spoiled_dtm.tif", "reference": patterns["dtm"]}
-    catalog = index(folder, {**layers, "road_mask": patterns["cover"]}, road_values=(PAVED,), crs=crs)
+    made = Town.unpacked(name, data, scratch)
+    scarred = with_scars(made.dtm, np.random.default_rng(0))
+    catalog = made.catalog(made.dsm, scarred, reference=made.patterns["dtm"])
     rows, blocks = [], []
     for tile in catalog.tiles:
         for config in CHAINS:
@@ -166,19 +156,6 @@ def squares(errors: Floats, road: Bools, side: int) -> Iterator[dict[str, float]
                 yield {"mean_m": float(errors[here][road[here]].mean())}
 
 
-def write_degraded(folder: Path, patterns: dict[str, str]) -> None:
-    """Write a DSM with canopies and a DTM with noise and scars next to the original files."""
-    paths = {layer: next(folder.glob(pattern)) for layer, pattern in patterns.items()}
-    with rasterio.open(paths["dtm"]) as raster:
-        profile = {**raster.profile, "driver": "GTiff", "dtype": "float64", "nodata": -9999.0}
-    dsm, dtm, canopy = (_read(paths[layer]) for layer in ("dsm", "dtm", "canopy"))
-    scarred = with_scars(dtm, np.random.default_rng(0))
-    with_canopies = np.fmax(dsm, dtm + np.nan_to_num(canopy))
-    for name, heights in (("spoiled_dsm.tif", with_canopies), ("spoiled_dtm.tif", scarred)):
-        with rasterio.open(folder / name, "w", **profile) as raster:
-            raster.write(np.nan_to_num(heights, nan=-9999.0), 1)
-
-
 def with_scars(dtm: Floats, rng: np.random.Generator) -> Floats:
     """Return a DTM with noise and with tilted, shifted patches of 8 to 20 m, as left by removed houses."""
     dtm = dtm + NOISE_M * rng.standard_normal(dtm.shape)
@@ -193,74 +170,16 @@ def with_scars(dtm: Floats, rng: np.random.Generator) -> Floats:
     return dtm
 
 
-def _read(path: Path) -> Floats:
-    with rasterio.open(path) as raster:
-        values: Floats = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-        return values
-
-
-ROADS = "class = 'road' AND certainty <> 'low' AND visible_in IS NOT 'rgb'"
-
-
-def autzen(folder: Path, scratch: Path) -> None:
-    """Compare on the roads of an unclassified scan, at ground points of another classification."""
-    out = scratch / "autzen"
-    words = ["prepare", folder / "autzen_north.laz", "--crs", "EPSG:2994", "-o", out]
-    words += ["--roads", f"{folder / 'roads' / 'autzen_north_roads.gpkg'}|layername=road_polygons"]
-    call([*map(str, words), "--roads-where", ROADS])
-    cloud = laspy.read(folder / "autzen-thin.las")
-    ground = np.asarray(cloud.classification) == 2
-    x, y, z = (np.asarray(axis)[ground] * FOOT_M for axis in (cloud.x, cloud.y, cloud.z))
-    errors: dict[str, list[Floats]] = {name: [] for name in CHAINS}
-    for tile in Catalog.read(out / "catalog.parquet", allow=[folder / "roads"]).tiles:
-        west, south, east, north = tile.grid.bounds
-        inside = (x >= west) & (x < east) & (y > south) & (y <= north)
-        for name in CHAINS:
-            result = run_stages(tile, name)
-            row, col = tile.grid.cells(x[inside], y[inside])
-            on_road = result.road.mask[result.data.grid.window(tile.grid)][row, col]
-            errors[name].append(np.abs(result.heights[row, col] - z[inside])[on_road])
-    paper, production = (np.concatenate(errors[name]) for name in CHAINS)
-    print(
-        f"\nAutzen north, distance to ground points on roads: paper {paper.mean():.4f} m, "
-        f"production {production.mean():.4f} m"
-    )
-    print(f"  {interval(paper, production)}")
-
-
-def call(words: list[str]) -> None:
-    """Run a command of the program."""
-    before, sys.argv = sys.argv, ["flexroad", *words]
-    try:
-        flexroad()
-    except SystemExit as end:
-        if end.code:
-            raise
-    finally:
-        sys.argv = before
-
-
-TOWNS = {
-    "Barbican": ("London_BNG", "EPSG:27700", {
-        "dsm": "dsm_barb*.tif", "dtm": "dem_barb*.tif", "canopy": "cdsm_barb*.tif", "cover": "landcover*.tif",
-    }),
-    "Gothenburg": ("Goteborg_SWEREF99_1200", "EPSG:3007", {
-        "dsm": "DSM_KR*.tif", "dtm": "DEM_KR*.tif", "canopy": "CDSM_KR*.asc", "cover": "landcover.tif",
-    }),
-}  # fmt: skip
-
-
 def main() -> None:
     tiles = int(sys.argv[1]) if len(sys.argv) > 1 else TILES
-    with tempfile.TemporaryDirectory() as name:
-        scratch = Path(name)
+    with tempfile.TemporaryDirectory() as made:
+        scratch = Path(made)
         if tiles:
             benchmark(tiles, scratch / "made")
         if folder := os.environ.get("FLEXROAD_REAL_DATA"):
             print(f"\nDSM with canopies; DTM with {NOISE_M} m of noise and with scars")
-            for place, (archive, crs, patterns) in TOWNS.items():
-                town(place, Path(folder) / "umep" / f"{archive}.zip", crs, patterns, scratch)
-            autzen(Path(folder) / "autzen", scratch)
+            for name in ARCHIVES:
+                town(name, Path(folder), scratch)
 
 
 if __name__ == "__main__":

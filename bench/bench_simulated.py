@@ -1,4 +1,4 @@
-"""Tiles that return at once: what client, scheduler and workers cost per tile, and the client's memory.
+"""Tiles that return at once: CPU time of client, scheduler and workers per tile, and the client's memory.
 
 The tiles are tiny parts of two large rasters and a mask. Usage:
 ``python bench/bench_simulated.py [TILES]``; 100,000 tiles take an hour.
@@ -18,8 +18,6 @@ from typing import Any
 
 import numpy as np
 import psutil
-import rasterio
-from numpy.typing import NDArray
 
 from bench.timing import resident_mb
 from flexroad.catalog import Catalog, Grid
@@ -31,6 +29,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from tests.made_result import done
+from tests.make_rasters import write
 
 TILES = 2000
 """Default number of tiles."""
@@ -39,7 +38,7 @@ PATCH_M = 400
 """Size of the synthetic scene of which the rasters are repeated copies."""
 WORKERS = 2
 STARTED = 0.3
-"""Share of the tiles after which CPU time counts: code is loaded."""
+"""Share of the tiles after which CPU time is measured, because code is then loaded."""
 LAYERS = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_mask": "road.tif"}
 CONFIG = {
     "fit": {"control_points": [12, 12], "iterations": 30},
@@ -62,22 +61,14 @@ def survey(folder: Path, side: int) -> None:
     # Dense streets, so that every tile has one.
     scene = make_scene(grid, 7, options=SceneOptions(block_m=20))
     cells = side * TILE_M
-    write(folder / "dsm.tif", scene.dsm, cells)
-    write(folder / "dtm.tif", scene.dtm, cells)
-    write(folder / "road.tif", scene.reference_road.astype(np.uint8), cells)
-
-
-def write(path: Path, patch: NDArray[Any], cells: int) -> None:
-    """Write a raster of repeated copies of a patch."""
     repeat = math.ceil(cells / PATCH_M)
-    data = np.tile(patch, (repeat, repeat))[:cells, :cells]
-    data = data.astype(np.float32) if data.dtype == np.float64 else data
-    layout = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
-    place = {"crs": "EPSG:25832", "transform": rasterio.transform.from_origin(300_000, 5_700_000, 1, 1)}
-    with rasterio.open(
-        path, "w", height=cells, width=cells, count=1, dtype=data.dtype, **layout, **place
-    ) as raster:
-        raster.write(data, 1)
+    layout = {"tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
+    for name, patch in (
+        ("dsm", scene.dsm.astype(np.float32)),
+        ("dtm", scene.dtm.astype(np.float32)),
+        ("road", scene.reference_road.astype(np.uint8)),
+    ):
+        write(folder / f"{name}.tif", np.tile(patch, (repeat, repeat))[:cells, :cells], **layout)
 
 
 def busy(processes: list[psutil.Process]) -> float:
@@ -141,7 +132,8 @@ def simulated(folder: Path, tiles: int) -> dict[str, Any]:
             f"  {sample['tiles']:9,.0f} tiles: client {sample['client_mb']:6.0f} MB, "
             f"largest worker {sample['worker_mb']:6.0f} MB"
         )
-    # From the middle on, because Dask fills logs of recent messages before; without the end of the run.
+    # The growth is measured from the middle on, because Dask fills logs before; the end of the run is left
+    # out.
     middle, late = executor.samples[len(executor.samples) // 2], executor.samples[-2]
     grown = (late["client_mb"] - middle["client_mb"]) * 2**20 / (late["tiles"] - middle["tiles"])
     print(f"  growth of the client in the second half: {grown:.0f} bytes a tile", flush=True)

@@ -1,8 +1,7 @@
 """Start of commands: CPU time of whole processes, relative to ``python -c "import numpy"``.
 
 Targets: ``flexroad --help`` at most 3, ``flexroad config show`` at most 8, a run with nothing to do over ten
-tiles at most 15, a rerun of one tile at most 25, all with the default number of workers. Two workers must not
-take longer than one over 48 small tiles, wall time and CPU time: ``bench_start.py --tiles``.
+tiles at most 15, a rerun of one tile at most 25, all with the default number of workers.
 """
 
 from __future__ import annotations
@@ -12,14 +11,12 @@ import resource
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline import ONE_THREAD
 
 ROUNDS = 7
-SMALL_TILES = 48
 FLEXROAD = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()"]
 ENVIRONMENT = {
     name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
@@ -35,7 +32,7 @@ def cpu_s(command: list[str]) -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def start() -> None:
+def main() -> None:
     """Print the CPU time of short commands."""
     with tempfile.TemporaryDirectory() as scratch:
         survey, run = Path(scratch, "survey"), Path(scratch, "run")
@@ -63,44 +60,6 @@ def start() -> None:
     print(f"{'command':32}{'CPU s':>8}{'ratio':>8}{'target':>8}")
     for name, (_, target) in commands.items():
         print(f"{name:32}{best[name]:8.2f}{best[name] / base:8.1f}{target:8}")
-
-
-def tiles() -> None:
-    """Print wall and CPU time of a run over small tiles with one and with two workers, in turn."""
-    with tempfile.TemporaryDirectory() as scratch:
-        survey = Path(scratch, "survey")
-        synthetic = [
-            "catalog",
-            "synthetic",
-            "-o",
-            str(survey),
-            "--tiles",
-            str(SMALL_TILES),
-            "--tile-size",
-            "60",
-        ]
-        subprocess.run([*FLEXROAD, *synthetic], check=True, capture_output=True)
-        common = [*FLEXROAD, "run", "--config", "production", "--catalog", str(survey / "catalog.parquet")]
-        ways = {
-            "one worker": ["--workers", "1"],
-            "two workers": ["--workers", "2"],
-            "two workers, always": ["--workers", "2", "--executor", "dask"],
-        }
-        # First run not timed: it compiles.
-        subprocess.run([*common, "--out", str(Path(scratch, "first"))], check=True, capture_output=True)
-        print(f"{SMALL_TILES} tiles of 60 m{'':14}{'wall s':>8}{'CPU s':>8}")
-        for turn in range(2):
-            for name, words in ways.items():
-                begin = time.perf_counter()
-                cpu = cpu_s([*common, *words, "--out", str(Path(scratch, f"{name} {turn}"))])
-                print(f"{name:32}{time.perf_counter() - begin:8.1f}{cpu:8.1f}")
-
-
-def main() -> None:
-    if "--tiles" in sys.argv:
-        tiles()
-    else:
-        start()
 
 
 if __name__ == "__main__":

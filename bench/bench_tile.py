@@ -1,8 +1,8 @@
 """The stages of a tile, load to exported files, beside their floors: production's and the paper's settings.
 
 CPU ms of one thread: the lowest of some rounds, mean of tiles from urban to rural. The floors are formulas of
-`floors.py`, over what one core did at most in the same run. A tile alone computes its four corners and four
-edges; in a mosaic, where neighbours share them, it pays for one corner and two edges.
+`floors.py`, over the highest rate of one core in the same run. A tile alone computes its four corners and
+four edges; in a mosaic, where neighbours share them, it pays for one corner and two edges.
 
 Usage: ``python bench/bench_tile.py [--rounds 5] [--tiles 4] [--json FILE]``
 """

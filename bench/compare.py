@@ -2,7 +2,7 @@
 
 Each checkout runs `measure_stages.py` with its own interpreter, ``.venv/bin/python``, in one process per
 configuration. Both process the same tiles, one after the other, so that a slower machine affects both. The
-lowest time of all rounds counts for each stage of each tile; the table has means over tiles. A tile is alone
+lowest time of all rounds is used for each stage of each tile; the table has means over tiles. A tile is alone
 in its store: it computes its four corners and four edges itself. Heights and rows of both are compared.
 
 Usage: ``python bench/compare.py OTHER_CHECKOUT [--rounds 5] [--tiles 4] [--configs production paper]``
@@ -85,7 +85,7 @@ def started(root: Path, catalog: Path, config: str, folder: Path) -> Iterator[su
     """Start the measuring process of a checkout in an empty folder, and end it with the block."""
     python = root / ".venv" / "bin" / "python"
     folder.mkdir()
-    # Without PYTHONPATH: it might name this checkout, and the other one is to be imported.
+    # PYTHONPATH is removed: it might name this checkout, but the other checkout must be imported.
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | ONE_THREAD
     words = [str(python if python.exists() else sys.executable), str(SCRIPT), str(catalog), config]
     with subprocess.Popen(

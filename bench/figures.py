@@ -44,7 +44,7 @@ def inner_imports(tree: ast.Module) -> int:
 
 
 def keys(node: Any) -> set[str]:
-    """Return the keys that a JSON schema names, those of its definitions included."""
+    """Return the keys that a JSON schema names, including keys of its definitions."""
     if isinstance(node, list):
         return {key for item in node for key in keys(item)}
     if not isinstance(node, dict):
@@ -53,7 +53,7 @@ def keys(node: Any) -> set[str]:
 
 
 def configuration_keys() -> int:
-    """Return the number of keys of a configuration; each counts once in its section, also for two methods."""
+    """Return the number of keys of a configuration; a key of several methods of a section is counted once."""
     sections = schema()["properties"]
     inner = [keys(part) for section, part in sections.items() if section != "variants"]
     return len(sections) + sum(map(len, inner))

@@ -1,9 +1,9 @@
-"""Floors of the stages: the work that any method with the same result has to do, as formulas.
+"""Floors of the stages: the least work of any method with the same result, as formulas.
 
 A stage reads every input once, writes every result once, and does the arithmetic below. Its floor is the
 longer of two times: bytes over the rate at which one core copies memory, and operations over the rate of a
-product of matrices. No stage can be faster; how near a good implementation comes differs: ``sample`` and
-``evaluate`` have branches, ``load`` and ``export`` have (de)compression, which the floors leave out.
+product of matrices. No stage can be faster. A good implementation may be slower: ``sample`` and ``evaluate``
+have branches, ``load`` and ``export`` have (de)compression, which the floors leave out.
 
 Symbols: N cells with the halo, n cells of the tile, V vertices, F faces, and for a fit H x W cells, m x k
 control points and s steps.
@@ -35,7 +35,7 @@ DRAPE, FACE, EDGE = 10, 20, 30
 
 @dataclass(frozen=True)
 class Work:
-    """Operations and bytes that a stage cannot do without."""
+    """Operations and bytes that a stage needs at least."""
 
     flops: float = 0.0
     bytes: float = 0.0
@@ -95,8 +95,8 @@ def surface(cells: tuple[int, int], points: tuple[int, int]) -> int:
 def fit(size: FitSize) -> Work:
     """Operations: s x (2 x fields x surface + `PER_CELL` x H x W): the surface, its transpose for a slope.
 
-    Any solver that takes s steps evaluates both once in each step; what it spends to solve the equations in
-    between is left out. Bytes: targets and weights read once, because a cache may hold them.
+    Any solver with s steps evaluates both once in each step; the time to solve the equations is left out.
+    Bytes: targets and weights are read once, because a cache may keep them.
     """
     cells = size.cells[0] * size.cells[1]
     step = 2 * size.fields * surface(size.cells, size.points) + PER_CELL * cells

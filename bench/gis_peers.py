@@ -1,9 +1,9 @@
 """Peers of `bench_peers` that are programs: GMT and GRASS, where they are installed.
 
 On Debian: ``apt install gmt grass-core``. Both get the same points as the libraries, as text. Their CPU time
-is that of the module alone; reading the points into GRASS and writing the raster do not count. The settings
-are those with the lowest road error among a few that were tried on the same tile, so the peers do at least
-as well as with their defaults.
+includes only the module, not reading the points into GRASS and writing the raster. The settings have the
+lowest road error among a few that were tried on the same tile. So the peers do at least as well as by
+default.
 """
 
 from __future__ import annotations

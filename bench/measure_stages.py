@@ -1,6 +1,6 @@
 """CPU time of the stages of tiles, in a process that measures one round for each line of its input.
 
-It imports nothing of its own folder, so that the interpreter of another checkout can run it (`compare.py`).
+It imports no module of its folder, so that the interpreter of another checkout can run it (`compare.py`).
 
 Usage: ``python bench/measure_stages.py CATALOG CONFIG FOLDER``; prints a JSON object for each round.
 """
@@ -33,7 +33,7 @@ def main(catalog: Path, config: str, folder: Path) -> None:
     for number, _ in enumerate(sys.stdin):
         measured = []
         for tile in tiles:
-            # A fresh store: a tile computes its corners and edges itself. Earlier rounds are removed.
+            # With a fresh store, a tile computes its corners and edges itself. Earlier rounds are removed.
             shutil.rmtree(folder / tile.id, ignore_errors=True)
             measured.append(measure(folder / tile.id, alone, Catalog((tile,))))
         print(json.dumps({"round": number, "tiles": measured}), flush=True)
@@ -41,7 +41,7 @@ def main(catalog: Path, config: str, folder: Path) -> None:
 
 def by_cpu_time() -> None:
     """Let stages measure themselves by CPU time, because other programs may use the machine."""
-    # Where the clock is bound differs between checkouts.
+    # Checkouts may bind the clock in different modules.
     sys.modules[StageCost.__module__].perf_counter = time.process_time  # type: ignore[attr-defined]
 
 

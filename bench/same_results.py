@@ -1,8 +1,9 @@
-"""Compare the results of this checkout with those of another one, byte by byte.
+"""Compare the results of this checkout with the results of another checkout, byte by byte.
 
 Both run each configuration over the same synthetic tiles, with the same interpreter. Compared are the
-fingerprints (names of the files in the store), the bytes of all products and mosaics, the metrics without
-times, and the sources, nodes and versions in each tile's item. The exit code is 1 if something differs.
+fingerprints (names of the files in the store), the bytes of all products and mosaics. Also compared are the
+metrics without times, and the sources, nodes and versions in each tile's item. The exit code is 1 if
+something differs.
 
 Usage: ``python bench/same_results.py OTHER_CHECKOUT [--tiles 12] [--configs production paper]``, with
 ``--other-options`` if the checkouts have different options: fingerprints and nodes are then not compared.
@@ -39,11 +40,11 @@ main()
 
 
 def run(root: Path, catalog: Path, config: str, out: Path, compared: Sequence[str]) -> dict[str, str]:
-    """Run a configuration with a checkout; return what it has given, by name."""
+    """Run a configuration with a checkout; return its results by name."""
     words = ["run", "--config", config, "--catalog", str(catalog), "--out", str(out), "--executor", "serial"]
     environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(root)}
     command = [sys.executable, "-c", COMMAND, str(root / "flexroad" / "__init__.py"), *words]
-    # In another folder: Python would import the package of the folder that it is started in.
+    # It runs in another folder: Python would import the package of the current folder.
     subprocess.run(command, cwd=catalog.parent, env=environment, check=True)
     stored = (out / "store").rglob("*.npz") if "fingerprint" in compared else ()
     results = {str(path.relative_to(out)): "stored" for path in stored}

@@ -1,7 +1,7 @@
 """Measure the tables and the plot of docs/results/speed.md and write them into the page: ``make speed``.
 
-Everything is CPU time, so other programs on the machine change it little. The page says how each figure is
-made; the text around the tables is not touched.
+All times are CPU time, so other programs on the machine change them little. The page says how each figure is
+made; the text around the tables is not changed.
 
 Usage: ``python bench/speed_page.py [--rounds 5] [--tiles 4] [--simulated 10000]``
 """
@@ -44,12 +44,12 @@ NUMBERS = (1, 2, 4, 8)
 
 @dataclass(frozen=True)
 class Curves:
-    """What the plot shows."""
+    """The values of the plot."""
 
     fit_ms: list[tuple[int, float]]
     """Control points of a tile and CPU time of its fit (ms)."""
     run_ms: list[tuple[int, float]]
-    """Tiles of a run and CPU time of all of it (ms)."""
+    """Tiles of a run and its CPU time (ms)."""
 
 
 def main() -> None:
@@ -100,10 +100,7 @@ def stages(rows: list[bench_tile.Row], top: Peak, options: argparse.Namespace) -
 def state(rows: list[bench_tile.Row], sent: dict[str, Any], scan: dict[str, float]) -> str:
     """Return the estimate for a state as Markdown: sums of measured parts.
 
-    Parameters
-    ----------
-    scan : dict
-        CPU time of `points_ms` by ground method.
+    - `scan`: CPU time of `points_ms` by ground method.
     """
     tile_ms = next(row.ms for row in rows if (row.config, row.stage) == ("production", "tile of a mosaic"))
     worker_ms, client_ms = (1000 * sent["per_tile"][name] for name in ("worker_s", "client_s"))

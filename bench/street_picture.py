@@ -2,7 +2,7 @@
 
 Before is the scan with its photograph; after is the mesh of ``production_vector``, whose roads were drawn by
 hand (``--set "segment.where=class = 'road' AND certainty <> 'low'"``). The data are a laser scan
-of Eugene, Oregon (Watershed Sciences, PDAL/data, CC BY 4.0). The photograph is made of the colours of its
+of Eugene, Oregon (Watershed Sciences, PDAL/data, CC BY 4.0). The photograph is made from the colours of its
 points, moved by 2 m onto its heights. Section "Autzen" of docs/results/real_data.md has the command that
 makes the rasters.
 

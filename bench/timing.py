@@ -1,7 +1,7 @@
-"""Clocks of the benchmarks: CPU time of one thread, and what one core of this machine can do at most.
+"""Clocks of the benchmarks: CPU time of one thread, and the highest rates of one core of this machine.
 
-CPU time counts, not the time on the wall: other programs may use the machine. The lowest of several
-measurements counts, because caches and clock rates only ever add.
+CPU time is measured, not wall time, because other programs may use the machine. The lowest of several
+measurements is used, because caches and clock rates only add time.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import numpy as np
 import psutil
 
 DGEMM, STREAM = 1024, 8_000_000
-"""Side of the matrices, and length of the arrays (64 MB: no cache holds it), that measure a core."""
+"""Side of the matrices, and length of the arrays (64 MB: larger than caches), that measure a core."""
 
 
 @dataclass(frozen=True)
 class Peak:
-    """What one core does at most."""
+    """The highest rates of one core."""
 
     dgemm: float
     """Floating-point operations per second in a product of matrices of float64."""
     axpy: float
-    """The same in ``y + x`` over long arrays: bound by memory."""
+    """Floating-point operations per second in ``y + x`` over long arrays: bound by memory."""
     copy: float
     """Bytes read and written per second when memory is copied."""
 

@@ -23,9 +23,9 @@ from flexroad.catalog.text import reason
 pyogrio = lazy("pyogrio")
 
 TOUCH_M = 1e-3
-"""Overlap that counts (m): tiles beside an area that ends on their edge do not lie on it."""
+"""Least overlap of a tile and an area (m): an area that ends on the edge of a tile does not touch it."""
 STEPS = 8
-"""Parts of a tile's side in the CRS of the area, where sides are curved."""
+"""Number of parts into which a tile's side is divided: it is curved in the CRS of the area."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """The border of a tile in parts that belong to no tile: four corners and four edges.
 
 Up to four tiles meet at a corner and two share an edge. A part is described by its position and by the size
-of the tiles alone, so that all tiles around it describe it in the same way.
+of the tiles alone. So all tiles around it describe it in the same way.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ Unit = tuple[str, float]
 
 @lru_cache(maxsize=256)
 def _parts(text: str) -> tuple[CRS, CRS | None]:
-    """Return the horizontal CRS and, of a compound one, the vertical CRS (else None)."""
+    """Return the horizontal CRS, and the vertical CRS or None."""
     try:
         crs = CRS.from_user_input(text)
     except CRSError as error:
@@ -104,7 +104,7 @@ def _in_metres(height: CRS) -> CRS:
 
 @lru_cache(maxsize=256)
 def compound(plan: str, height: str) -> str:
-    """Return the compound CRS of a horizontal and a vertical one as WKT."""
+    """Return the compound CRS of a horizontal and a vertical CRS as WKT."""
     parts = [CRS.from_user_input(plan), CRS.from_user_input(height)]
     return str(CompoundCRS(" + ".join(part.name for part in parts), parts).to_wkt())
 
@@ -126,7 +126,7 @@ def short(text: str) -> str:
 
 
 def code(text: str) -> str | None:
-    """Return the EPSG code of a CRS, of a compound one that of the whole: ``25832``; None if it has none."""
+    """Return the EPSG code of a CRS, such as ``25832``, or None. A compound CRS has a code of its own."""
     number = CRS.from_user_input(text).to_epsg()
     return str(number) if number else None
 
@@ -148,7 +148,7 @@ def esri(text: str) -> str:
 
 
 def utm_of(degrees: Bounds) -> str:
-    """Return the code of the UTM zone (WGS 84) at the middle of bounds (degrees), of any if they are NaN."""
+    """Return the code of the UTM zone (WGS 84) at the middle of bounds (degrees); any zone for NaN."""
     east, north = (degrees[0] + degrees[2]) / 2, (degrees[1] + degrees[3]) / 2
     known = math.isfinite(east) and math.isfinite(north)
     zones = query_utm_crs_info("WGS 84", AreaOfInterest(east, north, east, north)) if known else []
@@ -196,7 +196,7 @@ def degrees(text: str, easting: float, northing: float) -> tuple[float, float]:
 
 
 def scales(source: str, target: str, x: float, y: float) -> tuple[float, float]:
-    """Return how far one unit of a CRS reaches along the two axes of another one, in units of the latter.
+    """Return the length of one unit of ``source`` along the two axes of ``target``, in units of ``target``.
 
     - `x`, `y`: a point, in ``source``.
     """
@@ -208,7 +208,7 @@ def scales(source: str, target: str, x: float, y: float) -> tuple[float, float]:
 
 
 def bounds_in(target: str, source: str, bounds: Bounds) -> Bounds:
-    """Return the bounds, in another CRS, of what lies within bounds; NaN if they cannot be transformed."""
+    """Return bounds transformed to another CRS; NaN if they cannot be transformed."""
     try:
         west, south, east, north = transformer(source, target).transform_bounds(*bounds, densify_pts=21)
     except ProjError:

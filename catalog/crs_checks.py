@@ -15,19 +15,19 @@ from flexroad.catalog.grid import Bounds, overlap
 from flexroad.catalog.text import edges
 
 MAX_SCALE_ERROR = 0.01
-"""Largest share by which a metre of a CRS may differ from one on the ground."""
+"""Largest share by which a metre of a CRS may differ from a metre on the ground."""
 STEP = 10.0
 """Length over which the scale is measured (units of the CRS)."""
 TURN_AND_BIT = 1.005
-"""Degrees count as such up to 360 and 90 times this: files reach half a cell beyond the poles."""
+"""Largest degrees are 360 and 90 times this: files reach half a cell beyond the poles."""
 ZONE = 1e6
-"""Eastings with the number of their zone first differ from those without by a multiple of this (m)."""
+"""The number of the zone in front of an easting adds a multiple of this (m)."""
 ZONED = {"EPSG:25831": "EPSG:5649", "EPSG:25832": "EPSG:4647", "EPSG:25833": "EPSG:5650"}
 """CRS -> the same with the number of the zone before the easting."""
 
 
 def may_be_in(crs: str, bounds: Bounds) -> bool:
-    """Return whether bounds may be in a CRS: in one of angles, they are at most a turn and a right angle."""
+    """Return whether bounds may be in a CRS: angles are at most a full turn and a right angle."""
     if not is_geographic(crs):
         return True
     turn = 2 * math.pi / plan_unit(crs)[1] * TURN_AND_BIT
@@ -36,10 +36,10 @@ def may_be_in(crs: str, bounds: Bounds) -> bool:
 
 
 def crs_of(declared: str | None, given: str | None, bounds: Bounds) -> str | None:
-    """Return the CRS of a file: the one it declares, or the given one if it has none or that cannot be.
+    """Return the CRS of a file: the declared one, or the given one if the file declares none or a wrong one.
 
-    - `declared`, `given`: the CRS of the file, and the one for files without a CRS.
-    - `bounds`: those of the file, in its CRS; NaN if they are unknown.
+    - `declared`, `given`: the CRS in the file, and the CRS for files without one.
+    - `bounds`: the bounds of the file, in its CRS; NaN if they are unknown.
     """
     if declared and (given is None or not np.isfinite(bounds).all() or may_be_in(declared, bounds)):
         return declared
@@ -47,7 +47,7 @@ def crs_of(declared: str | None, given: str | None, bounds: Bounds) -> str | Non
 
 
 def angle_fault(crs: str, bounds: Bounds) -> str | None:
-    """Return that coordinates are no angles though a CRS says so, to follow a file's name; else None."""
+    """Return a message if a CRS has angles but the coordinates are not angles, to follow a file's name."""
     if not np.isfinite(bounds).all() or may_be_in(crs, bounds):
         return None
     west, south, east, north = bounds
@@ -58,10 +58,10 @@ def angle_fault(crs: str, bounds: Bounds) -> str | None:
 
 
 def require_scale(title: str, crs: str, bounds: Bounds, remedy: str) -> None:
-    """Check that a metre of a CRS is one on the ground, within `MAX_SCALE_ERROR`.
+    """Check that a metre of a CRS is a metre on the ground, within `MAX_SCALE_ERROR`.
 
     - `crs`: a CRS in metres; one that is not projected is not checked.
-    - `bounds`: those of the data, in the CRS; the scale at their centre counts.
+    - `bounds`: bounds of the data, in the CRS; the scale is measured at their centre.
     - `remedy`: what to do, for the message; ``{zone}`` is replaced by the code of the UTM zone.
     """
     if not is_projected(crs):
@@ -98,9 +98,9 @@ def _to_degrees(crs: str) -> tuple[Transformer, Geod]:
 
 
 def elsewhere(crs: str, bounds: Bounds, target: str, ground: Bounds, reach_m: float) -> str:
-    """Return where a layer lies that does not reach the tiles, and where these lie, to follow its name.
+    """Return the places of the tiles and of a layer that does not reach them, to follow the layer's name.
 
-    - `crs`, `bounds`: CRS and bounds of the layer; `target`, `ground`: those of the tiles.
+    - `crs`, `bounds`: CRS and bounds of the layer; `target`, `ground`: CRS and bounds of the tiles.
     - `reach_m`: distance up to which a layer reaches a tile (m).
     """
     text = f"lies at {edges(bounds)} in {short(crs)}, the tiles at {edges(ground)} in {short(target)}"
@@ -112,7 +112,7 @@ def elsewhere(crs: str, bounds: Bounds, target: str, ground: Bounds, reach_m: fl
 
 
 def _mistakes(crs: str, bounds: Bounds, target: str, ground: Bounds) -> Iterator[tuple[str, str, Bounds]]:
-    """Yield known mistakes, each with the CRS and the bounds that the layer has if it was made."""
+    """Yield known mistakes, each with the true CRS and bounds of the layer if this mistake was made."""
     west, south, east, north = bounds
     yield "its axes are swapped: give easting before northing", crs, (south, west, north, east)
     here = bounds_in(crs, target, ground)

@@ -1,4 +1,4 @@
-"""Rasters that a catalog makes of files that are none, beside itself."""
+"""Rasters made from inputs that are not rasters (point files). They are stored next to the catalog."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def write_heights(target: Path, heights: Floats, transform: Affine, crs: str) ->
 
 
 def is_current(source: Path, target: Path) -> bool:
-    """Return whether a raster is not older than the file that it was made of, and is not damaged."""
+    """Return whether a raster is undamaged, and not older than the file from which it was made."""
     try:
         if target.stat().st_mtime_ns < source.stat().st_mtime_ns:
             return False
@@ -57,7 +57,7 @@ def rasters_of_points(source: Path, corner: tuple[float, float]) -> tuple[dict[s
 
     - `source`: NumPy archive with the arrays x and y (m) and others of their shape, or of the shape ``(y,
       x)``.
-    - `corner`: added to coordinates that are all below 1000 m: they count from the corner of the tile.
+    - `corner`: added to coordinates that are all below 1000 m: they are relative to the corner of the tile.
     """
     arrays = _arrays(source)
     try:
@@ -89,7 +89,7 @@ def rasters_of_points(source: Path, corner: tuple[float, float]) -> tuple[dict[s
 
 
 def _arrays(source: Path) -> dict[str, NDArray[np.generic]]:
-    """Return the numeric arrays of an archive whose size was checked before any is read."""
+    """Return the numeric arrays of an archive, after a check of their size."""
     try:
         require_regular(source)
         with zipfile.ZipFile(source) as archive:

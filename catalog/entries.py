@@ -1,7 +1,7 @@
 """Entries of catalog files, and the tiles in them.
 
-A tile is made of each entry. If an entry cannot be used, its tile has a `Tile.fault`: it keeps its id, or
-gets one such as ``entry-17`` if that is at fault, too.
+Each entry becomes a tile. If an entry cannot be used, its tile has a `Tile.fault`. The tile keeps its id, or
+gets an id such as ``entry-17`` if the id cannot be used either.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ YEARS = range(1000, 10_000)
 """Years that are written with four digits."""
 MAX_MESSAGE = 500
 MAX_FAULTS = 10_000
-"""Most entries of a catalog that cannot be used; with more it is something else, and may have millions."""
+"""Most entries of a catalog that cannot be used; a file with more is probably not a catalog."""
 
 MAX_LABEL = 200
 """Longest stratum and name of a dataset."""
 WORDS = {dict: "not an object", list: "not a list", bool: "neither true nor false"}
-"""What a value of another type is."""
+"""Words for a value of another type."""
 PROPERTIES = "properties."
 T = TypeVar("T", Layer, datetime)
 
@@ -74,7 +74,7 @@ class TileReader:
         self._names = _Names()
 
     def tiles(self, entries: Iterable[Any]) -> tuple[Tile, ...]:
-        """Return a tile for each entry; those of unusable entries have a fault."""
+        """Return a tile for each entry; tiles of unusable entries have a fault."""
         tiles, faults = [], 0
         for number, entry in enumerate(entries, 1):
             tiles.append(self._tile(entry, number))
@@ -106,13 +106,13 @@ class TileReader:
             properties = entry.get("properties")
             known = properties.get("flexroad:fault") if isinstance(properties, dict) else None
             if known and isinstance(known, str):
-                # It was not usable in the catalog that this one was copied from.
+                # The entry was not usable in the catalog from which this catalog was copied.
                 return faulty(tile_id, printable(known)[: 2 * MAX_MESSAGE], self._folder)
             return self._usable(tile_id, _field(entry, "properties", dict), _field(entry, "assets", dict))
         except CatalogError as error:
             reason = str(error)
         except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
-            # No mistake that is known, but one entry must not cost the others.
+            # An unknown mistake in one entry must not make the other entries unusable.
             reason = repr(error)
         fault = f"{self._kind} {number} of {self._file}: {printable(reason)[:MAX_MESSAGE]}; "
         return faulty(tile_id, fault + "correct it, or make the catalog again", self._folder)
@@ -175,7 +175,7 @@ class TileReader:
 
 @lru_cache(RECENT)
 def _shared(value: T) -> T:
-    """Return the first one of equal values: most tiles have the layers and the date of a neighbour."""
+    """Return the first of equal values: most tiles have the same layers and date as a neighbour."""
     return value
 
 
@@ -242,7 +242,7 @@ def _placed(transform: list[Any]) -> tuple[float, float, float]:
     if not 6 <= len(transform) <= 9 or not set(map(type, transform)) <= {float, int}:
         raise CatalogError(f"properties.proj:transform: {shown(transform)} are not six numbers")
     try:
-        # JSON may hold whole numbers; fingerprints are of the text of numbers.
+        # JSON may have whole numbers, but fingerprints are made of the text of a float.
         numbers = list(map(float, transform))
     except OverflowError:
         numbers = [math.inf]
@@ -262,7 +262,7 @@ def _placed(transform: list[Any]) -> tuple[float, float, float]:
 @lru_cache(maxsize=256)
 def _check_crs(text: str, field: str) -> None:
     if "\0" in text:
-        # PROJ reads the text before it.
+        # PROJ reads only the text before the zero byte.
         raise CatalogError(f"{field}: unknown CRS {shown(text)}")
     try:
         crs.in_plan(text)
@@ -318,7 +318,7 @@ def _extents(asset: dict[str, Any], files: int) -> tuple[Bounds, ...]:
 
 @lru_cache(maxsize=16)
 def _unpacked(edges: bytes) -> tuple[Bounds, ...]:
-    """Return the extents of a layer's files; cached, because a tile's layers often have the same ones."""
+    """Return the extents of a layer's files; cached, because the layers of a tile often share them."""
     if np.isnan(np.frombuffer(edges)).any():
         raise CatalogError("flexroad:extents: a number is NaN")
     return tuple(struct.iter_unpack("=4d", edges))

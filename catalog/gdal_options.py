@@ -1,9 +1,9 @@
 """Options of GDAL and PROJ on which results depend: neither environment nor configuration files change them.
 
-GDAL's list has about 1,100 options (``port/cpl_known_config_options.h``). Here are those of its core, and of
-formats read or written here, that change cells, places, features or text. Those for limits, speed, messages
-and access to the web are left to the user. GDAL takes an option from the program, else from the environment,
-else from ``GDAL_CONFIG_FILE`` or ``~/.gdal/gdalrc``.
+GDAL's list has about 1,100 options (``port/cpl_known_config_options.h``). This file has the options of the
+core and of our formats that change cells, places, features or text. The user may set options for limits,
+speed, messages and access to the web. GDAL takes an option from the program, else from the environment, else
+from ``GDAL_CONFIG_FILE`` or ``~/.gdal/gdalrc``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from flexroad.catalog.lazy import lazy
 pyogrio = lazy("pyogrio")
 
 CHOSEN = {
-    # Do not list the folder for every file (it may hold 10,000); side-car files are still opened.
+    # Do not list the folder for every file (it may have 10,000); side-car files are still opened.
     "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",
     # Otherwise GDAL does not report the vertical CRS of GeoTIFF 1.0 files.
     "GTIFF_REPORT_COMPD_CS": "YES",
@@ -30,7 +30,7 @@ CHOSEN = {
 DEFAULTS = {
     # Damaged blocks of a GeoTIFF would be 0 without an error.
     "GTIFF_IGNORE_READ_ERRORS": "NO",
-    # The same of answers of a server.
+    # Cut-off answers of a server would be read without an error, too.
     "CPL_CURL_IGNORE_ERROR": "NO",
     # These move rasters, some by half a cell, or turn them upside down.
     "GTIFF_POINT_GEO_IGNORE": "FALSE",
@@ -40,7 +40,7 @@ DEFAULTS = {
     "GDAL_USE_GMLJP2": "TRUE",
     "GDAL_IGNORE_AXIS_ORIENTATION": "FALSE",
     "GDAL_JP2K_ALT_OFFSETVECTOR_ORDER": "FALSE",
-    # These make a georeference of points that do not fit one.
+    # These make a georeference from control points that do not fit a georeference.
     "GDAL_GCPS_TO_GEOTRANSFORM_APPROX_OK": "NO",
     "TAB_APPROX_GEOTRANSFORM": "NO",
     # These change the CRS that a file has, or its parameters.
@@ -151,21 +151,21 @@ WITHOUT_DEFAULT = (
     "PROJ_AUX_DB",
     "PROJ_ONLY_BEST_DEFAULT",
 )
-"""Options without a value that stands for no value: they are removed from the environment."""
+"""Options that have no neutral value: they are removed from the environment."""
 NETWORK = "PROJ_NETWORK"
 """PROJ asks a server for grids, so that places depend on its answer; conda sets it in every shell."""
 FOLDERS = "PROJ_LIB PROJ_DATA GDAL_DATA GDAL_DRIVER_PATH OGR_DRIVER_PATH GDAL_PYTHON_DRIVER_PATH".split()
-"""Folders of data and drivers, which only fit the GDAL and PROJ that they were installed with."""
+"""Folders of data and drivers, which fit only the GDAL and PROJ with which they were installed."""
 FILE = "GDAL_CONFIG_FILE"
 
 
 def use_own_values(variables: MutableMapping[str, str] = os.environ) -> str:
-    """Remove what changes results from the environment, and turn off GDAL's configuration files.
+    """Remove variables that change results from the environment, and turn off GDAL's configuration files.
 
     Call it before GDAL and PROJ are loaded. Folders of the environment that Python runs in stay if rasterio
     has no data of its own: conda sets them.
 
-    - result: a line on what is ignored, empty if nothing is.
+    - result: a line that lists the ignored settings; empty if no setting is ignored.
     """
     own = None if _has_own_data() else Path(sys.prefix).resolve()
     foreign = {name: variables[name] for name in (*DEFAULTS, *WITHOUT_DEFAULT) if name in variables}

@@ -20,9 +20,9 @@ pyproj = lazy("pyproj")
 Item = dict[str, Any]
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 AT_ONCE = 1000
-"""Rows that are objects at a time: these take many times the memory of a table."""
+"""Number of rows that are converted to objects at a time: objects take many times the memory of a table."""
 GROUP = 10_000
-"""Rows of a row group, which are a table in memory until they are written; a multiple of `AT_ONCE`."""
+"""Rows of a row group, which stays in memory until it is written; a multiple of `AT_ONCE`."""
 MAX_ROWS = 10_000_000
 MAX_UNPACKED = 8 * 2**30
 """Most rows and bytes of a table, unpacked; ten million tiles of 250 m are 625,000 km2."""
@@ -46,11 +46,11 @@ class Unreadable:
 FIELDS = tuple(
     f".flexroad:{name}" for name in ("files", "values", "crs", "reproject", "sublayer", "height_unit")
 )
-"""Fields of an asset that make a layer, without its extents."""
+"""Fields of an asset from which a layer is made, without its extents."""
 
 
 def entries(data: bytes) -> tuple[Iterator[Item], Any]:
-    """Return the fields of each item that make a tile, and the entries of skipped files.
+    """Return the fields of each item from which a tile is made, and the entries of skipped files.
 
     Reading complete items is many times slower.
     """
@@ -70,7 +70,7 @@ def entries(data: bytes) -> tuple[Iterator[Item], Any]:
 
 
 def _rows(file: Any, plain: list[str], names: list[str]) -> Iterator[Item]:
-    """Yield the fields of each row; as a table and as objects, a part of the rows at a time."""
+    """Yield the fields of each row. Only a part of the rows is in memory at a time."""
     # Reader threads may still be alive when a short process ends, and would abort it.
     parts = file.iter_batches(AT_ONCE, columns=plain, use_threads=False)
     extents = file.iter_batches(AT_ONCE, columns=names, use_threads=False) if names else repeat(None)
@@ -118,7 +118,7 @@ def _add_extents(rows: list[Item], name: str, column: Any) -> None:
         ends, edges = column.offsets.to_pylist(), np.from_dlpack(column.values)
         found = [edges[a:b] if a < b else None for a, b in pairwise(ends)]
     except Exception:
-        # Not lists of numbers, or with gaps.
+        # They are not lists of numbers, or have gaps.
         found = [_value(column, number) for number in range(len(column))]
     for row, extents in zip(rows, found, strict=True):
         assets = row.get("assets")
@@ -142,7 +142,7 @@ def schema_of(full: Item) -> Any:
 def table_bytes(items: Iterable[Item], schema: Any, skipped: Sequence[Item] = ()) -> bytes:
     """Return a table of items as GeoParquet 1.1, as stac-geoparquet writes it.
 
-    To import that takes an eighth of a run with nothing to do, and its conversion is many times slower.
+    Its import takes an eighth of the time of a run with nothing to do. Its conversion is many times slower.
     """
     outlines = pyproj.CRS.from_epsg(4326).to_json_dict()
     column = {"encoding": "WKB", "geometry_types": [], "crs": outlines, "edges": "planar"}

@@ -16,7 +16,7 @@ Bounds = tuple[float, float, float, float]
 """West, south, east, north in metres."""
 
 FARTHEST = 1e9
-"""Largest coordinate, in any unit: beyond it are no places on Earth, but damaged numbers."""
+"""Largest coordinate, in any unit; larger numbers are damaged, not places on Earth."""
 MOST_CELLS = 2**31 - 1
 """Largest width and height of a raster in GDAL."""
 LATTICE_TOLERANCE = 0.01
@@ -25,7 +25,7 @@ LATTICE_TOLERANCE = 0.01
 
 def overlap(a: Bounds, b: Bounds, tolerance: float = 0.0) -> bool:
     """Return whether two areas overlap by more than a tolerance (m) from west to east and south to north."""
-    # Most areas lie beside each other, and one comparison tells.
+    # Most areas lie beside each other, so that the first comparison already decides.
     return (
         a[2] - b[0] > tolerance
         and b[2] - a[0] > tolerance
@@ -84,7 +84,7 @@ class Grid:
     def holding(cls, grids: Sequence[Grid]) -> Grid | None:
         """Return the smallest grid that has the cells of all grids.
 
-        It is None if there are none, their lattices or CRSs differ, or it has more than `MOST_CELLS` a side.
+        The result is None without grids, if lattices or CRSs differ, or beyond `MOST_CELLS` a side.
         """
         if not grids:
             return None
@@ -168,7 +168,7 @@ class Grid:
         return Grid(self.crs, west, north, self.cell, cols.stop - cols.start, rows.stop - rows.start)
 
     def window(self, inner: Grid) -> tuple[slice, slice]:
-        """Return the (row, col) slices of this grid that hold the cells of ``inner``.
+        """Return the (row, col) slices of the cells of ``inner`` in this grid.
 
         Raises
         ------

@@ -13,8 +13,8 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.text import shown
 
 MAX_BYTES = 100
-"""Longest id (bytes in UTF-8). In a file name of 255 bytes, the mark of a changed id (9) and the one of a
-temporary file (38) leave 108 for the variant and the ending."""
+"""Longest id (bytes in UTF-8). A file name has at most 255 bytes: a changed id adds 9, a temporary file 38.
+108 bytes remain for the variant and the ending."""
 SAFE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
@@ -52,7 +52,7 @@ def check(ids: Sequence[str]) -> None:
 def safe_name(tile_id: str) -> str:
     """Return the name of a tile's folder and files: its id, changed if it is not a valid file name.
 
-    Programs take a name that begins with a minus for an option.
+    A name that begins with a minus is changed, because programs take it for an option.
     """
     safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".-")
     if safe and safe == tile_id:

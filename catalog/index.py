@@ -59,7 +59,7 @@ class Catalog:
 
     @cached_property
     def lost(self) -> frozenset[str]:
-        """Ids of the tiles of a run that the catalog lacks because their files were skipped."""
+        """Ids of tiles of a run that are missing in the catalog because their files were skipped."""
         return frozenset(tile for file in self.skipped for tile in file.tiles)
 
     @classmethod
@@ -103,7 +103,7 @@ class Catalog:
             entries, files = _from_json(data) if is_json else geoparquet.entries(data)
             tiles, skipped = reader.tiles(entries), from_fields(files, str(absolute(path).parent))
         except ImportError:
-            # A fault of this installation, not of the file.
+            # The installation is at fault, not the file.
             raise
         except CatalogError as error:
             raise _not_a_catalog(path, str(error)) from error
@@ -142,7 +142,7 @@ class Catalog:
         def written(tile: Tile) -> Item:
             if not movable:
                 return item(tile, tile.root)
-            # Links are not resolved: a folder of links stays one.
+            # Links are not resolved: a folder of links stays a folder of links.
             return item(tile.renamed(lambda file: normalise(join(tile.root, file)).removeprefix(prefix)))
 
         items = map(written, self.tiles)
@@ -200,7 +200,7 @@ class Catalog:
         return replace(self, tiles=tuple(tiles))
 
     def same_places(self) -> str:
-        """Return a note on tiles that lie on the same place, empty if there are none."""
+        """Return a note on tiles that lie on the same place; empty without such tiles."""
         ids: dict[tuple[str, Bounds], list[str]] = defaultdict(list)
         for tile in self.usable:
             ids[tile.grid.crs, tile.grid.bounds].append(tile.id)
@@ -260,7 +260,7 @@ def datetime_text(time: datetime) -> str:
 
 
 def _outline(grid: Grid) -> Item:
-    """Return geometry and bbox in degrees; no bbox if the grid lies where they are not defined."""
+    """Return geometry and bbox in degrees; no bbox if the grid has no position in degrees."""
     west, south, east, north = grid.bounds
     to_wgs84 = transformer(grid.crs, "EPSG:4326")
     ring = [(west, south), (east, south), (east, north), (west, north), (west, south)]
@@ -311,7 +311,7 @@ def _from_json(data: bytes) -> tuple[list[Any], Any]:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> Item:
-    """Return an object of JSON; a name that it has twice gets a value that no field accepts."""
+    """Return an object of JSON; a repeated name gets a value that no field accepts."""
     found = dict(pairs)
     if len(found) < len(pairs):
         names = Counter(name for name, _ in pairs)
@@ -357,7 +357,7 @@ def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
 
 
 def needed(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
-    """Return the folders that must be allowed besides those of ``allowed`` to read layers of a catalog."""
+    """Return the further folders that must be allowed to read layers of a catalog."""
     names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
     # Addresses cannot be allowed.
     outside = (name for name in names if not ADDRESS.match(name) and not allowed.permits(name))
@@ -376,7 +376,7 @@ def _chosen(catalog: Catalog, layers: Collection[str]) -> Iterator[tuple[Tile, L
 
 
 def _outermost(folders: Iterable[str]) -> set[str]:
-    """Return the folders that lie in none of the others."""
+    """Return the folders that are not inside another of the folders."""
     outermost: list[str] = []
     # Sorting puts a folder before its subfolders.
     for folder in sorted(set(folders), key=lambda folder: folder.rstrip("/") + "/"):

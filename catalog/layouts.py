@@ -1,9 +1,9 @@
 """Files of the paper's dataset GeRoD, recognised by the words in their paths in whatever order.
 
-The layout of the published archive is not known. Its ids are: a file belongs to the tile whose south-west
-corner is in its path (``295500_5629250``), and to the layer that its name means, else that of the nearest
-folder. So ``{id}/dsm.tif``, ``{id}_DSM.tif``, ``dsm/{id}.tif`` and all of these below ``{stratum}/`` are read
-alike. The class of area is a folder's name, or is given by a table beside the tiles (CSV or JSON).
+The layout of the published archive is not known, but its ids are. The path of a file contains the south-west
+corner of its tile (``295500_5629250``). The layer is given by the file's name, else by the nearest folder.
+So ``{id}/dsm.tif``, ``{id}_DSM.tif``, ``dsm/{id}.tif`` and all of these below ``{stratum}/`` are read alike.
+The class of area is a folder's name, or is given by a table beside the tiles (CSV or JSON).
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ class Found:
     """Path relative to the folder."""
     tile: str
     layer: str
-    """One of `LAYERS`; that of the points' heights for ``.npz``."""
+    """One of `LAYERS`; for ``.npz`` the layer of the heights of its points."""
     stratum: str
-    """Class of area, or empty if nothing names it."""
+    """Class of area, or empty if it is unknown."""
 
     @property
     def pattern(self) -> str:
@@ -78,7 +78,7 @@ class Found:
 
 
 def find(root: Path) -> tuple[list[Found], list[str]]:
-    """Return the files of the dataset below a folder, by path, and notes on what was not understood.
+    """Return the files of the dataset below a folder, by path, and notes on unclear files.
 
     - `root`: the folder; its own name means nothing.
     """
@@ -105,7 +105,7 @@ def find(root: Path) -> tuple[list[Found], list[str]]:
 
 
 def layer_of(name: str, words: Sequence[tuple[str, str]] = NAMES) -> str:
-    """Return the layer that a file's name means, else that of the nearest folder, else an empty text."""
+    """Return the layer by a file's name, else by the nearest folder, else an empty text."""
     path = PurePosixPath(name)
     for part in (path.stem, *reversed(path.parts[:-1])):
         for layer, pattern in words:
@@ -115,13 +115,13 @@ def layer_of(name: str, words: Sequence[tuple[str, str]] = NAMES) -> str:
 
 
 def stratum_of(text: str) -> str:
-    """Return the class of area that a text is, or an empty text."""
+    """Return the class of area that a text names, or an empty text."""
     word = text.strip().lower()
     return next((name for name, pattern in STRATA.items() if re.fullmatch(pattern, word)), "")
 
 
 def table(found: Sequence[Found]) -> list[str]:
-    """Return what was found as lines of a table: layer, number of tiles, and an example of the path."""
+    """Return the found files as lines of a table: layer, number of tiles, and an example of the path."""
     by_layer: dict[str, list[Found]] = defaultdict(list)
     for file in found:
         by_layer[file.layer].append(file)
@@ -140,7 +140,7 @@ def table(found: Sequence[Found]) -> list[str]:
 
 
 def questions(found: Sequence[Found]) -> list[str]:
-    """Return what the user must give: layers and classes of area that the files do not have."""
+    """Return questions to the user about layers and classes of area that the files do not have."""
     tiles = {file.tile for file in found}
     have: dict[str, set[str]] = defaultdict(set)
     for file in found:
@@ -189,7 +189,7 @@ def _strata(root: Path, names: Sequence[str]) -> tuple[dict[str, str], list[str]
 
 
 def _pairs(node: Any, tile: str, stratum: str) -> Iterator[tuple[str, str]]:
-    """Yield id and class of area where both stand together: in a row, an object, or a key and its value."""
+    """Yield id and class of area where both are together: in a row, an object, or a key and its value."""
     if isinstance(node, Mapping | list):
         keyed = list(node.items()) if isinstance(node, Mapping) else [("", value) for value in node]
         flat = [value for _, value in keyed if isinstance(value, str)]

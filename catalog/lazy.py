@@ -19,10 +19,10 @@ from typing import Any
 
 
 class LazyModule:
-    """A module that is imported when one of its names is first asked for.
+    """A module that is imported when one of its names is first used.
 
-    A name that the module does not have is looked for among its submodules. Whatever is set or deleted is set
-    or deleted in the module itself.
+    A name that the module does not have is searched among its submodules. Names are set and deleted in the
+    module itself.
     """
 
     __slots__ = ("_name",)
@@ -32,7 +32,7 @@ class LazyModule:
         object.__setattr__(self, "_name", name)
 
     def __getattr__(self, name: str) -> Any:
-        # Tools that look through the names of a file ask for these; an answer is not worth an import.
+        # Tools that inspect a file read these names; they must not cause an import.
         if name.startswith("__") and name != "__version__":
             raise AttributeError(f"{name!r} does not import module {self._name!r}")
         module = _imported(self._name)
@@ -58,7 +58,7 @@ class LazyModule:
 
 
 def _imported(name: str) -> ModuleType:
-    """Import a module without garbage collections: nearly all objects that it makes stay."""
+    """Import a module without garbage collections: nearly all of its objects stay in use."""
     if name in sys.modules or not gc.isenabled():
         return importlib.import_module(name)
     gc.disable()
@@ -69,5 +69,5 @@ def _imported(name: str) -> ModuleType:
 
 
 def lazy(name: str) -> Any:
-    """Return a library that is imported when one of its names is first asked for."""
+    """Return a library that is imported when one of its names is first used."""
     return LazyModule(name)

@@ -1,4 +1,4 @@
-"""Files that a catalog leaves out because they cannot be used, as the catalog keeps them."""
+"""Files that a catalog leaves out because they cannot be used."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Skipped:
     root: str = ""
     """Folder that a relative name starts from; empty: the catalog's."""
     tiles: tuple[str, ...] = ()
-    """Ids of tiles of a run that an earlier catalog made of the file, and that are missing without it."""
+    """Ids of tiles of a run that an earlier catalog made from the file, and that are missing without it."""
 
     @property
     def path(self) -> str:
-        """Full name; that of a folder ends in ``/``."""
+        """Full name; the name of a folder ends in ``/``."""
         return _full_name(self.root, self.file) + "/" * self.is_folder
 
     @property
@@ -70,7 +70,7 @@ def _full_name(root: str, file: str) -> str:
 
 
 def lines(skipped: Iterable[Skipped]) -> list[str]:
-    """Return one line per layer and reason, with the tiles that a run lost."""
+    """Return one line per layer and reason, with the lost tiles of a run."""
     groups: dict[tuple[str, str], list[Skipped]] = defaultdict(list)
     for one in skipped:
         groups[one.layer, one.reason].append(one)
@@ -85,12 +85,12 @@ def _line(layer: str, reason: str, group: Sequence[Skipped]) -> str:
 
 
 def to_fields(skipped: Skipped) -> dict[str, Any]:
-    """Return the content of an entry as a catalog's file has it."""
+    """Return the content of an entry in a catalog's file."""
     return vars(skipped) | {"tiles": list(skipped.tiles)}
 
 
 def from_fields(entries: Any, folder: str) -> tuple[Skipped, ...]:
-    """Return what `to_fields` wrote for each file; names without a root start from ``folder``."""
+    """Return the files from the entries of `to_fields`; names without a root start from ``folder``."""
     if not isinstance(entries, list) or not all(map(_is_entry, entries)):
         raise CatalogError("its list of skipped files cannot be read")
     return tuple(

@@ -16,7 +16,7 @@ MAX_REASON = 500
 MAX_LINE = 200
 """Longest line of an error of a decoder in a message."""
 FORMULA = ("=", "+", "-", "@", "\t", "\n")
-"""Starts of texts that spreadsheets take for formulas."""
+"""Characters at the start of texts that spreadsheets take for formulas."""
 _NUMBER = re.compile(r"[+-][\d.,_]*(?:[eE][+-]?\d+)?%?(?: [a-z][^=@(|!]*)?")
 _CREDENTIALS = re.compile(r"(:/{1,2})(?:[^/\s@:]*:\S*|[^/\s@]+)@|^[^/\s@:]*:[^/\s]\S*@")
 _SIGNATURE = re.compile(r"(https?:/\S*\?)\S+")
@@ -41,9 +41,9 @@ def without_credentials(text: str) -> str:
 
 
 def no_formula(value: Any) -> Any:
-    """Return a cell of a table for CSV: with an apostrophe first if its text could be taken for a formula.
+    """Return a cell of a table for CSV, with an apostrophe first if its text could be taken for a formula.
 
-    Numbers stay, also as text (``-5.2``) and with words after them, and ids of digits (``-500_5600``).
+    Numbers as text (``-5.2``), also with words after them, and ids of digits (``-500_5600``) are unchanged.
     `with_formula` is the inverse.
     """
     if not isinstance(value, str):
@@ -54,7 +54,7 @@ def no_formula(value: Any) -> Any:
 
 
 def with_formula(text: str) -> str:
-    """Return the text of a cell that `no_formula` has changed; any other text as it is."""
+    """Return the original text of a cell that `no_formula` has changed; any other text is unchanged."""
     plain = text.removeprefix("'")
     return plain if no_formula(plain) == text else text
 
@@ -94,7 +94,7 @@ def access_reason(error: BaseException) -> str | None:
 
 
 def write_reason(error: BaseException) -> str:
-    """Return why a file could not be written: the system's words, or GDAL's, the cause of rasterio's."""
+    """Return why a file could not be written, in the words of the system or of GDAL."""
     return getattr(error, "strerror", None) or reason(error.__cause__ or error)
 
 

@@ -29,9 +29,9 @@ BORDER_LAYERS = ("dsm", "dtm", "road_height", "dop", "road_mask", "roads")
 REACH_M = 200.0
 """A tile's layers list the files within this distance of it (m): for halos and for ground along borders."""
 RECENT = 2**14
-"""Layers and dates that are kept to be shared: of the last thousands of tiles."""
+"""Number of layers and dates that are kept, so that neighbouring tiles share them."""
 MIN_COVER = 0.25
-"""Default share below which catalogs leave a tile out and `load` fails on it."""
+"""Default share of cells with heights. Below it, catalogs leave a tile out, and `load` fails."""
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 """Heights outside are nodata (m)."""
 TOUCH_M = 0.001
@@ -59,8 +59,8 @@ class Layer:
     sublayer: str | None = None
     """Layer of vector files that have several; None: their only one, or the road layers of the OSM format."""
     height_unit: str | None = None
-    """Unit of heights, a key of `to_metres.HEIGHT_UNITS`, of files that declare none; None: metres or, of a
-    file that is reprojected, the unit of its eastings."""
+    """Unit of heights (a key of `to_metres.HEIGHT_UNITS`) of files that declare no unit. None: metres or, for
+    a reprojected file, the unit of its eastings."""
 
     def __post_init__(self) -> None:
         if self.extents and len(self.extents) != len(self.files):
@@ -70,7 +70,7 @@ class Layer:
             )
 
     def reaching(self, bounds: Bounds) -> Layer | None:
-        """Return the layer with only the files that overlap an area, or None if there are none.
+        """Return the layer with only the files that overlap an area, or None without such files.
 
         A layer of unknown extents is returned unchanged.
 
@@ -84,8 +84,8 @@ class Layer:
     def in_common_order(self, bounds: Bounds) -> Sequence[int]:
         """Return the numbers of the files that overlap an area, in the order that all tiles agree on.
 
-        The files are sorted by name, but of two that overlap the first one stays first, because its values
-        are used. Of unknown extents all files are returned as they are.
+        The files are sorted by name, but of two overlapping files the first stays first, because its values
+        are used. If extents are unknown, all files are returned in their order.
         """
         numbers = self._overlapping(bounds)
         if len(numbers) < 2 or not self.extents:
@@ -111,7 +111,7 @@ class Layer:
         return _reaching(self.extents, bounds) if self.extents else range(len(self.files))
 
 
-# The layers of a tile share their extents: what follows from these is found once for all of them.
+# The layers of a tile share their extents, so the results of these functions are cached.
 @lru_cache(maxsize=64)
 def _reaching(extents: tuple[Bounds, ...], bounds: Bounds) -> tuple[int, ...]:
     """Return the numbers of the files that overlap an area."""
@@ -155,10 +155,10 @@ class Tile:
     dataset: str = ""
     """Name of the source dataset in reports ("GeRoD"), or empty if unknown."""
     nearby: tuple[Layer, ...] = ()
-    """Layers of which files lie within `REACH_M`, but none on the tile itself, in the order of `LAYERS`."""
+    """Layers with files within `REACH_M`, but not on the tile itself, in the order of `LAYERS`."""
     fault: str = ""
-    """Why the tile's entry in a catalog cannot be used, or empty. `load` then fails with this message; the
-    tile has no layers, and its grid and date mean nothing (`faulty`)."""
+    """Why the tile's entry in a catalog cannot be used, or empty. `load` fails with this message. Such a tile
+    has no layers, and its grid and date have no meaning (`faulty`)."""
     allowed: AllowedFolders | None = field(default=None, compare=False, repr=False)
     """Where its files may lie; None if the program itself has made the tile and has not read it."""
     missing: frozenset[str] | None = field(default=None, compare=False, repr=False)
@@ -208,10 +208,10 @@ class Tile:
         return replace(self, layers=layers, nearby=nearby)
 
     def within(self, bounds: Bounds) -> Tile:
-        """Return the tile with only those files of the rasters in `LOADED` that reach an area.
+        """Return the tile with only the files of the rasters in `LOADED` that reach an area.
 
-        A layer none of whose files reaches it stays as it is, and `load` reports that. Of the photo and the
-        roads all files stay, because segmenters read them beyond the grid.
+        If no file of a layer reaches the area, the layer is unchanged, and `load` reports that. All files of
+        the photo and the roads stay, because segmenters read them beyond the grid.
 
         Parameters
         ----------
@@ -230,8 +230,8 @@ class Tile:
     def around(self, grid: Grid, reach: Bounds, names: Collection[str] = BORDER_LAYERS) -> Tile:
         """Return a tile of other ground within `REACH_M`, made of this tile's files, with this tile's id.
 
-        Its layers are the same whichever tile of the catalog they are taken from, if their extents are known
-        and the ground is within `REACH_M` of both.
+        Its layers do not depend on the tile from which they are taken, if their extents are known and the
+        ground is within `REACH_M` of that tile.
 
         Parameters
         ----------
@@ -250,7 +250,7 @@ class Tile:
 def files_around(layers: Iterable[Layer], bounds: Bounds, reach: Bounds) -> list[tuple[Layer, Sequence[int]]]:
     """Return the layers with files that reach other ground, and the numbers of these files (`Tile.around`).
 
-    - `layers`: those of a tile (`Tile.layers_around`).
+    - `layers`: the layers of a tile (`Tile.layers_around`).
     - `bounds`: the ground: files of rasters reach it.
     - `reach`: photo and roads reach this area.
     """
@@ -268,7 +268,7 @@ def faulty(tile_id: str, fault: str, root: str) -> Tile:
 def by_cover(layers: Sequence[Layer], grid: Grid) -> tuple[tuple[Layer, ...], tuple[Layer, ...]]:
     """Return the layers that cover a tile, at least in part, and those that are only nearby.
 
-    Layers of unknown extents count as covering. So do roads, which are wider than the lines in their files.
+    Layers of unknown extents are taken as covering the tile. So are roads: they are wider than their lines.
     """
     bounds, tolerance = grid.bounds, LATTICE_TOLERANCE * grid.cell
     # The layers of a tile often share their extents.

@@ -35,11 +35,11 @@ MASKS = ("road_mask", "reference_road")
 MAX_CELL_RATIO = 50
 """DSM files whose cells are larger than most height files' by more than this factor are left out."""
 CELLS = (1.0, 2.0, 2.5, 5.0)
-"""Sizes of the cells of tiles whose DSM is reprojected (m), and these times powers of ten."""
+"""Cell sizes of tiles whose DSM is reprojected (m): these numbers times powers of ten."""
 MAX_TILE_M = 2000
 """Largest size of a tile that is proposed (m)."""
 AT_ONCE = 10_000
-"""Tiles whose neighbourhoods are looked up at a time: as polygons they take many times the memory."""
+"""Number of tiles whose neighbours are found at a time: polygons of tiles take much memory."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Conversion:
     """How files in other CRSs and units are used."""
 
     reproject: bool = False
-    """Warp files in another CRS when they are read; else tiles on them fail."""
+    """Whether files in another CRS are warped when they are read; else their tiles fail."""
     to_crs: str | None = None
-    """CRS of the tiles; None: that of most DSM files, which must be in metres."""
+    """CRS of the tiles; None: the CRS of most DSM files, which must be in metres."""
     height_unit: str | None = None
-    """Unit of heights, a key of `to_metres.HEIGHT_UNITS`, of files that declare none."""
+    """Unit of heights, a key of `to_metres.HEIGHT_UNITS`, of files that declare no unit."""
 
     def __post_init__(self) -> None:
         if self.to_crs and not self.reproject:
@@ -73,13 +73,13 @@ class TilingResult:
     tiles: tuple[Tile, ...]
     """In the order of their ids."""
     notes: tuple[str, ...]
-    """What was assumed, and the tiles that were left out, one line each."""
+    """Notes on assumptions and on tiles that were left out, one line each."""
     skipped: tuple[Skipped, ...] = ()
     """The files and folders that cannot be used: the tiles lack their cells."""
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """What is skipped, one line per reason."""
+        """The skipped files, one line per reason."""
         return tuple(lines(self.skipped))
 
     @property
@@ -108,7 +108,7 @@ class _OnTile(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _NearFiles:
-    """The files of one layer near each tile: all in a few arrays, because objects would take gigabytes."""
+    """The files of one layer near each tile, in a few arrays, because objects would take gigabytes."""
 
     files: Sequence[_PlacedFile]
     ends: NDArray[np.intp]
@@ -179,7 +179,7 @@ def cut(
     for name, files in near.items():
         if not files.numbers.size:
             raise CatalogError(_far(name, placed[name], grids))
-    # Of the complete layer, so that all tiles describe it in the same way.
+    # This is decided for the complete layer, so that all tiles describe it in the same way.
     bare = {name: None if all(p.file.has_crs for p in files) else crs for name, files in placed.items()}
     others = {name: any(not same(p.file.crs, grid_crs) for p in files) for name, files in placed.items()}
     values = dict.fromkeys(MASKS, road_values)
@@ -203,7 +203,7 @@ def _place(
     kept, lost = list[_PlacedFile](), list[Skipped]()
     for file in files:
         bounds = file.bounds if same(file.crs, crs) else bounds_in(crs, file.crs, file.bounds)
-        # NaN is not below either.
+        # The comparison is also false for NaN.
         if np.abs(bounds).max() <= FARTHEST:
             kept.append(_PlacedFile(file, bounds))
             continue
@@ -220,7 +220,7 @@ def _place(
 def _alike(
     root: Path, placed: Mapping[str, Sequence[_PlacedFile]]
 ) -> tuple[list[_PlacedFile], list[Skipped]]:
-    """Return the DSM files without those of huge cells, which would be cut into millions of tiles."""
+    """Return the DSM files without files of huge cells, which would be cut into millions of tiles."""
     usual = statistics.median_high(_cell_size(entry) for name in HEIGHTS for entry in placed.get(name, ()))
     kept, huge = list[_PlacedFile](), list[Skipped]()
     for entry in placed["dsm"]:
@@ -280,7 +280,7 @@ def _cut(dsm: Sequence[_PlacedFile], crs: str, size_m: float) -> dict[str, Grid]
 
 
 def _check_cell(name: str, cell: float, size_m: float) -> None:
-    """Raise an error if a tile of whole metres has no whole number of the cells of its DSM."""
+    """Raise an error if the size of a tile is not a whole number of the cells of its DSM."""
     if not 0 < size_m < math.inf or size_m != int(size_m) or is_whole(size_m / cell):
         return
     rounded = _nearest_cell(cell)
@@ -304,7 +304,7 @@ def _nearest_cell(true_m: float) -> float:
 def _cell_m(placed: _PlacedFile, crs: str) -> float:
     """Return the cell of tiles whose DSM is reprojected (m).
 
-    That of the file if it is in metres and has nearly this size on the ground, else the nearest of `CELLS`.
+    It is the file's cell if that is in metres and nearly as large on the ground, else the nearest of `CELLS`.
     """
     file, (west, south, east, north) = placed
     across, along = scales(crs, file.crs, (west + east) / 2, (south + north) / 2)
@@ -337,7 +337,7 @@ def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> _NearFiles
 
 
 def _far(name: str, files: Sequence[_PlacedFile], grids: Mapping[str, Grid]) -> str:
-    """Return that a layer reaches no tile, and where both lie."""
+    """Return the message that a layer reaches no tile, with the places of both."""
     first = files[0].file
     bounds = union(placed.file.bounds for placed in files if placed.file.crs == first.crs)
     target, ground = next(iter(grids.values())).crs, union(grid.bounds for grid in grids.values())
@@ -348,7 +348,7 @@ def _far(name: str, files: Sequence[_PlacedFile], grids: Mapping[str, Grid]) -> 
 def _covered(
     root: Path, grids: Mapping[str, Grid], near: _NearFiles, min_cover: float, reproject: bool
 ) -> tuple[dict[str, Grid], list[str]]:
-    """Return the tiles of which the DSM covers at least ``min_cover``, and notes on the others."""
+    """Return the tiles with a DSM on at least ``min_cover`` of their cells, and notes on the other tiles."""
     kept, thin, empty, risky = dict[str, Grid](), list[str](), list[str](), list[str]()
     for position, (tile_id, grid) in enumerate(grids.items()):
         dsm = near.on(position)
@@ -418,7 +418,7 @@ def taken(dsm: Sequence[RasterFile], date: datetime | None = None) -> tuple[date
 
 
 def assumed(tiles: Sequence[Tile]) -> list[str]:
-    """Return a note on the tiles whose date is only assumed; empty if there are none."""
+    """Return a note on the tiles whose date is only assumed; empty without such tiles."""
     undated = [tile.id for tile in tiles if tile.datetime_assumed]
     note = f"no date in the dsm of {count(len(undated), 'tile')}: the files' times are used instead"
     return [f"{note} (--date sets it)"] * bool(undated)

@@ -1,12 +1,11 @@
 """Where the files of a catalog may lie: below its own folder or below a folder that the user allows.
 
 A catalog may come from anyone, and its files are read with the user's rights. `Catalog.read` gives each tile
-its `AllowedFolders`, and `Tile.paths`, the only way to the locations of a tile's files, asks them: a command
-that reads a catalog cannot forget the check. Tiles that the program itself has just made have none.
+its `AllowedFolders`. `Tile.paths`, the only way to a tile's files, checks them: no command can forget the
+check. Tiles that the program itself has just made have no `AllowedFolders`.
 
-Files and folders are compared with links resolved: a link in a catalog's folder that leads out of it needs
-the permission for its target. GDAL's virtual file systems (``/vsicurl/``) and web addresses are never
-allowed.
+Files and folders are compared with links resolved: a link that leads out of a catalog's folder needs the
+permission for its target. GDAL's virtual file systems (``/vsicurl/``) and web addresses are never allowed.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class AllowedFolders:
     @classmethod
     def of(cls, home: Location | str, more: Sequence[str | Path] = ()) -> AllowedFolders:
         """Return the catalog's own folder and further ones."""
-        # Both names are stored in a run: links may lead elsewhere on another machine.
+        # Names with and without links are stored in a run: links may lead elsewhere on another machine.
         own = (normalise(str(home)), normalise(str(absolute(parse_location(home)))))
         return cls(str(home), tuple(dict.fromkeys((*own, *(normalise(str(folder)) for folder in more)))))
 
@@ -54,7 +53,7 @@ class AllowedFolders:
         """Return the error that a file may not be read, with the options that allow it.
 
         - `subject`: what names the file: ``tile 1: dsm``.
-        - `folders`: the folders to allow; by default that of the file.
+        - `folders`: the folders to allow; by default the folder of the file.
         """
         if len(name) > LONGEST_SHOWN:
             return CatalogError(
@@ -85,7 +84,7 @@ def full_name(root: str, file: str) -> str:
 
 
 def located(name: str) -> Location:
-    """Return a file as an absolute location; GDAL takes ``GTIFF_DIR:1:a.tif`` for more than a name."""
+    """Return a file as an absolute location, as GDAL gives ``GTIFF_DIR:1:a.tif`` a special meaning."""
     if name.startswith("/"):
         return _on_disk(name)
     location = parse_location(name)

@@ -3,7 +3,7 @@
 import sys
 
 if not sys.flags.safe_path:
-    # The current folder, which may have a module with the name of a library's.
+    # Remove the current folder: it may have a module with the name of a library.
     del sys.path[0]
 
 from flexroad.pipeline.cli.main import main

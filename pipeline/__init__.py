@@ -21,8 +21,8 @@ ONE_THREAD = dict.fromkeys(
 )
 """Environment of every process: on a tile's arrays two BLAS threads are up to 400 times slower than one."""
 OF_WORKERS = ONE_THREAD | {"PYTHONSAFEPATH": "1"}
-"""Environment of worker processes. They start as ``python -c`` or ``-m``, which would import modules of the
-current folder in place of Python's own: a folder of downloads would run code."""
+"""Environment of worker processes. They start as ``python -c`` or ``-m``. Without this setting, modules of
+the current folder would replace Python's own modules: a folder of downloads could run code."""
 
 # Libraries read these variables once, on import, so they are set before any import. Values set by the user
 # are kept. If NumPy is already imported (as in a notebook), nothing is changed: numba raises an error when
@@ -32,7 +32,7 @@ if "numpy" not in sys.modules:
         os.environ.setdefault(name, value)
 
 IGNORED = use_own_values()
-"""A line on settings of GDAL and PROJ that this process ignores, empty if there are none."""
+"""A line on settings of GDAL and PROJ that this process ignores; empty if none is set."""
 
 
 def _writable(folder: Path) -> bool:
@@ -47,8 +47,8 @@ def _writable(folder: Path) -> bool:
 def _set_numba_cache() -> None:
     """Set a temporary numba cache folder if none of the default folders is writable.
 
-    Numba raises an error without one, for example in a service account without a home folder that uses
-    a system-wide installation. Workers inherit the setting.
+    Numba needs such a folder. A service account without a home folder, with a system-wide installation, does
+    not have it. Workers inherit the setting.
     """
     beside = Path(__file__).parent.parent / "tasks" / "__pycache__"
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME", "/"), ".cache"))

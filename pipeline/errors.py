@@ -1,4 +1,4 @@
-"""Errors of the pipeline itself, raised before any tile is processed or when the cluster is lost."""
+"""Errors of the pipeline itself: raised before any tile is processed, or when the cluster is lost."""
 
 
 class ConfigError(Exception):

@@ -1,4 +1,4 @@
-"""What happens to one tile: pure functions from the paper's inputs to its meshes and figures."""
+"""The work on one tile: pure functions from the paper's inputs to its meshes and figures."""
 
 from flexroad.tasks.errors import TaskError
 

@@ -1,10 +1,10 @@
 """The computation of corners and edges of tiles.
 
-Each is a small tile of its own, which all tiles around it share::
+Each corner and edge is computed like a small tile, which all tiles around it share::
 
     Border -> load_border -> segment -> ecsrc -> corner | edge -> the tile's fit
 
-A fit whose module has the functions `corner` and `edge` holds the control points that they return.
+If the module of a fit has the functions `corner` and `edge`, the fit keeps the control points from them.
 """
 
 from __future__ import annotations
@@ -27,34 +27,35 @@ from flexroad.tasks.spline.frame import Corner, Edge, Frame
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 AROUND_M = 100.0
-"""Distance from a corner or edge up to which the filter sees the ground (m): it judges a road by the size of
-its cluster, and a short piece of a viaduct would look like an object. A larger halo counts instead, or
-the distance up to which the control points act: without ground there, the mesh must not depend on them."""
+"""Distance from a corner or edge up to which the filter reads the ground (m). The filter judges a road by the
+size of its cluster, so a short piece of a viaduct would look like an object. A larger halo replaces it, and
+so does a larger acting distance of the control points: without ground there, the mesh must not depend on
+them."""
 ENDS = ((0, 1), (2, 3), (0, 2), (1, 3))
 """Numbers of the corners at the ends of the southern, northern, western and eastern edge."""
 
 
 @dataclass(frozen=True)
 class BorderStages:
-    """The stages that a corner or edge goes through, with their options."""
+    """The stages that compute a corner or edge, with their options."""
 
     segment: Options
     ecsrc: Options
     fit: Options
     load: LoadOptions
-    """The heights that roads are fitted to, and the halo of the tiles: if it sees the far side of a void, so
-    must the corner or edge."""
+    """The heights to which roads are fitted, and the halo of the tiles: if the halo reaches the far side of a
+    void, the corner or edge must reach it, too."""
 
     @classmethod
     def of(cls, chain: Mapping[str, Options]) -> BorderStages:
-        """Return those of a variant."""
+        """Return the stages of a variant."""
         load = chain["load"]
         assert isinstance(load, LoadOptions)
         return cls(chain["segment"], chain["ecsrc"], chain["fit"], load)
 
     @property
     def heights(self) -> list[Any]:
-        """The options of `load` that its ground depends on, as they enter fingerprints."""
+        """The options of `load` on which the ground depends, for fingerprints."""
         return [self.load.road_height, self.load.offset_undeclared]
 
     @property
@@ -99,7 +100,7 @@ class BorderStages:
         return Frame(*parts)
 
     def _filtered(self, data: TileData, road: RoadMask, near: Slices | None) -> RoadClusters:
-        """Return the filtered roads; what only the fit needs may be there near the border alone."""
+        """Return the filtered roads; with ``near``, arrays only for the fit are computed only there."""
         of_part = getattr(stage_module(self.ecsrc), "ecsrc_near", None)
         clusters: RoadClusters = (
             of_part(data, road, self.ecsrc, near)
@@ -142,7 +143,7 @@ class BorderTask:
     stages: BorderStages
 
     def ground(self, tile: Tile) -> Tile:
-        """Return the ground around it, with the files of a tile that reach it and that the stages read."""
+        """Return the ground around it, with the files of a tile that the stages read there."""
         return tile.around(self.border.grid, self.border.within(REACH_M), self.stages.reads)
 
     def __call__(self, tile: Tile, ends: Sequence[Corner]) -> Corner | Edge:

@@ -3,8 +3,8 @@
 Importing them does not import numba, so commands that compute nothing start fast. Compiled code is cached on
 disk and used by later processes.
 
-To compile all takes some seconds on a new machine. An array or a tuple that is assigned to a slice or a row
-takes most of a second of them, for the message that their shapes differ: assign element by element.
+Compiling all functions takes some seconds on a new machine. Assign element by element: assigning an array or
+a tuple to a slice or a row takes most of a second to compile, for the error that their shapes differ.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Compiled(Generic[P, R]):
 
     @property
     def _numba_type_(self) -> Any:
-        """What numba asks for when it compiles a function that calls this one."""
+        """The type that numba reads when it compiles a function that calls this function."""
         return self.inner._numba_type_
 
     def _dispatcher(self, **options: bool) -> Any:

@@ -1,6 +1,6 @@
 """Errors of this package, and the source files that a computation leaves out because they cannot be used.
 
-A result that was computed without a file is not the one that its name says, so the caller has to know of it.
+The caller must know of files that were left out, because the result then needs another name.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LeftOut = dict[tuple[str, str], str]
-"""Notes on files by full name and by the hash of the cells that were left out; empty: the complete file."""
+"""Notes on files by full name and hash of the cells that were left out; an empty hash: the complete file."""
 _RECORD: ContextVar[LeftOut | None] = ContextVar("_RECORD", default=None)
 
 
@@ -38,23 +38,23 @@ class TaskError(Exception):
 
 
 class Unusable(TaskError):
-    """A source file that is missing or broken, or does not have what its layer needs.
+    """A source file that is missing, broken, or unsuitable for its layer.
 
-    Tiles that do not need it leave it out.
+    Tiles that do not need the file leave it out.
     """
 
 
 class LayerMissing(TaskError):
-    """A tile lacks a layer that a stage needs; around a border of tiles it may end before the heights do."""
+    """A tile lacks a layer that a stage needs. Around a border, the layer may end before the heights end."""
 
 
 class MeshFault(TaskError):
-    """A mesh that is no height field triangulated once (`tasks.metrics.mesh_check`)."""
+    """A mesh that is not a height field triangulated once (`tasks.metrics.mesh_check`)."""
 
 
 @contextmanager
 def recorded() -> Iterator[LeftOut]:
-    """Give the files that are left out until the block ends."""
+    """Yield the files that are left out in the block."""
     files = LeftOut()
     token = _RECORD.set(files)
     try:
@@ -64,7 +64,7 @@ def recorded() -> Iterator[LeftOut]:
 
 
 def leave_out(error: Unusable, cells: NDArray[np.bool_] | None = None) -> str:
-    """Record that a file is left out, or only some cells of what was read of it, ``(rows, cols)``.
+    """Record that a file is left out, or only some of its cells that were read, ``(rows, cols)``.
 
     - result: a note on it.
     """

@@ -27,7 +27,7 @@ VERSION = 3
 
 CLASSES = ("road_mask", "reference_road")
 READS = HEIGHTS + CLASSES
-"""Layers that are read; of other layers the result holds only the file names."""
+"""Layers that are read; of other layers the result has only the file names."""
 NEEDS = ("dsm", "dtm")
 """Layers without which a tile fails."""
 
@@ -42,8 +42,8 @@ class Options(options.Options):
         0.0,
         ge=0,
         le=500,
-        description="ground read around the tile (m): for the filter, and for a fit without shared borders; "
-        "0 in the paper; catalogs of rasters and of prepared tiles list the files up to 200 m around a tile",
+        description="ground read around the tile (m), for the filter, and for a fit without shared borders; "
+        "0 in the paper. Catalogs of rasters and of prepared tiles list files up to 200 m around a tile",
     )
     min_valid: float = Field(
         MIN_COVER,
@@ -53,14 +53,14 @@ class Options(options.Options):
     )
     road_height: Literal["dsm", "auto", "layer", "offset"] = Field(
         "dsm",
-        description="heights that roads are fitted to: dsm, its highest points; layer, the catalog's "
-        "road_height; auto, that layer where the tile has it, else the DSM; offset, the DSM minus its height "
+        description="heights to which roads are fitted. dsm: the highest points; layer: the catalog's "
+        "road_height; auto: road_height if the tile has it, else the DSM. offset: the DSM minus its height "
         "above the DTM on open road, if both declare the same date and vertical CRS",
     )
     offset_undeclared: bool = Field(
         False,
-        description="with road_height: offset, take DSM and DTM as of one survey where they declare no date "
-        "or no vertical CRS",
+        description="with road_height: offset, assume that DSM and DTM are of one survey if they declare no "
+        "date or no vertical CRS",
     )
 
 
@@ -69,7 +69,7 @@ def load(tile: Tile, options: Options) -> TileData:
 
     Cells that coincide are copied; others are resampled (heights bilinearly, classes to the nearest),
     with a note. Files in another CRS are warped if the layer says so (`Layer.reproject`). Where files
-    overlap, the first one with a value is used, those in the tile's CRS before others.
+    overlap, the first file with a value is used. Files in the tile's CRS come before other files.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def load(tile: Tile, options: Options) -> TileData:
         mosaics["dsm"].check_valid(tile, options.min_valid)
         mosaics["dtm"].check_valid(tile, 0.0)
     data, remarks = _data(tile, grid, tile.grid, mosaics, options)
-    # Of the tile alone: the sheets of its neighbours may have other heights.
+    # Only the tile itself is checked: the sheets of its neighbours may have other heights.
     window = grid.window(tile.grid)
     if suspect := offset_note(data.dsm[window], data.dtm[window]) or below_ground_note(data.dsm, data.dtm):
         remarks = [*remarks, suspect]
@@ -117,13 +117,13 @@ def load(tile: Tile, options: Options) -> TileData:
 
 
 def load_border(ground: Tile, core: Grid, options: Options) -> TileData:
-    """Read the ground around a corner or an edge of tiles; it may be without data in part or everywhere.
+    """Read the ground around a corner or an edge of tiles; it may have no data in part or everywhere.
 
     Files that cannot be used (`Unusable`) are left out: they fail the tiles that they lie on.
 
     - `ground`: the ground, with the files that reach it (`Tile.around`).
-    - `core`: the tile that the files are of: the position of a file without georeference.
-    - `options`: the heights that roads are fitted to. The halo does not count.
+    - `core`: the tile of the files: it is the position of a file without georeference.
+    - `options`: the heights to which roads are fitted. The halo is not used.
     """
     grid = ground.grid
     with quiet():
@@ -142,7 +142,7 @@ def load_border(ground: Tile, core: Grid, options: Options) -> TileData:
 def _data(
     tile: Tile, grid: Grid, core: Grid, mosaics: Mapping[str, Mosaic], options: Options
 ) -> tuple[TileData, list[str]]:
-    """Return what a tile and the ground around a border have, and a note on the heights of roads."""
+    """Return the common data of a tile and of the ground around a border, and a note on heights of roads."""
     values = {name: mosaic.values for name, mosaic in mosaics.items()}
     unknown = np.full(grid.shape, np.nan)
     offset_dsm, remarks = _offset(tile, options)
@@ -167,7 +167,7 @@ def _is_read(layer: Layer, options: Options) -> bool:
 
 
 def _offset(tile: Tile, options: Options) -> tuple[bool, list[str]]:
-    """Return whether roads are fitted to the DSM minus an offset, and a note if they would be but cannot."""
+    """Return whether roads are fitted to the DSM minus an offset, and a note if that is not possible."""
     if options.road_height != "offset":
         return False, []
     differs, undeclared = survey_difference(tile)
@@ -181,7 +181,7 @@ def _offset(tile: Tile, options: Options) -> tuple[bool, list[str]]:
 
 
 def layer_source(tile: Tile, name: str) -> Source | None:
-    """Return a layer that another stage reads, or None if the tile has none.
+    """Return a layer that another stage reads, or None if the tile does not have it.
 
     Missing files that do not reach the tile are left out.
     """

@@ -1,4 +1,4 @@
-"""Memory that inputs may take: estimated from their headers, and compared before anything is allocated."""
+"""Memory that inputs may take: estimated from their headers, and checked before it is allocated."""
 
 from __future__ import annotations
 
@@ -21,10 +21,9 @@ GIB = 2**30
 def group_limits(mount: Path = MOUNT, own: Path = OWN) -> list[int]:
     """Return the memory limits of this process's control group and of the groups around it (bytes).
 
-    These are the limits of a container, of a systemd unit (``MemoryMax=``) or of a SLURM job; empty if there
-    are none.
+    These are the limits of a container, of a systemd unit (``MemoryMax=``) or of a SLURM job; else empty.
 
-    - `mount`, `own`: where the control groups are, and the file with the name of the process's own one.
+    - `mount`, `own`: the folder of control groups, and the file with the name of the process's own group.
     """
     limits: list[int] = []
     with contextlib.suppress(OSError, ValueError):
@@ -40,7 +39,7 @@ def _limits(group: Path) -> list[int]:
     """Return the limits of one control group (bytes): of version 2, or of version 1."""
     found = []
     for name in ("memory.max", "memory.high", "memory.limit_in_bytes"):
-        # "max" is no limit.
+        # "max" means no limit.
         with contextlib.suppress(OSError, ValueError):
             found.append(int((group / name).read_text()))
     return [limit for limit in found if limit > 0]
@@ -56,7 +55,7 @@ def check(needed: float, what: str, remedy: str, file: str = "") -> None:
     """Check that something fits in memory.
 
     - `needed`: estimated size (bytes).
-    - `what`: what needs it, with the file and its size: the beginning of the message.
+    - `what`: the beginning of the message: the object that needs the memory, with the file and its size.
     """
     if needed > limit():
         raise TaskError(

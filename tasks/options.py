@@ -17,7 +17,7 @@ class Options(BaseModel):
 
 
 def stage_module(options: Options) -> ModuleType:
-    """Return the module that computes the stage: the one that defines the options' class and `VERSION`."""
+    """Return the module that computes the stage: it defines the options' class and `VERSION`."""
     return sys.modules[type(options).__module__]
 
 

@@ -3,9 +3,9 @@
 dynamic: points at ``road_m`` on the road and at ``terrain_m`` elsewhere, joined by Delaunay triangulation;
 uniform: a regular grid of triangles (RGT); corners: the two triangles of a plane.
 
-The lattices are anchored at the south-west corner of the domain: the hull of the core's cell centres where
-the tile has neither frame nor halo, else the core's bounds, so that neighbouring tiles meet. With a frame,
-the points on the border and their heights are those of the neighbours too: the meshes join without a gap.
+The lattices are anchored at the south-west corner of the domain. The domain is the hull of the core's cell
+centres if the tile has neither frame nor halo. Otherwise it is the core's bounds, so that neighbouring tiles
+meet. With a frame, neighbours have the same points and heights on the border: the meshes join without a gap.
 
 A dynamic mesh has edges along the limit of the survey and ends there (`tasks.meshing.survey_limit`). If the
 roads are polygons, it has edges along their outlines, too (`tasks.meshing.road_outline`).
@@ -64,13 +64,13 @@ VERSION = 5
 
 SMOOTH_M = 1.5
 """Distance from the road up to which a mesh without breaklines has no steps (m): faces between road and
-terrain would be steep, and those on the road's edge count as road."""
+terrain would be steep, and faces on the road's edge are taken as road."""
 FEW = 0.1
-"""Share of the points below which it takes longer to find the squares of a lattice than to do without."""
+"""Smallest share of points on a lattice for which the search for its squares saves time."""
 
 
 class Options(base.Options):
-    """Where the surface is sampled."""
+    """Method, spacing and mask of the sampling."""
 
     method: Literal["dynamic", "uniform", "corners"] = Field(
         "dynamic",
@@ -110,7 +110,7 @@ def sample(
     clusters : RoadClusters
         Gives the filtered mask.
     frame : Frame, optional
-        What the tile shares with its neighbours; None if its surface was fitted without.
+        The parts that the tile shares with its neighbours; None if its surface was fitted without them.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def sample(
     west, south, east, north = _domain(road, frame)
     local = west - origin[0], south - origin[1], east - origin[0], north - origin[1]
     if frame:
-        # Subtraction leaves rounding errors if the size of the tile is no whole number of metres.
+        # Subtraction leaves rounding errors if the size of the tile is not a whole number of metres.
         west, south, east, north = (round(edge, DECIMALS) for edge in local)
         local = west, south, east, north
     if isinstance(surface, SteppedSurface) and not options.breaklines:
@@ -204,7 +204,7 @@ def _levels(
 
 
 def with_levels(meshes: Mapping[int, Mesh]) -> Mesh:
-    """Return the meshes of several levels of a tile as one; they share no vertex.
+    """Return the meshes of several levels of a tile as one mesh; they share no vertex.
 
     - `meshes`: by number of the level; level 0 is the first.
     """
@@ -240,8 +240,8 @@ def _other_level(
 ) -> tuple[Floats, Faces]:
     """Return points and faces of a deck or tunnel, which ends at its outline and with the survey.
 
-    - `ground` ``(n, 3)``: the vertices of level 0: on abutments at the border of the tile, the level has the
-      same ones.
+    - `ground` ``(n, 3)``: the vertices of level 0; the level has the same vertices on abutments at the border
+      of the tile.
     """
     limit, lines, area = _limit(road, local, frame), [outline.lines], outline.area
     if limit:
@@ -318,7 +318,7 @@ def _dynamic(
 
 
 def _in_space(points: Floats, surface: MovingNurbs, origin: tuple[float, float]) -> Floats:
-    """Return the points S(u, v) for the parameters of lattice points, without those at poles, ``(n, 3)``."""
+    """Return the points S(u, v) for the parameters of lattice points, without poles, ``(n, 3)``."""
     places = surface.moved(*(points[:, :2] + origin).T)
     moved = np.column_stack([*places, points[:, 2]])
     moved[:, :2] += np.subtract(surface.origin, origin)
@@ -339,7 +339,7 @@ def _limit(road: RoadMask, local: Bounds, frame: Frame | None) -> SurveyLimit | 
 def _divided(
     lines: shapely.MultiLineString, road: RoadMask, mask: Bools, options: Options
 ) -> NDArray[np.object_]:
-    """Return lines with points as dense as those of the ground beside them."""
+    """Return lines with points as dense as the points of the ground beside them."""
 
     def on_road(places: Floats) -> Bools:
         return np.asarray(mask[road.grid.cells(*(places + road.core.origin).T)])
@@ -366,7 +366,7 @@ def _border(
 ) -> Floats:  # fmt: skip
     """Return points along the border of a dynamic mesh, with corners and ends of lines, ``(n, 3)``.
 
-    With a frame they are those of the neighbours, too.
+    With a frame, the neighbours have the same points.
     """
     west, south, east, north = local
     if frame:
@@ -394,7 +394,7 @@ def _mesh(
 ) -> Mesh:
     """Return the mesh of the faces that have heights, without unused vertices.
 
-    - `roads`: areas that class the faces, in place of the cells of ``mask``.
+    - `roads`: areas that class the faces, instead of the cells of ``mask``.
     """
     east, north = road.core.origin
     known = np.isfinite(points[:, 2])

@@ -25,25 +25,25 @@ BLEND_M = 4.0
 ON_ABUTMENT_M = 1e-3
 """Points within this distance of an abutment lie on it (m)."""
 FREE_M = 0.05
-"""Points that are nearer to the outline of a level by this (m) than to its abutments lie at a free edge."""
+"""Points lie at a free edge if a level's outline is nearer by at least this (m) than its abutments."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A layer that is not read by `load` but by the stage that uses it, at its own resolution."""
+    """A layer that the stage that uses it reads, at its own resolution; `load` does not read it."""
 
     name: str
     """One of `catalog.LAYERS`."""
     paths: tuple[Location, ...]
     """Files that reach the tile; where files overlap, the first one with a value is used."""
     crs: str | None = None
-    """CRS of files without one."""
+    """CRS of files without a CRS of their own."""
     optional: bool = False
-    """Whether rasters that are missing or broken are left out, as around a border, and not an error."""
+    """Whether missing or broken rasters are left out, as around a border; else they are an error."""
     reproject: bool = False
     """Whether rasters in another CRS than the tile's are warped; else they are an error."""
     sublayer: str | None = None
-    """Layer of vector files that have several."""
+    """Layer to read from vector files with several layers."""
     missing: frozenset[str] | None = None
     """Full names of files that are missing; None if that is not known."""
 
@@ -91,7 +91,7 @@ class TileData:
         """Return the cells beyond the survey, ``(H, W)``.
 
         These are the cells with neither DSM nor DTM in a void (4-connected) that touches the grid's edge. A
-        void inside, as in water or deep shade, is not beyond the survey: meshes bridge it.
+        void inside, such as water or deep shade, is not beyond the survey: meshes bridge it.
         """
         void = np.isnan(self.dsm) & np.isnan(self.dtm)
         if not any(side.any() for side in (void[0], void[-1], void[:, 0], void[:, -1])):
@@ -109,14 +109,14 @@ class TileData:
 class Level:
     """The roads of one level: decks above the ground (number above 0), or tunnels below it (below 0).
 
-    Level 0 is the ground with its streets and has no `Level`. Coordinates are those of the tile's CRS (m).
+    Level 0 is the ground with its streets and has no `Level`. Coordinates are in the tile's CRS (m).
     """
 
     number: int
     areas: shapely.MultiPolygon
     """The decks or tunnels on and around the tile."""
     abutments: shapely.MultiLineString
-    """The parts of their outline where a road of level 0 goes on."""
+    """The parts of their outline where a road of level 0 continues."""
     approach: shapely.MultiPolygon
     """The road of level 0 beyond the abutments: there level 0 has the surface of this level."""
     passing: shapely.MultiPolygon = field(default_factory=shapely.MultiPolygon)
@@ -133,7 +133,7 @@ class Level:
         return np.asarray(shapely.intersects_xy(self.areas, easting, northing))
 
     def weight(self, easting: Floats, northing: Floats) -> Floats:
-        """Return the share of this level's surface in that of level 0, from 0 to 1, in the broadcast shape.
+        """Return the weight of this level's surface in level 0, from 0 to 1, in the broadcast shape.
 
         It is 1 on the approach, falls to 0 over `BLEND_M` beside and behind it, and is 0 below the decks, at
         their free edges, and on streets that pass.
@@ -164,7 +164,7 @@ class Level:
 class RoadMask:
     """The result of `segment`: the paper's M^r, before the filter.
 
-    With levels, mask and areas are those of level 0, without the decks and tunnels.
+    With levels, mask and areas show level 0, without the decks and tunnels.
     """
 
     grid: Grid
@@ -179,34 +179,34 @@ class RoadMask:
     bridge: Bools | None = None
     """Cells of the mask that lie on bridges, ``(H, W)``, or None if the method does not detect bridges."""
     areas: NDArray[np.uint8] | None = None
-    """The road as polygons (WKB of `tasks.meshing.road_outline.encoded`), of which the mask has the cells.
-    None if there are none, or if the mask is not that of polygons."""
+    """The road as polygons (WKB of `tasks.meshing.road_outline.encoded`), if the mask was made from polygons;
+    else None."""
     notes: tuple[str, ...] = ()
     """Warnings about the mask (such as a photo shifted against the heights), one line each."""
     levels: tuple[Level, ...] = ()
-    """The other levels that the tile's surface depends on, by ascending number."""
+    """The other levels on which the tile's surface depends, by ascending number."""
 
 
 @dataclass(frozen=True, eq=False)
 class RoadClusters:
     """The result of ECSRC: the paper's labels L and, as `mask`, M^{r+}.
 
-    With levels, the labels are those of what level 0 sees: its streets, without approaches.
+    With levels, the labels show the streets of level 0, without approaches.
     """
 
     grid: Grid
     labels: NDArray[np.int32]
-    """``(H, W)``; 0 is no road, clusters count from 1 in the order of their first cell."""
+    """``(H, W)``; 0 is no road, clusters are numbered from 1 in the order of their first cell."""
     dtm_invalid: Bools | None = None
     """Dropped cells whose DTM is invalid, ``(H, W)``, or None if the DTM was not checked. Under objects that
-    hide a road the DTM may be that of other ground; beside a road it is smoothed."""
+    hide a road the DTM may show other ground; beside a road it is smoothed."""
     beside: Bools | None = None
     """Cells beside the streets whose ground has its own height (`tasks.spline.stepped`), ``(H, W)``: the
     shoulder, whose DTM is left out of the fit, and cells near it. None if there is no shoulder."""
     level: Level | None = None
-    """The level that these clusters are of; None: level 0."""
+    """The level of these clusters; None: level 0."""
     levels: tuple[RoadClusters, ...] = ()
-    """The clusters of each other level, of its roads and of the streets far from them."""
+    """The clusters of each other level: of its roads, and of streets far from them."""
 
     @property
     def mask(self) -> Bools:
@@ -268,11 +268,11 @@ class Surface(ABC):
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """The numbers of the levels, ascending; 0 is one of them."""
+        """The numbers of the levels, ascending, including 0."""
         return tuple(sorted((0, *(own.level.number for own in self.levels))))
 
     def at(self, number: int) -> Surface:
-        """Return the surface of one of its levels."""
+        """Return the surface of a level."""
         return self
 
     @property
@@ -281,7 +281,7 @@ class Surface(ABC):
         return self
 
     def covers(self, number: int, easting: Floats, northing: Floats) -> Bools:
-        """Return which points a level has, in their broadcast shape: level 0 is everywhere."""
+        """Return which points a level covers, in their broadcast shape; level 0 covers all points."""
         for own in self.levels:
             if own.level.number == number:
                 return own.level.covers(easting, northing)
@@ -302,7 +302,7 @@ class Mesh:
 
     crs: str
     origin: tuple[float, float, float]
-    """Whole-metre (easting, northing, height) the vertices are relative to."""
+    """Origin of the vertices: whole-metre (easting, northing, height)."""
     vertices: Floats
     """``(V, 3)``, metres from the origin: east, north, up."""
     faces: NDArray[np.int32]
@@ -311,17 +311,17 @@ class Mesh:
     """``(F,)``, True where the cell under the face's centroid is road by the mask used for sampling, or where
     the centroid is in the road's polygons, if the mesh has their outline."""
     level: NDArray[np.int8] | None = None
-    """Level of each face, ``(F,)``; None: all are on level 0. Faces of different levels share no vertex: on a
-    abutment both have vertices at the same places."""
+    """Level of each face, ``(F,)``; None: all are on level 0. Faces of different levels share no vertex: on
+    an abutment both have vertices at the same places."""
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """The numbers of the levels that it has, 0 first."""
+        """The numbers of its levels, 0 first."""
         others = [] if self.level is None else np.unique(self.level[self.level != 0]).tolist()
         return 0, *others
 
     def at(self, number: int) -> Mesh:
-        """Return the part of it that is of one level, with the same origin."""
+        """Return the part on one level, with the same origin."""
         if self.level is None:
             return self
         chosen = self.level == number
@@ -374,7 +374,7 @@ class Metrics:
     road_fraction: float
     """Share of the core's reference cells that are road by the evaluation mask."""
     completeness: float
-    """Share of the core's reference cells the mesh has a height for."""
+    """Share of the core's reference cells for which the mesh has a height."""
     mesh_p95_road_m: float
     """95th percentile of the vertical distance of the mesh from the surface that it samples, over the road
     cells of the raw mask."""
@@ -404,7 +404,7 @@ class Quality:
     """
 
     residual_median_m: float
-    """Median of surface minus the heights it was fitted to at the kept road cells: a vertical shift."""
+    """Median of surface minus fitted heights at the kept road cells: a vertical shift."""
     residual_nmad_m: float
     """NMAD (spread) of that difference."""
     residual_p95_m: float
@@ -422,11 +422,11 @@ class Quality:
     dropped_road: float
     """Share of the mask that the filter dropped."""
     dsm_excess_m: float
-    """Median height of the DSM above the heights that the road was fitted to; 0 if they are the DSM's."""
+    """Median height of the DSM above the heights to which the road was fitted; 0 if these are the DSM."""
     off_dtm_m: float
     """Median of surface minus DTM."""
     off_dtm_road: float
-    """Share of the road with a DTM whose distance to it exceeds that of two heights of the same ground."""
+    """Share of the road with a DTM whose distance to the DTM exceeds the tolerance for the same ground."""
     bounded_weights: float
     """Share of the weights at a bound; NaN unless the surface is a NURBS."""
     error_estimate_m: float
@@ -437,12 +437,12 @@ class Quality:
     """Easting of the cell with the largest estimate in that piece of road (m)."""
     worst_northing: float
     max_unexplained_area_m2: float
-    """Area of the largest road patch whose distance to scan and DTM exceeds that of two heights of the same
-    ground (m2); 0 if the road has none."""
+    """Area of the largest road patch whose distance to scan and DTM exceeds the tolerance for the same ground
+    (m2); 0 without such a patch."""
     holdout_squares: float
-    """Number of squares of road that a second fit did without; NaN if there was none."""
+    """Number of squares of road that a second fit left out; NaN without a second fit."""
     holdout_error_m: float
-    """Mean absolute difference of that fit and the heights of these squares."""
+    """Mean absolute difference of the second fit and the heights of these squares."""
     holdout_covered: float
     """Share of these squares whose difference is within the 90% interval of the error estimate."""
     flags: tuple[str, ...]
@@ -452,12 +452,12 @@ class Quality:
     flagged: NDArray[np.uint16]
     """Raised flags of the core's cells by `tasks.quality.flagged.LOCAL_FLAGS`, ``(H, W)``."""
     levels: tuple[tuple[int, Quality], ...] = ()
-    """Number and quality of each other level; beyond its decks or tunnels the height source is none."""
+    """Number and quality of each other level; beyond its decks or tunnels there is no height source."""
     structures: Structures | None = None
     """Figures of these decks or tunnels; None for level 0."""
 
     def at(self, number: int) -> Quality:
-        """Return the quality of a level, that of level 0 if it has none."""
+        """Return the quality of a level, or of level 0 if the level has none."""
         return dict(self.levels).get(number, self)
 
 

@@ -1,17 +1,24 @@
 """Small objects of the program for tests: grids, tiles, masks, clusters, surfaces and finished runs."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
 
 from flexroad.catalog import Catalog, Grid
+from flexroad.catalog.borders import border_of
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.border import ENDS
+from flexroad.tasks.filter import planar
+from flexroad.tasks.fit import smoothing_spline
+from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
@@ -94,3 +101,53 @@ def copy_run(made: Run, survey: Path, folder: Path) -> Run:
     ids = {tile.id for tile in made.catalog.tiles}
     tiles = [tile for tile in Catalog.read(own / "catalog.parquet").tiles if tile.id in ids]
     return Run.create(folder / "run", made.config, Catalog(tuple(tiles)))
+
+
+def given_heights(heights: np.ndarray, grid: Grid) -> Any:
+    """Return a surface with these heights at the cells of a grid."""
+    return SimpleNamespace(bounds=grid.hull, lattice=lambda eastings, northings: heights)
+
+
+def make_frame(
+    part: Callable[[Grid], tuple[TileData, RoadMask, RoadClusters]],
+    tile: Grid,
+    around_m: float,
+    options: smoothing_spline.Options,
+) -> Frame:
+    """Fit the corners and edges of a tile, as in a run. ``part`` returns what a grid has."""
+    parts: list[Any] = []
+    for number, border in enumerate(border_of(tile, around_m)):
+        if number < 4:
+            parts.append(smoothing_spline.corner(*part(border.grid), border, options))
+        else:
+            ends = [parts[end] for end in ENDS[number - 4]]
+            parts.append(smoothing_spline.edge(*part(border.grid), border, ends, options))
+    return Frame(*parts)
+
+
+def filtered(
+    world: TileData, grid: Grid, core: Grid | None = None
+) -> tuple[TileData, RoadMask, RoadClusters]:
+    """Return a part of the data of an area, with its road and the filtered road."""
+    cut = world.grid.window(grid)
+    layers = {name: getattr(world, name) for name in ("dsm", "dtm", "road_mask", "road_height")}
+    part = {name: layer[cut] for name, layer in layers.items() if layer is not None}
+    data = TileData("part", grid, core or grid, **part, offset_dsm=world.offset_dsm)
+    road = RoadMask(grid, data.core, data.road_mask, data.beyond_extent())
+    return data, road, planar.ecsrc(data, road, planar.Options(shoulder_m=5))
+
+
+def make_street(
+    ground: Callable[[Any, Any], Any], shape: tuple[int, int] = (100, 100), noise: float = 0.0
+) -> tuple[TileData, RoadClusters, np.ndarray]:
+    """Return a tile with a road 10 m wide along its middle rows, the filtered road, and the true heights.
+
+    ``ground`` returns the heights at metres to the east and to the south.
+    """
+    height, width = shape
+    truth = ground(*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
+    rng = np.random.default_rng(0)
+    dsm, dtm = (truth + rng.normal(0, noise, truth.shape) for _ in range(2))
+    road = np.zeros(truth.shape, bool)
+    road[height // 2 - 5 : height // 2 + 5] = True
+    return make_tile(dsm, dtm), make_clusters(road), truth

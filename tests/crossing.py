@@ -22,6 +22,15 @@ WEST, SOUTH = 500000.0, 5600000.0
 GROUND_M, DECK_M, RISE = 100.0, 107.0, 0.03
 
 
+def border_part(border, areas) -> Corner | Edge:
+    """Return a corner or an edge without control points, with roads on these areas."""
+    if border.kind == "corner":
+        return Corner(np.zeros((3, 3)), np.zeros((2, 2), np.bool_))
+    road = border.along(cells(areas, border.grid))
+    places = crossings(encoded(areas, border.grid), border)
+    return Edge(np.zeros((3, 0)), road[1], road[1], np.zeros_like(road), places)
+
+
 class Tile(NamedTuple):
     """What a tile is sampled from."""
 
@@ -111,10 +120,10 @@ class Crossing:
         return LevelledSurface.of(spline, (LevelSpline(self.level, deck),), grid)
 
     def _part(self, border) -> Corner | Edge:
-        if border.kind == "corner":
-            return Corner(np.zeros((3, 3)), np.zeros((2, 2), np.bool_))
-        own, level = self._edge(border, self.streets), self.level
-        deck = self._edge(border, shapely.get_parts(level.areas))
+        own, level = border_part(border, self.streets), self.level
+        if isinstance(own, Corner):
+            return own
+        deck = border_part(border, shapely.get_parts(level.areas))
         (east, north), along = border.start, deck.crossings
         places = (
             (east + along, north + 0 * along) if border.kind == "east" else (east + 0 * along, north + along)
@@ -122,10 +131,3 @@ class Crossing:
         on_abutment = shapely.dwithin(level.abutments, shapely.points(*places), 0.05)
         every = np.union1d(own.crossings, deck.crossings[on_abutment])
         return replace(own, crossings=every, levels=((self.number, deck),))
-
-    def _edge(self, border, areas) -> Edge:
-        road = border.along(cells(areas, border.grid))
-        inside = np.zeros_like(road)
-        return Edge(
-            np.zeros((3, 0)), road[1], road[1], inside, crossings(encoded(areas, border.grid), border)
-        )

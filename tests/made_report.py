@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 
 from flexroad.catalog import Catalog
-from flexroad.catalog.grid import Grid
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.summary import Summary
@@ -21,29 +20,22 @@ from flexroad.tools.report.content import (
     Content,
 )
 from flexroad.tools.report.steps import CHECK
+from tests.builders import make_grid
 
 SIDE_M = 250
+FURTHER = "off_dtm_m residual_median_m measured_road dtm_road completeness max_unexplained_area_m2".split()
+"""Figures of a row that have any value."""
 
 
 def made_run(folder, survey, ids, columns=None) -> Run:
     """Return a run of tiles with these ids, row by row from the south-west; none is computed."""
     tile = Catalog.read(survey).tiles[0]
     columns = columns or max(1, round(len(ids) ** 0.5))
-    tiles = [
-        dataclasses.replace(
-            tile,
-            id=name,
-            grid=Grid(
-                "EPSG:25832",
-                588_000.0 + SIDE_M * (i % columns),
-                5_519_000.0 + SIDE_M * (1 + i // columns),
-                1.0,
-                SIDE_M,
-                SIDE_M,
-            ),
-        )
-        for i, name in enumerate(ids)
-    ]
+    tiles = []
+    for i, name in enumerate(ids):
+        west, north = 588_000.0 + SIDE_M * (i % columns), 5_519_000.0 + SIDE_M * (1 + i // columns)
+        grid = make_grid(SIDE_M, SIDE_M, west=west, north=north)
+        tiles.append(dataclasses.replace(tile, id=name, grid=grid))
     return Run.create(folder, load_config("production"), Catalog(tuple(tiles)))
 
 
@@ -124,23 +116,6 @@ def many_rows(ids, seed=0):
             yield failed_row(name, f"load: TaskError: dsm dsm/{name}.tif is missing; restore it")
             continue
         estimate = float(rng.gamma(2.0, 0.02))
-        yield made_row(
-            name,
-            estimate,
-            "error-estimate, spike" if estimate > 0.12 else "no-road" if i % 61 == 7 else "",
-            **{
-                name: float(value)
-                for name, value in zip(
-                    (
-                        "off_dtm_m",
-                        "residual_median_m",
-                        "measured_road",
-                        "dtm_road",
-                        "completeness",
-                        "max_unexplained_area_m2",
-                    ),
-                    rng.normal(0, 1, 6),
-                    strict=True,
-                )
-            },
-        )
+        flags = "error-estimate, spike" if estimate > 0.12 else "no-road" if i % 61 == 7 else ""
+        further = zip(FURTHER, rng.normal(0, 1, len(FURTHER)).tolist(), strict=True)
+        yield made_row(name, estimate, flags, **dict(further))

@@ -24,14 +24,15 @@ def write(
     tags: dict[str, str] | None = None,
     **profile,
 ) -> Path:
-    """Write a raster of one band with its north-west corner at ``west`` and ``north``."""
+    """Write a raster, ``(h, w)`` or ``(bands, h, w)``; ``west`` and ``north`` are its north-west corner."""
     values = np.asarray(values)
+    bands = values if values.ndim == 3 else values[None]
     path.parent.mkdir(parents=True, exist_ok=True)
-    form = {"driver": driver, "dtype": values.dtype, "count": 1, "crs": crs, **profile}
-    form |= {"width": values.shape[1], "height": values.shape[0]}
+    form = {"driver": driver, "dtype": bands.dtype, "crs": crs, **profile}
+    form |= dict(zip(("count", "height", "width"), bands.shape, strict=True))
     form["transform"] = transform or Affine(cell, 0, west, 0, -cell, north)
     with rasterio.open(path, "w", **form) as dst:
-        dst.write(values, 1)
+        dst.write(bands)
         dst.update_tags(**(tags or {}))
         if unit:
             dst.units = (unit,)

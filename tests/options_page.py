@@ -15,7 +15,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "options.md"
 HEAD = """# Options
 
 The options of a configuration with their own defaults (`extends: defaults`), bounds and meaning. `flexroad
-config template` prints the values of `production`, `flexroad config show NAME` those of a configuration,
+config template` prints the values of `production`, `flexroad config show NAME` the values of a configuration,
 `flexroad config schema` a schema for editors.
 """
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}

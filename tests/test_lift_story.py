@@ -30,9 +30,8 @@ def test_the_extract_is_the_one_that_is_made(tmp_path):
 
 def commands() -> list[list[str]]:
     section = (ROOT / "docs" / "quickstart.md").read_text().partition("\n## Heights for your own roads")[2]
-    return [
-        shlex.split(line) for line in re.findall(r"^\$ (.*)$", section.partition("\n## ")[0], re.MULTILINE)
-    ]
+    lines = re.findall(r"^\$ (.*)$", section.partition("\n## ")[0], re.MULTILINE)
+    return [shlex.split(line) for line in lines]
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +58,8 @@ def offset(file: Path) -> np.ndarray:
 def surface(folder: Path, places: np.ndarray) -> np.ndarray:
     """Return the heights of the run at places in UTM, without kerbs."""
     to_run = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:25832", always_xy=True)
-    found, _ = RunSampler.open(folder / "runs" / "town").heights(
-        *to_run.transform(*places[:, :2].T), steps=False
-    )
-    return found.ground
+    x, y = to_run.transform(*places[:, :2].T)
+    return RunSampler.open(folder / "runs" / "town").heights(x, y, steps=False)[0].ground
 
 
 def rows(folder: Path) -> dict[str, dict[str, str]]:
@@ -76,9 +73,8 @@ def test_carla_reads_heights_within_the_reported_error(lifted):
     roads, places = by_carla(file)
     height = surface(lifted, places + offset(file))
     reported = rows(lifted)
-    inside = np.array([reported[str(road)]["without_ground_m"] == "0.0" for road in roads]) & np.isfinite(
-        height
-    )
+    covered = np.array([reported[str(road)]["without_ground_m"] == "0.0" for road in roads])
+    inside = covered & np.isfinite(height)
     assert inside.sum() > 2000
     missed = 1000 * np.abs(places[:, 2] - height)[inside]
     allowed = np.array([float(reported[str(road)]["elevation_max_mm"]) for road in roads[inside]])
@@ -104,24 +100,12 @@ def test_a_vehicle_of_sumo_drives_on_the_surface(lifted):
         for number in range(0, len(ids), 7)
     ]
     (lifted / "trips.xml").write_text(f"<routes>{''.join(trips)}</routes>")
-    command = [
-        validators.program("sumo"),
-        "-n",
-        net,
-        "-r",
-        lifted / "trips.xml",
-        "--fcd-output",
-        lifted / "fcd.xml",
-    ]
-    subprocess.run(
-        [*command, "--fcd-output.geo", "false", "--ignore-route-errors"], check=True, capture_output=True
-    )
-    places = np.array(
-        [
-            [float(each.attrib[axis]) for axis in "xyz"]
-            for each in ElementTree.parse(lifted / "fcd.xml").getroot().iter("vehicle")
-        ]
-    )
+    positions = lifted / "fcd.xml"
+    words = ["-n", net, "-r", lifted / "trips.xml", "--fcd-output", positions, "--fcd-output.geo", "false"]
+    command = [validators.program("sumo"), *words, "--ignore-route-errors"]
+    subprocess.run(command, check=True, capture_output=True)
+    vehicles = ElementTree.parse(positions).getroot().iter("vehicle")
+    places = np.array([[float(each.attrib[axis]) for axis in "xyz"] for each in vehicles])
     assert len(places) > 500
     net_offset = ElementTree.parse(net).getroot().find("location").attrib["netOffset"].split(",")
     height = surface(lifted, places - [*map(float, net_offset), 0.0])

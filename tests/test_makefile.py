@@ -1,4 +1,4 @@
-"""`make reproduce` runs the commands that README lists; `make test` omits slow tests."""
+"""The commands of `make reproduce`."""
 
 import shutil
 import subprocess
@@ -6,35 +6,26 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed"),
+]
 
 ROOT = Path(__file__).parent.parent
 
 
-def commands(tmp_path, *words: str, program: str = "flexroad", target: str = "reproduce") -> list[list[str]]:
-    """Return the words of a program's calls that make would run in a fresh, installed checkout."""
-    tmp_path.mkdir(exist_ok=True)
+def commands(tmp_path, *words: str) -> list[list[str]]:
+    """Return the words of each call of flexroad in a fresh, installed checkout."""
     shutil.copy(ROOT / "Makefile", tmp_path)
-    validated_by = (
-        f"tests/validators/{name}" for name in ("requirements.txt", "package.json", "package-lock.json")
-    )
-    for name in (
-        "pyproject.toml",
-        "constraints.txt",
-        ".venv/.installed",
-        "configs/gerod.yaml",
-        *validated_by,
-    ):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    for name in ("pyproject.toml", "constraints.txt", ".venv/.installed", "configs/gerod.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    done = subprocess.run(
-        ["make", "-n", target, *words], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
+    make = ["make", "-n", "reproduce", *words]
+    done = subprocess.run(make, cwd=tmp_path, capture_output=True, text=True, check=True)
     lines = [line.split() for line in done.stdout.splitlines()]
-    return [line[1:] for line in lines if line[0].endswith(program)]
+    return [line[1:] for line in lines if line[0].endswith("flexroad")]
 
 
-@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_reproduce_synthetic_tiles_run_with_both_masks(tmp_path):
     catalog, _, first, second, dsm, literal, _, _, tables, figures = commands(tmp_path, "TILES=3", "SEED=5")
     assert catalog[:2] == ["catalog", "synthetic"]
@@ -53,7 +44,6 @@ def test_reproduce_synthetic_tiles_run_with_both_masks(tmp_path):
     assert tables[-2:] == figures[-2:]
 
 
-@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 @pytest.mark.parametrize(("root", "folder"), [("/data/gerod", "/data/gerod"), ("GeRoD.zip", "GeRoD")])
 def test_reproduce_with_gerod_root_uses_real_tiles(tmp_path, root, folder):
     catalog, _, run, dsm, literal, _, _, tables, _ = commands(tmp_path, f"GEROD_ROOT={root}")
@@ -65,7 +55,6 @@ def test_reproduce_with_gerod_root_uses_real_tiles(tmp_path, root, folder):
     assert "--true" not in tables
 
 
-@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 @pytest.mark.parametrize("words", [["SEED=5"], ["SEED=5", "GEROD_ROOT=/data/gerod"]])
 def test_reproduce_synthetic_scenes_run_with_both_references(tmp_path, words):
     _, scenes, *_, circular, true, tables, _ = commands(tmp_path, *words)
@@ -79,44 +68,3 @@ def test_reproduce_synthetic_scenes_run_with_both_references(tmp_path, words):
         assert run[run.index("--config") + 1] == "dsc3d"
         assert run[run.index("--catalog") + 1] == str(folder / name)
         assert tables[tables.index(option) + 1] == run[run.index("--out") + 1]
-
-
-@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_make_test_omits_slow_tests_and_test_all_does_not(tmp_path):
-    selected = ["-m", '"not', 'slow"']
-    for target, selection in (("test", selected), ("test-all", [])):
-        (words,) = commands(tmp_path / target, program="python", target=target)
-        assert words == [
-            "-m",
-            "pytest",
-            "-n",
-            "2",
-            "--dist",
-            "loadfile",
-            "--no-loadscope-reorder",
-            *selection,
-        ]
-
-
-@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_make_test_of_an_area_runs_its_folders(tmp_path):
-    (tmp_path / "tests" / "tools" / "lift").mkdir(parents=True)
-    (words,) = commands(tmp_path, "AREA=lift", program="python", target="test")
-    assert words[-1] == "tests/tools/lift"
-
-
-@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_make_soak_records_the_commit(tmp_path):
-    fuzz, words = commands(tmp_path, program=".venv/bin/python", target="soak")
-    assert fuzz[:2] == ["-m", "tests.fuzz"]
-    assert words[-4:] == ["-m", "soak", "--soak", "record"]
-
-
-def test_ci_runs_lint_all_tests_and_the_fuzzer():
-    lines = (ROOT / ".ci" / "run").read_text().splitlines()
-    *_, install, tests, due, fuzz, end = [line for line in lines if not line.startswith("#")]
-    assert {"setup", "validators", "lint"} <= set(install.split())
-    options = '"--hypothesis-profile=ci --soak=changed"'
-    assert tests == f"PYTEST_ADDOPTS={options} FLEXROAD_VALIDATORS=.validators make test-all"
-    assert (due, end) == ("if python3 tests/changed.py readers; then", "fi")
-    assert fuzz.startswith("  make fuzz FUZZ_SECONDS=10 ")

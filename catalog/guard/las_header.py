@@ -1,7 +1,7 @@
 """The header of a LAS or LAZ file, checked before a decoder reads it.
 
-Decoders allocate and repeat what the header says: 2^32 - 1 records take hours, a chunk of 2^32 points takes
-all memory. Here every count and offset is compared with the size of the file.
+Decoders trust the header: 2^32 - 1 records take hours, a chunk of 2^32 points takes all memory. Here every
+count and offset is compared with the size of the file.
 
 A chunk of a compressed LAS 1.4 begins with its first point, the number of points and the size of each of its
 layers. The decoder allocates what these sizes say, up to 4 GiB each.
@@ -25,7 +25,7 @@ LONGEST = 375
 """Length of the header of LAS 1.4 (bytes); LAS 1.0 to 1.2 have 227."""
 SHORTEST = 227
 COMPRESSED = 0x80
-"""Bit of the point format."""
+"""Bit of the point format that marks compressed points."""
 RECORD, EXTENDED_RECORD = 54, 60
 """Length of the headers of a variable length record (VLR) and of an extended one (bytes)."""
 LASZIP = 22204, b"laszip encoded"
@@ -33,7 +33,7 @@ LASZIP = 22204, b"laszip encoded"
 COARSEST = 1000.0
 """Largest step of coordinates, in any unit."""
 VARIABLE = 2**32 - 1
-"""Size of the chunks of COPC: each has its own."""
+"""Chunk size in the header of COPC: each chunk has its own size."""
 WHOLE = 0
 """Size of the only chunk of a file that is not divided."""
 SHORTEST_CHUNK = 20
@@ -47,7 +47,7 @@ BYTES = 14
 
 
 class _Span(NamedTuple):
-    """Where the points of a file are, and how many its header counts."""
+    """Where the points of a file are, and their number by the header."""
 
     start: int
     """First byte."""
@@ -75,7 +75,7 @@ def check(path: Path) -> int:
         number = struct.unpack_from(*(("<Q", head, 247) if is_long else ("<I", head, 107)))
         points, item = int(number[0]), int(struct.unpack_from("<H", head, 105)[0])
         if points:
-            # Files without points have the largest numbers that there are as bounds.
+            # Files without points have the largest possible numbers as bounds.
             _check_numbers(head)
         if is_long:
             _check_extended(file, head, size)
@@ -169,7 +169,7 @@ def _chunk_table(file: BinaryIO, record: bytes, span: _Span) -> list[tuple[int, 
     file.seek(span.start)
     position = struct.unpack("<q", file.read(8).ljust(8, b"\0"))[0]
     if position == -1:
-        # Written as a stream: the position is at the end.
+        # The file was written as a stream: the position is at the end.
         file.seek(span.size - 8)
         position = struct.unpack("<q", file.read(8))[0]
     if not span.start < position <= span.size - 8:

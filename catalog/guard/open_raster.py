@@ -1,11 +1,11 @@
-"""Opening of source rasters: only regular files of known formats, none of which leads to other files.
+"""Opening of source rasters: only regular files of known formats that do not lead to other files.
 
 GDAL chooses the driver by a file's content, whatever its name: a VRT or WMS named ``a.tif`` would make it
-read other files or the web. So the driver is chosen here, by the first bytes, and is the only one allowed.
+read other files or the web. So the driver is chosen here, by the first bytes, and no other is allowed.
 Side-car files and metadata can name further files, too; they are checked as well.
 
 A thread keeps rasters open (`kept_raster`): a tile, its corners and its edges read the same files. Only files
-on disk without side-car files are kept. One that has changed since, or whose folder has, is opened again.
+on disk without side-car files are kept. A file is opened again if it or its folder has changed.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ SUFFIXES = {
     ".jpg": "JPEG",
     ".jpeg": "JPEG",
 }
-"""Drivers in object storage, by the suffix of a file's name: to read its first bytes is a request more."""
+"""Drivers in object storage, by the suffix of a file's name: reading the first bytes would need a request."""
 NOT_TEXT = re.compile(rb"[<\0-\x08\x0e-\x19\x1b-\x1f]")
 """Bytes that ASCII grids and XYZ do not have; 0x1a ends some files."""
 MARK = re.compile(rb"<[A-Za-z]{3}")
 ASCII_GRID = re.compile(rb"\s*(ncols|nrows|xll|yll|cellsize|dx|dy|nodata)", re.IGNORECASE)
 ERRORS = (RasterioError, CRSError, OSError, UnicodeDecodeError)
-"""What rasterio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
+"""Errors of rasterio for damaged files; the last is for a name in the CRS that is not UTF-8."""
 BLOCK_CACHE_BYTES = 16 * 2**20
-"""Blocks of files that stay open which GDAL keeps in memory; its own default grows with the machine."""
+"""Size of GDAL's cache of blocks of open files; GDAL's default grows with the memory of the machine."""
 OFFLINE = {"CPL_VSIL_CURL_ALLOWED_FILENAME": "none"}
 """GDAL's option for local files: its file system on the web opens nothing."""
 MOST_KEPT = 64
@@ -103,9 +103,9 @@ def open_alone(path: Path) -> Any | None:
 
 
 def has_own_blocks(path: Path) -> bool:
-    """Return whether each block of a raster can be read by itself: that of a GeoTIFF.
+    """Return whether each block of a raster can be read by itself: only blocks of a GeoTIFF can.
 
-    Text grids and pictures are decoded from their beginning, and GDAL does not return from reading a row of
+    Text grids and pictures are decoded from their beginning. GDAL does not return from reading a row of
     an ASCII grid behind a damaged one.
     """
     try:
@@ -124,7 +124,7 @@ def _remote(path: Any) -> Iterator[Any]:
     names = sidecars(path)
     if path.name not in names:
         raise FileNotFoundError(str(path))
-    # Stop GDAL from searching side-car files if there are none.
+    # Stop GDAL from searching side-car files of a file without them.
     env = {} if names - {path.name} else {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
     with rasterio.Env(**env), rasterio.open(gdal_name(path), driver=driver) as dataset:
         _require_no_link(dataset)
@@ -141,7 +141,7 @@ def _driver(path: Path) -> str:
     """Return the name of GDAL's driver for a file, by its first bytes."""
     data = head(path)
     for magic, driver in MAGIC.items():
-        # Of a side-car file, GDAL takes a mark of XML before the first zero for its format.
+        # GDAL takes a side-car file for XML if a mark of XML comes before the first zero.
         if data.startswith(magic) and not MARK.search(data.partition(b"\0")[0]):
             return driver
     if data.startswith(b"\x1f\x8b") and path.suffix.lower() == ".gz":
@@ -149,7 +149,7 @@ def _driver(path: Path) -> str:
     text = data.removeprefix(b"\xef\xbb\xbf").lstrip()
     if text.startswith((b"<VRTDataset", b"<?xml")) and b"<VRTDataset" in data:
         raise InputRejected(A_VRT)
-    # Marks of other formats may stand anywhere in a text.
+    # Marks of other formats may be anywhere in a text.
     if not text or text.startswith(b"{") or NOT_TEXT.search(data):
         raise InputRejected(UNKNOWN + archive_note(data))
     return "AAIGrid" if ASCII_GRID.match(text) else "XYZ"
@@ -182,11 +182,11 @@ def _check_side_car(side: Path) -> None:
             with env, rasterio.open(str(side), driver="GTiff") as dataset:
                 _require_no_link(dataset)
         except (RasterioError, UnicodeDecodeError) as error:
-            # GDAL takes a raster without a mask that it cannot read.
+            # If GDAL cannot read a mask, it reads the raster without the mask.
             raise InputRejected(f"cannot be read: {error}; fetch it again") from error
     elif suffix == ".xml":
         data = side.read_bytes()
-        # Of a file that is cut off or has zeros, GDAL takes a raster without its nodata value.
+        # If the file is cut off or has zeros, GDAL reads the raster without its nodata value.
         if b"\0" in data or not data.rstrip().endswith(b">"):
             raise InputRejected("is damaged; fetch it again, or remove it")
     elif suffix == ".aux" and head(side).startswith(b"EHFA_HEADER_TAG"):
@@ -201,7 +201,7 @@ def kept_raster(path: Location) -> Iterator[Any]:
             yield dataset
         return
     path = path.absolute()
-    # Before it is opened: a later change is noticed the next time.
+    # The state is read before the file is opened: a later change is noticed the next time.
     state = _state(path)
     dataset = _idle.take(path, state) or open_alone(path)
     if dataset is None:
@@ -217,7 +217,7 @@ def kept_raster(path: Location) -> Iterator[Any]:
 
 
 def _state(path: Path) -> tuple[int, ...]:
-    """Return what shows that a file has changed, or that its folder has other files; last the process."""
+    """Return numbers that change with the file or with the names in its folder; last the process id."""
     file = path.stat()
     # A forked process would share the position in the file with its parent.
     return file.st_ino, file.st_size, file.st_mtime_ns, path.parent.stat().st_mtime_ns, os.getpid()
@@ -230,11 +230,11 @@ class _Idle(threading.local):
         self.files = OrderedDict[Path, tuple[tuple[int, ...], Any]]()
 
     def take(self, path: Path, state: tuple[int, ...]) -> Any | None:
-        """Return the open file, None if there is none in this state."""
+        """Return the file if it is open in this state, else None."""
         before, dataset = self.files.pop(path, (None, None))
         if dataset is not None and before == state:
-            # Opening a file clears this thread's last error in GDAL. This call raises the error, whatever its
-            # file, and so clears it.
+            # Opening a file clears this thread's last error in GDAL. This call raises the error of any file,
+            # and so clears it.
             with contextlib.suppress(Exception):
                 _ = dataset.colorinterp
             return dataset

@@ -1,8 +1,8 @@
 """Check of source vector files before GDAL opens them: regular files of known formats that lead nowhere else.
 
 pyogrio cannot be told which drivers to use, and GDAL chooses by content, whatever a file's name: an OGR VRT
-named ``roads.geojson`` would make it read other files or the web. So the format is told here from the first
-bytes, and only formats are let through that GDAL cannot take for another one.
+named ``roads.geojson`` would make it read other files or the web. So the format is found here by the first
+bytes. Only formats pass that GDAL cannot take for another format.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ INDEX = re.compile(
 MAX_CRS_BYTES = 65536
 """Longest text of a CRS in GeoJSON."""
 ERRORS = (RuntimeError, ValueError, OSError, UnboundLocalError)
-"""What pyogrio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
+"""Errors of pyogrio for damaged files; the last is for a name in the CRS that is not UTF-8."""
 LINKS = ("link", "url")
 T = TypeVar("T")
 
@@ -102,7 +102,7 @@ def vector_name(path: Path) -> str:
 def _require_complete(part: Path) -> None:
     """Raise an error if a part of a Shapefile is cut off or zeroed: GDAL would read it without values.
 
-    The headers are those of ESRI's white paper of 1998 (``.shp``, ``.shx``) and of dBASE (``.dbf``).
+    The headers are described in ESRI's white paper of 1998 (``.shp``, ``.shx``) and by dBASE (``.dbf``).
     """
     kind = part.suffix.lower()
     if kind not in (".shp", ".shx", ".dbf") or not part.exists():
@@ -121,7 +121,7 @@ def _require_complete(part: Path) -> None:
 
 
 def _objects(path: Path, condition: str) -> list[tuple[str, str]]:
-    """Return names and statements of tables and views of an SQLite file; none if it is damaged."""
+    """Return names and statements of tables and views of an SQLite file; empty if it is damaged."""
     try:
         with opened(path) as file:
             return file.execute(f"SELECT name, sql FROM sqlite_master WHERE {condition}").fetchall()
@@ -162,7 +162,7 @@ def _state(path: Path) -> FileStat:
 
 
 def in_its_encoding(read: Callable[..., T]) -> tuple[T, str]:
-    """Return what a function reads of a vector file, and the encoding of its text; empty if as declared.
+    """Return the result of a reading function, and the encoding of the text; empty if it is as declared.
 
     Text that is not in the declared encoding, mostly UTF-8, is taken for cp1252, else for latin1, which has
     all bytes.
@@ -180,7 +180,7 @@ def in_its_encoding(read: Callable[..., T]) -> tuple[T, str]:
 
 
 def layer_info(file: str, layer: str, **more: Any) -> dict[str, Any]:
-    """Return what pyogrio knows of a layer; names of columns may be in another encoding than declared."""
+    """Return pyogrio's description of a layer; names of columns may be in another encoding than declared."""
     info: dict[str, Any] = in_its_encoding(partial(pyogrio.read_info, file, layer=layer, **more))[0]
     return info
 
@@ -240,12 +240,12 @@ def _require_own_parts(path: Path, parts: Iterable[Path]) -> None:
 
 
 def _require_no_linked_crs(path: Path) -> None:
-    """Raise an error if a GeoJSON file has its CRS by a web address, which GDAL would ask."""
+    """Raise an error if a GeoJSON file gives its CRS as a web address: GDAL would open it."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         for found in CRS.finditer(data):
             rest = bytes(data[found.end() : found.end() + MAX_CRS_BYTES])
             if rest[:1] in (b",", b"}", b"]"):
-                # A value, not a key.
+                # ``"crs"`` is a value, not a key.
                 continue
             if not rest.startswith(b":") or _is_link(rest[1:]):
                 raise InputRejected(
@@ -254,7 +254,7 @@ def _require_no_linked_crs(path: Path) -> None:
 
 
 def _is_link(rest: bytes) -> bool:
-    """Return whether the text after ``"crs":`` is an object that links to a CRS, or none that can be read."""
+    """Return whether the text after ``"crs":`` links to a CRS or cannot be read as an object."""
     pairs: list[tuple[str, Any]] = []
     decoder = json.JSONDecoder(object_pairs_hook=pairs.extend)
     try:

@@ -1,4 +1,4 @@
-"""Files that a source on disk consists of: whether they may be opened, and whether any has changed."""
+"""The files of a source on disk: whether they may be opened, and whether any of them has changed."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from flexroad.catalog.storage.paths import FileStat, Location, file_stat, stat
 
 SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".sbx", ".idm", ".ind")
 SQLITE_PARTS = ("-wal", "-journal")
-"""Files with changes that are not yet in a GeoPackage; ``-shm`` is an index of the first, made by readers."""
+"""Files with changes that are not yet in a GeoPackage; readers make ``-shm``, an index of ``-wal``."""
 ALONE = (".geojson", ".json", ".fgb", ".osm", ".pbf")
-"""Endings of vector formats of one file."""
+"""Endings of vector formats that consist of one file."""
 SETTLED_NS = 2 * 10**9
-"""Age at which the time of a folder shows every later change of its names."""
+"""A folder whose time is older than this shows every later change of its names by another time."""
 APPENDED = (".aux.xml", ".ovr", ".msk", ".aux")
 REPLACED = (".aux.xml", ".aux", ".prj", ".tab", ".wld")
 """Endings of the side-car files of rasters, after a file's name or in place of its suffix."""
@@ -68,10 +68,10 @@ def require_regular(path: Path) -> None:
 
 
 def source_stat(where: Location) -> FileStat | None:
-    """Return the state of a source: of one file, its size and version; None if it does not exist.
+    """Return the size and version of a source; None if it does not exist.
 
     The version of a source of several files is a text that changes with any of them. In object storage only
-    the file itself counts.
+    the file itself is read.
     """
     own = stat(where)
     if own is None or not isinstance(where, Path):
@@ -91,7 +91,7 @@ def files_of(path: Path) -> Iterator[Path]:
 
 def _files(path: str) -> Iterator[str]:
     yield path
-    # Texts in place of paths, and no function for a step: a run looks up each source of each tile.
+    # This uses texts, not paths, and few calls, for speed: a run looks up each source of each tile.
     folder, name = os.path.split(path)
     for beside in _beside(folder or ".", name):
         part = f"{folder}/{beside}" if folder else beside
@@ -135,7 +135,7 @@ def _beside(folder: str, name: str) -> tuple[str, ...]:
             alike = _settled_names(folder, changed_ns).get(name.partition(".")[0], ())
             return tuple(part for part in _part_names(name) if part in alike) if len(alike) > 1 else ()
     except OSError:
-        # Names may be looked up in a folder that may not be listed.
+        # A folder that may not be listed can still permit access to single names.
         pass
     return tuple(part for part in _part_names(name) if os.path.lexists(f"{folder}/{part}"))
 

@@ -1,10 +1,10 @@
-"""Checks of what GDAL believes of a vector file: views, computed columns, numbers of features, and indexes.
+"""Checks of parts of a vector file that GDAL trusts: views, computed columns, numbers of features, indexes.
 
 GDAL runs the queries of all views of an SQLite file when it lists the layers, without any limit. Here each is
 run once by Python's SQLite, with limits. pyogrio reads as many features as the file states, and no more.
 
-GDAL does not return a feature that a spatial index lacks or has elsewhere. Programs leave such indexes that
-edit a GeoPackage without its triggers, or a Shapefile without the ``.qix`` beside it.
+GDAL does not return a feature that is missing or misplaced in a spatial index. Such an index remains if a
+program edits a GeoPackage without its triggers, or a Shapefile without updating its ``.qix``.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ STEPS = 50_000_000
 STEPS_PER_BYTE = 2
 """Further steps for each byte of the file: to read all rows takes fewer."""
 STRIDE = 100_000
-"""Steps between two looks at their number."""
+"""Number of steps after which the limit is checked again."""
 MAX_VALUE_BYTES = 2**26
 """Largest text or geometry."""
 FUNCTIONS = frozenset(
     "abs avg coalesce count dense_rank ifnull iif instr length lower ltrim max min nullif rank round "
     "row_number rtrim substr substring sum total trim typeof upper".split()
 )
-"""Functions that a query may call: their result is the same each time, and no longer than what they get."""
+"""Functions that a query may call: their result is always the same, and not longer than their arguments."""
 NO_ROWS = re.compile(r"no such (table|column)|circularly defined|no such function: XB_", re.IGNORECASE)
-"""Errors of queries that GDAL cannot run, either; the last one is of views that SpatiaLite makes itself."""
+"""Errors of queries that GDAL cannot run either; the last is for views that SpatiaLite makes itself."""
 COUNTS = (
     ("gpkg_ogr_contents", "table_name", "feature_count", "DELETE FROM gpkg_ogr_contents"),
     (
@@ -55,7 +55,7 @@ COUNTS = (
 )
 """Tables with numbers of features, their columns, and a statement after which GDAL counts by itself."""
 VIRTUAL_COLUMN = 2
-"""Mark of columns that are computed when they are read, in SQLite's table of columns."""
+"""Numbers in SQLite's table of columns for columns that are computed when they are read."""
 
 
 def opened(path: Path) -> closing[sqlite3.Connection]:
@@ -76,7 +76,7 @@ def require_sound_contents(path: Path, state: FileStat) -> None:
 
 @lru_cache(maxsize=256)
 def _fault(path: Path, state: FileStat) -> str:
-    """Return what is wrong, to follow the name of the file; empty if nothing is."""
+    """Return the fault of a file, to follow its name; empty without a fault."""
     try:
         with opened(path) as file:
             names = file.execute(
@@ -129,7 +129,7 @@ def _of_counts(file: sqlite3.Connection, tables: set[str], path: Path) -> str:
 
 
 def _trial(file: sqlite3.Connection, view: str, most_steps: int) -> str:
-    """Run the query of a view; return that it is not read and why, empty if it ends."""
+    """Run the query of a view; return why the view is not read, empty if the query ends."""
     others: list[str] = []
 
     def authorize(action: int, _: str | None, function: str | None, *__: str | None) -> int:
@@ -174,7 +174,7 @@ pyogrio = lazy("pyogrio")
 SQLITE = ("GPKG", "SQLite")
 """GDAL's drivers of formats in SQLite."""
 EDITED = (*SQLITE, "ESRI Shapefile")
-"""Those of formats whose features programs change in place, so that index and bounds may be of other ones."""
+"""GDAL's drivers of formats that are edited in place, so that index and bounds may be out of date."""
 BOXES = np.dtype(
     [("feature", np.int64), *((edge, np.float32) for edge in ("west", "east", "south", "north"))]
 )
@@ -184,8 +184,8 @@ BOXES = np.dtype(
 def has_complete_index(file: str, info: Mapping[str, Any]) -> bool:
     """Return whether each feature of a layer is in its index, within its box there.
 
-    - result: also False of a view, whose index is the table's, and of a Shapefile: its index is not read
-      here.
+    - result: also False for a view, which has the index of its table, and for a Shapefile, whose index is not
+      read here.
     """
     if not info["capabilities"]["fast_spatial_filter"] or info["driver"] not in SQLITE:
         return bool(info["capabilities"]["fast_spatial_filter"]) and info["driver"] not in EDITED
@@ -205,7 +205,7 @@ def has_complete_index(file: str, info: Mapping[str, Any]) -> bool:
 
 
 def _boxes(path: Path, layer: str) -> np.ndarray[Any, Any]:
-    """Return the boxes of the R-tree of a table and column; none if there is no such one."""
+    """Return the boxes of the R-tree of a table and column; empty if it does not exist."""
     names = f"rtree_{layer}".lower(), f"idx_{layer}".lower()
     with opened(path) as data:
         try:
@@ -218,7 +218,7 @@ def _boxes(path: Path, layer: str) -> np.ndarray[Any, Any]:
 
 
 def real_bounds(file: str, info: Mapping[str, Any]) -> Bounds | None:
-    """Return the bounds of a layer with all of its features, None if it has none; `has_complete_index`."""
+    """Return the bounds of all features of a layer, None if it has none; see `has_complete_index`."""
     stated: Bounds | None = info["total_bounds"]
     if info["driver"] not in EDITED:
         return stated

@@ -1,1 +1,1 @@
-"""What a folder of input files has."""
+"""The contents of a folder of input files."""

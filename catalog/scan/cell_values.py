@@ -25,7 +25,7 @@ LOWEST, HIGHEST = -9000.0, 1e6
 MAX_CELLS = 100_000_000
 """Largest number of cells that are read of one raster for one tile."""
 AS_TEXT = (".xyz", ".gz", ".asc", ".txt")
-"""Endings of formats that cannot be read in parts: their files count as without gaps."""
+"""Endings of formats that cannot be read in parts: their files are assumed to have no gaps."""
 
 
 def height_share(grid: Grid, paths: Iterable[Location], crs: str | None = None) -> float | None:
@@ -76,15 +76,15 @@ def _add(known: NDArray[Any], grid: Grid, raster: Any, crs: str | None) -> bool:
 MOST_MASKS = 8
 """Largest number of files of a mask that are read."""
 SIDE = 1024
-"""A file of at most this many cells along each axis is read as a whole."""
+"""A file of at most this many cells along each axis is read completely."""
 PARTS = 4
-"""Of a larger one, this many squares along each axis are read, with as many cells in all."""
+"""Of a larger file, this many squares along each axis are read, with as many cells in sum."""
 MOST_SHOWN = 8
 """Largest number of values in a note."""
 
 
 def mask_notes(root: Path, layer: str, names: Sequence[str], road_values: Sequence[int]) -> list[str]:
-    """Return a note if the values of a mask do not fit those that mean road; empty if they may.
+    """Return a note if the values of a mask do not fit the values that mean road; else empty.
 
     Parts of some files are read, so that the time does not depend on the size of the survey.
     """
@@ -105,9 +105,9 @@ def mask_notes(root: Path, layer: str, names: Sequence[str], road_values: Sequen
 
 
 def values_note(values: set[float], road_values: Sequence[int], has_nodata: bool, option: str) -> str:
-    """Return how the values of a mask do not fit those that mean road; empty if they may.
+    """Return why the values of a mask do not fit the values that mean road; empty if they may fit.
 
-    - `values`: values of its cells, at least one; nodata is none of them.
+    - `values`: values of its cells without nodata, at least one.
     - `road_values`: values that mean road; empty: every value but 0 and nodata.
     - `option`: name of the option that has ``road_values``.
     """
@@ -127,7 +127,7 @@ def values_note(values: set[float], road_values: Sequence[int], has_nodata: bool
 
 
 def has_fractions(values: set[float]) -> bool:
-    """Return whether values are no classes, as some are not whole."""
+    """Return whether some values are not whole numbers, so that they are not classes."""
     return not all(value.is_integer() for value in values)
 
 
@@ -143,7 +143,7 @@ def _values(path: Path) -> tuple[set[float], bool]:
 
 
 def windows(raster: Any) -> Iterator[Window]:
-    """Yield all of a small raster, or squares spread over a large one."""
+    """Yield the window of a complete small raster, or squares spread over a large raster."""
     if max(raster.shape) <= SIDE:
         yield Window(0, 0, raster.width, raster.height)
         return
@@ -198,7 +198,7 @@ def _plateaus(path: Location) -> Iterable[tuple[float, float, float]]:
     values, counts = np.unique(np.concatenate([part.compressed() for part in parts]), return_counts=True)
     cells = sum(part.size for part in parts)
     if counts.max(initial=0) == cells:
-        # A file of one height, and no other, has no voids in it.
+        # A file whose cells all have one height has no voids.
         return []
     return [
         (float(values[n] * scale + offset), float(values[n]), float(counts[n] / cells))

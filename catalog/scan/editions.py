@@ -38,13 +38,12 @@ MOST_COMPARED = 4
 SIDE = 256
 """Largest number of cells along an axis that are compared of a pair."""
 DIFFERENT_M = 0.05
-"""Heights differ if those of more than `DIFFERENT_SHARE` of the cells do by more than this (units of the
-file)."""
+"""Heights differ if more than `DIFFERENT_SHARE` of the cells differ by more than this (units of the file)."""
 DIFFERENT_SHARE = 0.01
 
 
 class _Pair(NamedTuple):
-    """Two files that cover the same ground, by their numbers; of which rule the newest is, or none."""
+    """Two files that cover the same ground, by their numbers, and the rule that finds the newer file."""
 
     newer: int
     older: int
@@ -54,8 +53,8 @@ class _Pair(NamedTuple):
 def newest_first(root: Path, layer: str, files: Sequence[RasterFile]) -> tuple[list[RasterFile], list[str]]:
     """Return the files of a layer with the newest before others of the same ground, and notes on that.
 
-    The age is that of the dates in which the two names differ, else of the dates in the files' tags, else of
-    their times, if these are a day apart. Files without another of the same ground keep their places.
+    The newer file is found by the dates in which the names differ, else by the dates in the tags, else by the
+    times of the files, if they are a day apart. Other files keep their places.
     """
     pairs = [_aged(files, one, other) for one, other in _same_ground(files)]
     if not pairs:
@@ -89,7 +88,7 @@ def _aged(files: Sequence[RasterFile], one: int, other: int) -> _Pair:
     a, b = files[one], files[other]
     dates_a, dates_b = _dates(a.name), _dates(b.name)
     own_a, own_b = max(dates_a - dates_b, default=""), max(dates_b - dates_a, default="")
-    # A year and a day of that year do not tell which is newer.
+    # A year and a day of the same year do not show which file is newer.
     if own_a and own_b and not own_a.startswith(own_b) and not own_b.startswith(own_a):
         return _Pair(one, other, "name") if own_a > own_b else _Pair(other, one, "name")
     if a.taken and b.taken and a.taken != b.taken:
@@ -121,12 +120,12 @@ def _ordered(number: int, pairs: Sequence[_Pair]) -> list[int]:
         older[pair.newer].add(pair.older)
         blocked[pair.older].add(pair.newer)
     moved = sorted(older.keys() | blocked)
-    # Files without a newer one that is not yet in order, and all that are left: each the first by name first.
+    # A file is ready if all newer files are placed. Ready files and remaining files are sorted by name.
     free, left, order = [one for one in moved if not blocked[one]], deque(moved), dict[int, None]()
     while len(order) < len(moved):
         while left[0] in order:
             left.popleft()
-        # Rules that contradict each other in a circle leave the first by name first.
+        # If rules contradict each other in a circle, the first by name comes first.
         first = heappop(free) if free else left[0]
         if first in order:
             continue

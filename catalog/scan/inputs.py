@@ -1,4 +1,4 @@
-"""What rasters can be made of: point clouds, a mesh, an OpenDroneMap project, photographs."""
+"""Inputs for rasters: point clouds, a mesh, an OpenDroneMap project, photographs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def is_project(folder: Path) -> bool:
 
 
 def recognised(inputs: Collection[Path]) -> tuple[str, list[Path]]:
-    """Return the kind of inputs, a key of `TITLES`, and their places; of a mesh the only file."""
+    """Return the kind of inputs, a key of `TITLES`, and their places; for a mesh its only file."""
     examples: dict[tuple[str, ...], Path] = {}
     for path in inputs:
         examples.setdefault(_kinds(path), path)
@@ -44,7 +44,7 @@ def recognised(inputs: Collection[Path]) -> tuple[str, list[Path]]:
 
 
 def files_of(inputs: Iterable[Path], kind: str) -> list[Path]:
-    """Return files, and of folders the files of a kind, each once."""
+    """Return the files of a kind, given as files or folders, each once."""
     files: dict[Path, None] = {}
     for path in inputs:
         inside = [file for file in _files(path) if file == path or file.suffix.lower() in SUFFIXES[kind]]

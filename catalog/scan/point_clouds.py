@@ -30,7 +30,7 @@ NOISE = (7, 18)
 CHUNK = 1_000_000
 """Points decoded at a time, so that memory does not grow with the file."""
 CHUNK_BYTES = 256 * 2**20
-"""Largest size of points decoded at a time; a point of an absurd format has 64 KiB."""
+"""Largest size of points decoded at a time; a point has at most 64 KiB."""
 RGB = ("red", "green", "blue")
 USED = ("Z", "CLASSIFICATION", "FLAGS", "RGB", "GPS_TIME")
 """Fields that are decoded besides the coordinates in plan, as laspy calls them."""
@@ -58,8 +58,7 @@ class Cloud:
     has_dates: bool = False
     """Whether the header declares GPS times as standard, so that they are dates and not seconds of a week."""
     chunk: int = 0
-    """Number of points of the largest chunk of a compressed file, which are decoded together; 0 if there are
-    none."""
+    """Number of points of the largest chunk of a compressed file, which are decoded together; else 0."""
 
     def parts(self, size: int) -> list[range]:
         """Return ranges of about ``size`` points that can be decoded apart; larger if chunks are larger."""
@@ -183,7 +182,7 @@ def _chunk(
 
 
 def _checked(path: Path) -> int:
-    """Check that a file is there and its header; return the size of its largest chunk (bytes)."""
+    """Check that a file exists, and its header; return the size of its largest chunk (bytes)."""
     if not _attempt(path, path.is_file):
         missing = "is not a file" if path.exists() else "does not exist"
         raise CatalogError(f"{path} {missing}; give LAS or LAZ files, or folders of them")
@@ -191,7 +190,7 @@ def _checked(path: Path) -> int:
 
 
 def _opened(path: Path, fields: Collection[str] = ()) -> Any:
-    """Open a checked cloud; of compressed points only some fields are decoded, all if none are named."""
+    """Open a checked cloud. Only the named fields of compressed points are decoded; without names, all."""
     selection = {}
     if fields:
         # Formats before LAS 1.4 are always decoded completely.
@@ -199,8 +198,8 @@ def _opened(path: Path, fields: Collection[str] = ()) -> Any:
         for name in fields:
             chosen |= laspy.DecompressionSelection[name]
         selection = {"decompression_selection": chosen}
-    # The parallel decoder allocates a complete chunk, which the header may give as 2^32 points, and goes to
-    # wrong points of files with chunks of different sizes, as COPC has (laz-rs #62).
+    # The parallel decoder allocates a complete chunk, which may have 2^32 points by the header. In files with
+    # chunks of different sizes, such as COPC, it finds wrong points (laz-rs #62).
     return _attempt(path, lambda: laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, **selection))
 
 

@@ -47,8 +47,8 @@ HANDLERS = (
     "rasterio._err.log_error",
     "rasterio._err.chaining_error_handler",
 )
-"""rasterio's functions that decode GDAL's messages for its log and cannot raise: of one that is no UTF-8,
-Python prints the UnicodeDecodeError. The reader of the file reports its damage by itself."""
+"""rasterio's functions that decode GDAL's messages for its log and cannot raise errors. If a message is not
+UTF-8, Python prints the UnicodeDecodeError. The reader of the file reports the damage by itself."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class RasterFile:
     crs: str
     """Horizontal CRS: ``EPSG:25832``, or WKT where there is no code."""
     has_crs: bool
-    """False if the file has no CRS, or none that can be its own, and the caller's is used."""
+    """False if the file has no CRS or a wrong CRS, so that the CRS of the caller is used."""
     bounds: Bounds
     cell: float
     """Cell size, rounded to 1e-6 (units of the CRS)."""
@@ -112,7 +112,7 @@ _hooks = _Hooks()
 def quiet() -> Iterator[None]:
     """Set GDAL's options for catalog and tasks; suppress what is printed about files that are damaged.
 
-    That is warnings about files without a georeference, and messages that are no text.
+    These are warnings about files without a georeference, and messages that are not text.
     """
     with rasterio.Env(**CHOSEN, **DEFAULTS, **gdal_options()), warnings.catch_warnings(), _hooks:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -157,7 +157,7 @@ def _option(layer: str) -> str:
 def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[Skipped]]:
     """Return the files that match a glob pattern, by name, and the folders that cannot be listed.
 
-    If the pattern's last part has a dot, it names files, and a folder that matches is in place of one.
+    If the pattern's last part has a dot, it names files: a matching folder is taken for a file.
 
     - `root`: the folder that relative patterns start from, resolved.
     - `pattern`: relative to ``root``; absolute, or with ``..``, it names files outside.
@@ -177,7 +177,7 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[Ski
 
 
 def glob(folder: Path, pattern: str) -> tuple[list[Path], list[tuple[Path, OSError]]]:
-    """Return all that matches a glob pattern, and the folders that may hold more.
+    """Return all paths that match a glob pattern, and the folders that may have more.
 
     - `paths`: files, folders, and links to nothing, by name.
     - `unlisted`: folders on the pattern's way that cannot be listed, each with the error; `Path.glob` ignores
@@ -200,7 +200,7 @@ def glob(folder: Path, pattern: str) -> tuple[list[Path], list[tuple[Path, OSErr
 
 
 def _is_folder(path: Path) -> bool:
-    """Return whether a path is a folder; what cannot be looked up is none."""
+    """Return whether a path is a folder; False if it cannot be looked up."""
     # `Path.is_dir` raises an error for a name in a folder without permission.
     return os.path.isdir(path)  # noqa: PTH112
 
@@ -227,7 +227,7 @@ def _start(root: Path, pattern: str) -> tuple[Path, str]:
 
 
 def there(folder: Path, remedy: str = "") -> str:
-    """Return which files are in a folder, for a message, and if there are any, what to do with them."""
+    """Return which files are in a folder, with the remedy if it has files, for a message."""
     if not folder.is_dir():
         return "the folder does not exist"
     files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not _is_folder(path))
@@ -304,10 +304,10 @@ def _cell(transform: Affine) -> float:
 
 
 def date_of(tags: Mapping[str, str]) -> datetime | None:
-    """Return the date in a raster's tags, None if there is none.
+    """Return the date in a raster's tags, or None.
 
-    - `tags`: those of the file and of GDAL's domain IMAGERY; the acquisition goes before the writing of the
-      image.
+    - `tags`: tags of the file and of GDAL's domain IMAGERY; the date of acquisition has priority over the
+      date of writing.
     """
     for tag in DATE_TAGS:
         text = tags.get(tag, "").strip()
@@ -325,7 +325,7 @@ def zoned(date: datetime) -> datetime:
 
 
 def require_metric(file: RasterFile, option: str = "") -> None:
-    """Check that a file's horizontal CRS is in metres, which are metres on the ground.
+    """Check that a file's horizontal CRS is in metres, and that they are metres on the ground.
 
     - `option`: option of the command that reprojects files, for the message; empty if it has none.
     """
@@ -343,7 +343,7 @@ def require_metric(file: RasterFile, option: str = "") -> None:
 
 
 def georeference_fault(dataset: Any) -> str | None:
-    """Return why the position of an open raster is no place, to follow its name; None if it is one."""
+    """Return why the position of an open raster is not valid, to follow its name; None if it is valid."""
     # A dataset makes its transform anew each time.
     transform = dataset.transform
     east_step, _, west, _, north_step, north = transform[:6]
@@ -363,7 +363,7 @@ def georeference_fault(dataset: Any) -> str | None:
 def heights_fault(dataset: Any) -> str | None:
     """Return why an open raster has no heights, to follow its name; None if it has them.
 
-    They are its only band of numbers, or the first one if its bands are described as `ROAD_HEIGHT_BANDS`.
+    Heights are its only band of numbers, or its first band if the bands are described as `ROAD_HEIGHT_BANDS`.
     """
     kinds = [kind for kind in color_kinds(dataset) if kind != ColorInterp.alpha]
     if len(kinds) > 1 and dataset.descriptions[: len(BANDS)] != BANDS:
@@ -378,16 +378,16 @@ def heights_fault(dataset: Any) -> str | None:
 
 def color_kinds(dataset: Any) -> tuple[ColorInterp, ...]:
     """Return the kind of each band of an open raster, such as grey or alpha."""
-    # The call raises the last error of GDAL, which may be about a tag that does not matter, and so clears it.
+    # The call raises GDAL's last error, and so clears it. This error may concern an unimportant tag.
     with contextlib.suppress(Exception):
         _ = dataset.colorinterp
     return tuple(dataset.colorinterp)
 
 
 def alpha_band(dataset: Any) -> int | None:
-    """Return the number of an open raster's alpha band that GDAL does not take for a mask, None without one.
+    """Return the number of an open raster's alpha band that GDAL does not use as a mask, or None.
 
-    GDAL takes one of uint8 or uint16 alone, and only if the file has no other mask and no nodata value.
+    GDAL uses only alpha bands of uint8 or uint16, in files without another mask and without a nodata value.
     """
     kinds = color_kinds(dataset)
     if ColorInterp.alpha not in kinds[1:] or MaskFlags.alpha in dataset.mask_flag_enums[0]:

@@ -30,11 +30,11 @@ pyogrio = lazy("pyogrio")
 
 LAYER_NAME = "|layername="
 MARGIN_M = 1.0
-"""Extents are larger than the features' bounds by this much (m): those of a straight road are empty."""
+"""Extents are larger than the features' bounds by this much (m): the bounds of a straight road are empty."""
 EVERYWHERE: Bounds = (-1e9, -1e9, 1e9, 1e9)
 """Extent of a file that may have features anywhere (m)."""
 NOWHERE: Bounds = (math.inf, math.inf, 0.0, 0.0)
-"""Extent of a file that reaches nothing: it has no features, or they have no place in the tiles' CRS."""
+"""Extent of a file without features, or with features that have no place in the tiles' CRS."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class VectorFile:
     path: Path
     """Absolute."""
     has_crs: bool
-    """False if the file has no CRS, or none that can be its own, and the caller's is used."""
+    """False if the file has no CRS or a wrong CRS, so that the CRS of the caller is used."""
     extents: tuple[tuple[str, Bounds], ...] | None
     """CRS and bounds of each layer with features, or None if the format does not store them."""
     sublayer: str | None = None
@@ -52,7 +52,7 @@ class VectorFile:
 
 
 def file_and_layer(given: Path | str) -> tuple[Path, str | None]:
-    """Split ``FILE|layername=NAME``, as QGIS writes it; the layer is None if no one is named."""
+    """Split ``FILE|layername=NAME``, as QGIS writes it; the layer is None without a name."""
     file, named, layer = str(given).partition(LAYER_NAME)
     return Path(file), layer if named else None
 
@@ -95,7 +95,7 @@ def listed(found: Mapping[str, str]) -> str:
 
 
 def several(subject: str, path: Path, found: Mapping[str, str]) -> CatalogError:
-    """Return the error that none of the layers of a file is named; ``subject`` begins its message."""
+    """Return the error that the layer of a file must be named; ``subject`` begins its message."""
     example = shlex.quote(f"{path}{LAYER_NAME}{next(iter(found))}")
     return CatalogError(
         f"{subject} has {count(len(found), 'layer')}: {listed(found)}; name one, such as {example}"
@@ -178,11 +178,11 @@ def with_roads(
         target: np.array([_extent(file, target) for file in files])
         for target in {tile.grid.crs for tile in tiles}
     }
-    # As a tree: in a state there are as many files as tiles.
+    # The tree saves time: a survey of a state has as many files as tiles.
     trees = {}
     for target, bounds in extents.items():
         boxes = np.full(len(bounds), None, object)
-        # None where a file reaches nothing.
+        # A file that reaches no ground has None.
         known = np.isfinite(bounds).all(axis=1)
         boxes[known] = shapely.box(*bounds[known].T)
         trees[target] = shapely.STRtree(boxes)
@@ -198,7 +198,7 @@ def with_roads(
     ]
     if len(far) == len(files):
         raise CatalogError(far[0].reason)
-    # A CRS is that of the complete layer, so that all tiles describe the layer in the same way.
+    # The CRS of the complete layer is used, so that all tiles describe the layer in the same way.
     bare = None if all(file.has_crs for file in files) else crs
 
     @lru_cache(RECENT)
@@ -219,7 +219,7 @@ def with_roads(
 
 
 def _far(file: VectorFile, tiles: Sequence[Tile]) -> str:
-    """Return that a file reaches no tile, and where both lie."""
+    """Return the message that a file reaches no tile, with the places of both."""
     text = "reaches no tile; check its CRS and its extent"
     if not file.extents:
         return text

@@ -84,7 +84,7 @@ def index(
     roads: str | None = None,
     reproject: bool = False,
 ) -> TilingResult:
-    """Cut the downloads below a folder into tiles; of files of the same ground the newest is used first.
+    """Cut the downloads below a folder into tiles; where files overlap, the newest is used first.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def index(
     ------
     CatalogError
         If there is no usable surface model, no usable file matches the pattern of the mask or the roads, or
-        no tile is left; or as of `newest_first`.
+        no tile is left; also the errors of `newest_first`.
     """
     root = root.resolve()
     downloads, skipped = _downloads(root)
@@ -185,7 +185,7 @@ def _placed(
         west, south, east, north = download.square
         x, y = (file.bounds[0] + file.bounds[2]) / 2, (file.bounds[1] + file.bounds[3]) / 2
         if file.crs == CRS and west < x < east and south < y < north:
-            # By the year in its name, unless its tags give a date in that year.
+            # The date is the year in its name, unless its tags give a date in that year.
             year = 0 if file.taken and file.taken.year == download.year else download.year
             kept.append(replace(file, taken=datetime(year, 1, 1, tzinfo=UTC)) if year else file)
         else:
@@ -221,7 +221,7 @@ def _bridges(
 def _deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
     """Write the mean height of a cloud's bridge points per cell (float32, NaN elsewhere).
 
-    Return whether there are any. A target that is not older than the cloud is kept, unless it is damaged.
+    Return whether it has bridge points. An undamaged target that is not older than the cloud is kept.
     """
     if is_current(cloud, target):
         with open_raster(target) as raster:

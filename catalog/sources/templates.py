@@ -6,7 +6,7 @@ A template is a path relative to the folder. ``{tile}`` is the tile's id, ``{str
 The paper's datasets are read so: GeRoD, 240 tiles of 250 x 250 m of North Rhine-Westphalia, and DSC3D, the
 DeepScenario Open 3D Dataset, as rasters made from the meshes of its scenes with separate true heights. The
 names of their files are not fixed: without templates the files of GeRoD are found by the words in their paths
-(`catalog.layouts`), and the templates in ``configs/dsc3d.yaml`` are a guess, to be adapted to the folder.
+(`catalog.layouts`). The templates in ``configs/dsc3d.yaml`` are a guess and must be adapted to the folder.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ def _named(root: Path, layout: Layout, derived: Path | None) -> tuple[_ByLayer, 
 def _rasters(
     root: Path, found: Sequence[layouts.Found], derived: Path | None, crs: str
 ) -> tuple[dict[Path, layouts.Found], list[Skipped]]:
-    """Return the files that are rasters, with those made of points, and the points that are left out."""
+    """Return the rasters, also rasters made from points, and the point files that are left out."""
     paths, left_out = dict[Path, layouts.Found](), list[Skipped]()
     for file in found:
         if not file.name.lower().endswith(layouts.POINTS):
@@ -216,7 +216,7 @@ def _rasters(
 
 
 def _of_points(source: Path, file: layouts.Found, derived: Path, crs: str) -> dict[Path, layouts.Found]:
-    """Write the arrays of points as rasters; return these. Rasters of the same file are written once."""
+    """Write the arrays of points as rasters, once per file; return the rasters."""
     folder = derived / file.tile
     made = {path: path.stem.rpartition(".")[2] for path in sorted(folder.glob(f"{source.stem}.*.tif"))}
     if not made or not all(is_current(source, path) for path in made):
@@ -232,7 +232,7 @@ def _of_points(source: Path, file: layouts.Found, derived: Path, crs: str) -> di
 
 
 def _without_metres(root: Path, dsm: dict[str, _MatchedFile]) -> list[Skipped]:
-    """Remove the files that are not in metres, and return them; one must be left."""
+    """Remove the files that are not in metres, and return them; raise an error if no file remains."""
     errors = dict[str, CatalogError]()
     for tile_id, match in dsm.items():
         try:
@@ -269,7 +269,7 @@ def _opened(
 ) -> tuple[dict[str, _MatchedFile], list[Skipped]]:
     """Return the files of a layer by tile id, and skipped files.
 
-    ``parts`` gives id and stratum of each path, ``remedy`` what to do with two files of a tile.
+    ``parts`` gives id and stratum of each path, ``remedy`` the advice for two files of a tile.
     """
     files, skipped = opened(root, layer, parts, crs)
     by_tile: dict[str, _MatchedFile] = {}

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class ListedFiles:
     """Sizes and versions of files; SQLite keeps a few megabytes of them in memory, the rest on disk.
 
-    The database has no name and ends with the object. A full disk for temporary files raises OSError.
+    The database is a temporary file that ends with the object. A full disk raises OSError.
     """
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class StatCache:
 
     def __call__(self, where: UPath) -> FileStat | None:
         """Return a file's size and version, or None if it does not exist."""
-        # UPath's `parent` and `name` would take as long as all the rest.
+        # UPath's `parent` and `name` would double the time.
         folder, _, name = where.path.rpartition("/")
         if folder not in self._folders:
             self._listed.add((folder, name, file) for name, file in entries_of(where.parent))

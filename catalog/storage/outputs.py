@@ -1,4 +1,4 @@
-"""Output files on disk: written whole or not at all, and only in place of regular files."""
+"""Output files on disk: written completely or not at all. They replace only regular files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def atomic_path(where: Path, flushed: bool = False) -> Iterator[Path]:
             flush_path(temporary)
         temporary.replace(target)
     except OSError as error:
-        # The error of a full disk has no file name, that of a failed rename has the temporary one.
+        # The error of a full disk has no file name, the error of a failed rename has the temporary name.
         number = error.errno or errno.EIO
         raise OSError(number, error.strerror or str(error), str(where)) from error
     finally:
@@ -35,7 +35,7 @@ def atomic_path(where: Path, flushed: bool = False) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def made_folder(where: Path) -> Iterator[None]:
-    """Make a folder and its parents if they do not exist; if the block fails, remove those that are empty."""
+    """Make a folder and its parents if they do not exist; if the block fails, remove empty new folders."""
     new = [folder for folder in (where, *where.parents) if not folder.exists()]
     try:
         where.mkdir(parents=True, exist_ok=True)

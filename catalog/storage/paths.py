@@ -39,7 +39,7 @@ upath = lazy("upath")
 Location: TypeAlias = "Path | UPath"
 
 PROBE = ".probe-"
-"""Start of the names of files that only try a folder; 32 hexadecimal digits follow."""
+"""Start of the names of files that test whether a folder is writable; 32 hexadecimal digits follow."""
 ROUNDS = 3
 """Attempts of s3fs when an answer breaks off in the middle; botocore does not retry these."""
 # Path("s3://bucket") drops a slash.
@@ -95,7 +95,7 @@ def is_remote(where: Location) -> bool:
 
 
 def absolute(where: Location) -> Location:
-    """Return the location as an absolute path with links resolved; one in a bucket is unchanged."""
+    """Return the location as an absolute path with links resolved; a location in a bucket is unchanged."""
     return where.resolve() if isinstance(where, Path) else where
 
 
@@ -120,7 +120,7 @@ def normalise(name: str) -> str:
 def resolved(name: str) -> str:
     """Return an absolute path with links resolved, or an address without ``..``.
 
-    The links of a folder are read once, those of a file each time.
+    The links of a folder are read once, the links of a file each time.
     """
     if _BUCKET.match(name) or "\0" in name:
         return normalise(name)
@@ -143,7 +143,7 @@ def gdal_name(where: Location) -> str:
 def stat(where: Location) -> FileStat | None:
     """Return a file's size and version, or None if there is no such file.
 
-    Links are followed. Folders, pipes, sockets and devices are no files: reading one may never end.
+    Links are followed. Folders, pipes, sockets and devices are not files: reading them may never end.
     """
     if isinstance(where, Path):
         return file_stat(where)
@@ -170,13 +170,13 @@ def file_stat(path: str | Path) -> FileStat | None:
 def listing(folder: Location) -> dict[str, FileStat]:
     """Return all files below a folder by their relative names; empty if the folder does not exist.
 
-    In a bucket this is one (paged) list request. `entries` gives those of a large folder one by one.
+    In a bucket this is one (paged) list request. For a large folder, `entries` yields files one by one.
     """
     return dict(entries(folder))
 
 
 def entries(folder: Location) -> Iterator[tuple[str, FileStat]]:
-    """Yield relative name and stat of all files below a folder; none if it does not exist.
+    """Yield relative name and stat of all files below a folder; nothing if it does not exist.
 
     Links to folders inside it are not followed. In a bucket, files come in the order of their names, in pages
     of a thousand: memory does not grow with their number.
@@ -210,10 +210,10 @@ def _pages(folder: UPath, options: dict[str, str], start: str = "") -> Iterator[
 
 
 def visible_entry(folder: Location, without: Collection[str] = ()) -> str | None:
-    """Return a file or folder in a folder by its name; None if it has none, or does not exist.
+    """Return the name of any file or folder in a folder; None if it is empty or does not exist.
 
-    Hidden files (``.DS_Store``), ``lost+found``, which a new disk has, and the names in ``without`` do not
-    count. Of a large folder in a bucket only the first page of names is requested.
+    Hidden files (``.DS_Store``), ``lost+found`` of a new disk, and the names in ``without`` are ignored. Of a
+    large folder in a bucket only the first page of names is requested.
     """
     if isinstance(folder, Path):
         try:
@@ -254,7 +254,7 @@ def read(where: Location) -> bytes:
     """Return a file's bytes; in a bucket, by one request."""
     if isinstance(where, Path):
         if not where.is_file() and not where.is_dir() and where.exists():
-            # To open a pipe would wait for a writer.
+            # Opening a pipe would wait for a writer.
             raise OSError(errno.EINVAL, "not a regular file", str(where))
         return where.read_bytes()
     with named(where):
@@ -300,10 +300,10 @@ def flush_names(*folders: Location) -> None:
 
 
 def refresh(*folders: Location) -> None:
-    """Have the names in folders looked up again: a share may remember for a minute that one was missing."""
+    """Look up the names in folders again: a share may remember for a minute that a file was missing."""
     for folder in folders:
         if isinstance(folder, Path):
-            # To open a folder asks the server.
+            # Opening a folder sends a request to the server.
             with contextlib.suppress(OSError), os.scandir(folder):
                 pass
 
@@ -351,7 +351,7 @@ def named(where: UPath) -> Iterator[None]:
 
 
 def contained(where: Location, home: Location) -> Location:
-    """Return a location in a folder that may come from anyone; OSError if a link leads it out of the folder.
+    """Return a location in an untrusted folder; OSError if a link leads out of the folder.
 
     The folder itself may be a link, or lie behind one. In a bucket there are no links.
     """
@@ -385,7 +385,7 @@ def _links_out(folder: Path, home: str, below: bool) -> Iterator[Path]:
 def _is_direct(where: str, home: str) -> bool:
     """Return whether a path leads from a folder to a place below it without ``..`` and links.
 
-    A tile has dozens of such paths, and to resolve both sides takes four times as long.
+    A tile has dozens of such paths, and resolving both sides would take four times as long.
     """
     start = home.rstrip("/") + "/"
     parts = where.removeprefix(start).split("/")

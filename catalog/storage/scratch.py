@@ -1,9 +1,8 @@
-"""Temporary folders that are removed also if their process was killed.
+"""Temporary folders that are removed even if their process was killed.
 
-A process removes its folders when it ends. One that is killed cannot: a later process removes them. Whether
-the process lives is known from a lock (`flock`) on a file in the folder, which the system releases when
-the process ends, however that happens. Unlike a process id it cannot mean another process, also not in a
-container that shares the folder of temporary files.
+A process removes its folders when it ends. If it is killed, a later process removes them. A lock (`flock`) on
+a file in the folder shows whether the process lives: the system always releases it when the process ends.
+A process id could belong to another process, also of a container that shares the folder of temporary files.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ LOCK = ".flexroad.lock"
 class ScratchFolder(tempfile.TemporaryDirectory[str]):
     """A temporary folder; a context manager that gives its path, and removes it at the end.
 
-    Without `with` it is removed by `cleanup`, or when the process ends. In a parent folder, for outputs that
-    are renamed or need much space, it is hidden, and those of processes that have ended are removed first.
+    Without `with` it is removed by `cleanup`, or when the process ends. A parent folder is for outputs that
+    are renamed or need much space. There the folder is hidden, and folders of ended processes are removed.
     """
 
     def __init__(self, parent: Path | None = None) -> None:
@@ -40,7 +39,7 @@ class ScratchFolder(tempfile.TemporaryDirectory[str]):
                 opened = _held(Path(self.name))
                 break
             except (FileNotFoundError, BlockingIOError):
-                # Another process took it for abandoned.
+                # Another process has removed it as abandoned.
                 super().cleanup()
         self._unlock = finalize(self, os.close, opened) if opened is not None else lambda: None
 
@@ -60,14 +59,14 @@ def abandoned() -> Iterator[Path]:
 def remove_abandoned(parent: Path | None = None) -> int:
     """Remove the folders of this user whose process has ended, in a parent folder; return their number.
 
-    By default the parent is that of the system. Folders without a lock file are not touched: other programs
-    or users may have made them. Only empty hidden ones are removed, whose process ended before it had a lock.
+    By default the parent is the system's temporary folder. Folders without a lock file stay, because other
+    programs or users may have made them. Only empty hidden folders go: their process ended before the lock.
     """
     removed = 0
     for folder in _folders(parent):
-        # In use, or another process removes it.
+        # The folder is in use, or another process removes it.
         with contextlib.suppress(OSError), _locked(folder):
-            # It does not follow links.
+            # `rmtree` does not follow links.
             shutil.rmtree(folder)
             removed += 1
     for folder in parent.glob(f"{HIDDEN}*") if parent else ():
@@ -91,7 +90,7 @@ def _folders(parent: Path | None = None) -> Iterator[Path]:
 
 
 def _held(folder: Path) -> int | None:
-    """Return the descriptor of the locked file of a new folder, None if there can be none."""
+    """Return the descriptor of the locked file of a new folder, None if it cannot be locked."""
     try:
         opened = os.open(folder / LOCK, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
     except FileNotFoundError:
@@ -104,7 +103,7 @@ def _held(folder: Path) -> int | None:
         os.close(opened)
         if isinstance(error, BlockingIOError):
             raise
-        # Not every disk has locks.
+        # Not every disk supports locks.
         return None
     if not os.fstat(opened).st_nlink:
         os.close(opened)

@@ -1,6 +1,6 @@
 """Settings of object storage for s3fs and GDAL, from the environment.
 
-Both read the usual variables ``AWS_...`` themselves; those that have another name there are passed on.
+Both read the usual variables ``AWS_...`` themselves; variables with another name there are passed on.
 """
 
 from __future__ import annotations
@@ -42,8 +42,7 @@ def s3_options() -> dict[str, Any]:
 def gdal_options() -> dict[str, str]:
     """Return GDAL's options for object storage; options set in the environment are left out.
 
-    Wrong values of variables are left out, too: they do not matter for files on disk, and `s3_options` comes
-    first for files in a bucket.
+    Wrong values are left out, too: files on disk do not need them, and `s3_options` reports them for buckets.
     """
     try:
         endpoint, tries = _endpoint(), _tries()
@@ -54,7 +53,7 @@ def gdal_options() -> dict[str, str]:
         "CPL_VSIL_CURL_NON_CACHED": "/vsis3/",
         "GDAL_HTTP_MAX_RETRY": str(tries - 1),
         "GDAL_HTTP_RETRY_DELAY": "0.5",
-        # 0 means no answer.
+        # The status 0 means no answer.
         "GDAL_HTTP_RETRY_CODES": "0,429,500,502,503,504",
         "GDAL_HTTP_CONNECTTIMEOUT": "10",
         # Give up below 1 byte per second for a minute; large files are not affected.
@@ -71,7 +70,7 @@ def gdal_options() -> dict[str, str]:
 
 
 def _endpoint() -> str:
-    """Return the address of the storage's server, empty for that of AWS."""
+    """Return the address of the storage's server, empty for AWS."""
     for name in ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL"):
         if address := os.environ.get(name):
             try:

@@ -14,20 +14,20 @@ from flexroad.catalog.text import Notify, one_line, printable, write_reason
 
 CHUNK_BYTES = 1 << 20
 MAX_RATIO = 20
-"""Largest size of the files of an archive, relative to its own; rasters of heights have 1 to 5."""
+"""Largest size of the files of an archive, relative to its own; archives of height rasters have 1 to 5."""
 MAX_FILES = 100_000
 GB = 1e9
 
 Progress = Callable[[Iterable[int], str, int], Iterable[int]]
-"""Shows the items of a step: steps of `CHUNK_BYTES`, what is done, and their number."""
+"""Shows progress: steps of `CHUNK_BYTES`, the work's name, and the number of steps."""
 
 
 def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Path:
-    """Return the folder with an archive's files: beside it, with its name; unpack it if there is none.
+    """Return the folder with an archive's files: beside it, with its name; unpack the archive if needed.
 
-    A folder that is there is complete: it gets its name when all files are in it.
+    An existing folder is complete, because it gets its name when all files are in it.
 
-    - `notify`: takes a line that says how much is unpacked where, or that the folder is there.
+    - `notify`: takes a line with the size and the folder, or that the folder exists.
     """
     target = archive.with_suffix("")
     if target.is_dir():
@@ -59,7 +59,7 @@ def unpack(archive: Path, sha256: str, progress: Progress, notify: Notify) -> Pa
 
 def _entries(archive: Path) -> list[zipfile.ZipInfo]:
     if archive.exists() and not archive.is_file():
-        # To open a pipe would wait for a writer.
+        # Opening a pipe would wait for a writer.
         raise CatalogError(f"{archive} is not a regular file; replace it by one")
     try:
         size = archive.stat().st_size
@@ -79,7 +79,7 @@ def _entries(archive: Path) -> list[zipfile.ZipInfo]:
         )
     for entry in entries:
         path = PurePosixPath(entry.filename)
-        # A link in an archive is a file with its target as content: it is written as such.
+        # A link in an archive is written as a regular file with the link's target as content.
         if path.is_absolute() or ".." in path.parts:
             raise CatalogError(
                 f"{archive} has a file outside its folder: {printable(entry.filename)}; download it again"

@@ -1,4 +1,4 @@
-"""What would fail in a run of tiles: entries, missing layers and files, other CRSs, too few heights."""
+"""Expected failures of a run: unusable entries, missing layers and files, other CRSs, too few heights."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from flexroad.tasks.io.raster_grid import header
 
 MISSING, NO_FILE = "missing", "not a regular file"
 REMEDIES = {MISSING: "restore it or build the catalog again", NO_FILE: "replace it by one"}
-"""What to do with a file that is not there."""
+"""Remedies for files that are missing or not regular files."""
 MAX_SHOWN = 5
-"""Number of missing files, and of entries that cannot be used, that are named."""
+"""Largest number of missing files, and of unusable entries, that are named."""
 
 
 def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[str]) -> Iterator[Finding]:
-    """Yield what would fail in a run of these tiles: the count and the first examples of each reason.
+    """Yield the expected failures of a run of these tiles: the number and first examples for each reason.
 
     The reasons are entries that cannot be used, missing layers and files, rasters in another CRS than their
     tile, and a DSM that covers less of a tile than `load.min_valid`. Every raster is opened once, and the DSM
-    is read. Some tiles, with those of doubtful files first, are read as the run would (`trials`), and their
+    is read. Some tiles, first the tiles with doubtful files, are read like in a run (`trials`), and their
     DSM and DTM are compared (`height_findings`).
     """
     unusable = [tile for tile in tiles if tile.fault]
@@ -109,7 +109,7 @@ def _missing(
 
 
 def _no_access(path: Location, stat: StatCache) -> str | None:
-    """Return why a file is not there, or is not given to this user; None if it is."""
+    """Return why a file is missing or closed to this user; None if it can be read."""
     if not isinstance(path, Path):
         return MISSING if stat(path) is None else None
     try:
@@ -125,7 +125,7 @@ def _no_access(path: Location, stat: StatCache) -> str | None:
 
 @dataclass(frozen=True)
 class _Header:
-    """What opening a raster once tells of it."""
+    """The properties of a raster, found by opening it once."""
 
     crs: str | None
     """Horizontal CRS, or the given one; None if both are missing or unusable."""
@@ -135,7 +135,7 @@ class _Header:
 
 
 def _unfit(tiles: Sequence[Tile], config: Config) -> tuple[dict[str, list[str]], set[str]]:
-    """Return the tiles that would fail, by reason, and those with a doubtful file.
+    """Return the tiles that would fail, by reason, and the tiles with a doubtful file.
 
     The reasons are a raster in another CRS, and a DSM with too few heights.
     """
@@ -150,14 +150,14 @@ def _unfit(tiles: Sequence[Tile], config: Config) -> tuple[dict[str, list[str]],
         if reason := _other_crs(tile, headers) or (low if share and share < min_valid else ""):
             by_reason[reason].append(tile.id)
         units = {found.unit for layer, found in headers if layer.name in HEIGHTS}
-        # Without any height the file may lie elsewhere, or be in another unit.
+        # A file without any height may lie elsewhere, or be in another unit.
         if not share or len(units) > 1 or any(found.doubtful for _, found in headers):
             doubtful.add(tile.id)
     return by_reason, doubtful
 
 
 def _headers(tile: Tile, known: dict[tuple[Location, str | None], _Header]) -> list[tuple[Layer, _Header]]:
-    """Return the headers of the rasters on a tile; ``known`` has those read before."""
+    """Return the headers of the rasters on a tile; ``known`` has the headers that were read before."""
     found = []
     for layer in tile.layers_on(load.READS):
         for path in tile.paths(layer):
@@ -183,7 +183,7 @@ def _header(path: Location, layer: Layer) -> _Header:
             crs = crs_of(raster.crs.to_wkt() if raster.crs else None, layer.crs, raster.bounds)
             fault = header(raster).fault or (heights_fault(raster) if layer.name in HEIGHTS else None)
             if Path(str(path)).suffix.lower() not in AS_TEXT:
-                # A truncated file lacks it.
+                # A truncated file does not have its last block.
                 raster.read(1, window=Window(raster.width - 1, raster.height - 1, 1, 1))
             return _Header(in_plan(crs) if crs else None, raster.units[0] or "", bool(fault))
     except (*ERRORS, CatalogError):

@@ -19,7 +19,8 @@ UP_TO_DATE = "up to date"
 def reason(run: Run, status: TileStatus) -> str:
     """Return why the next run computes a tile: a kind, and after a colon the file, stage or error if known.
 
-    It is `UP_TO_DATE` if the run does not. If sources and options have both changed, the sources are named.
+    The reason is `UP_TO_DATE` if the run does not compute the tile. If sources and options have both changed,
+    the sources are named.
     The marker is read only if neither a source nor a product differs.
     """
     record, graph = status.last_record, status.graph
@@ -31,7 +32,7 @@ def reason(run: Run, status: TileStatus) -> str:
         return UP_TO_DATE
     if missing := own_files_missing(graph):
         return _line("file missing", _first(missing))
-    # A file around the tile is left out, and the tile computed without it.
+    # If a file around the tile cannot be used, the tile is computed without it.
     if missing := [path for path, file in graph.file_stats.items() if file is None]:
         return _line("source changed", _first(missing, ", which is missing"))
     if status.done:
@@ -46,7 +47,7 @@ def reason(run: Run, status: TileStatus) -> str:
 
 
 def why_pending(run: Run, statuses: Iterable[TileStatus]) -> list[str]:
-    """Return why tiles without a result of the present files and options are computed, a line per reason."""
+    """Return why tiles without a result for the present files and options are computed, a line per reason."""
     tiles: dict[str, list[str]] = defaultdict(list)
     for status in statuses:
         tiles[reason(run, status)].append(status.graph.tile.id)
@@ -58,7 +59,7 @@ def _line(kind: str, detail: str) -> str:
 
 
 def _first(names: Sequence[str], what: str = "") -> str:
-    """Return the first of some files with what is to say of it, and the number of the others."""
+    """Return the first of some files with a remark on it, and the number of the other files."""
     if len(names) == 1:
         return f"{names[0]}{what}"
     return f"{names[0]}{what}{',' * what.startswith(',')} and {count(len(names) - 1, 'more file')}"
@@ -68,12 +69,12 @@ def _compared_otherwise(record: TileRecord, graph: TileGraph) -> bool:
     """Return whether files were compared by size and time then and are by content now, or vice versa."""
     before, now = _files(record.sources), _files(graph.sources)
     shared = [(before[name], now[name]) for name in now if name in before]
-    # Of a missing file neither is known.
+    # Neither size nor content of a missing file is known.
     return any(len(one) != len(other) for one, other in shared if None not in (one[1], other[1]))
 
 
 def _changed_sources(record: TileRecord, graph: TileGraph) -> str:
-    """Return the layers that are read or no longer read, or the first file that differs; empty if none does.
+    """Return the layers that are newly read or no longer read, or the first file that differs, or "".
 
     Options such as ``segment.method`` and ``load.halo_m`` also change what is read.
     """
@@ -93,7 +94,7 @@ def _changed_sources(record: TileRecord, graph: TileGraph) -> str:
     ):
         if names:
             return _first([name for _, name in names], what)
-    # Their values of road and their CRS are from the catalog.
+    # The catalog gives the road values and the CRS of layers.
     described = {entry[0]: entry[2:] for entry in record.sources}
     layers = [entry[0] for entry in graph.sources if entry[2:] != described[entry[0]]]
     return f"values or CRS of {', '.join(layers)} in the catalog" if layers else ""

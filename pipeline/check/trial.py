@@ -1,4 +1,4 @@
-"""Tiles of a catalog read as a run reads them, before it: what fails here fails there, in the same words.
+"""Read tiles of a catalog before a run, in the same way: errors here are the errors of the run.
 
 The DSM and DTM of these tiles are compared: units, vertical references, steps between sheets.
 """
@@ -26,9 +26,9 @@ from flexroad.tasks.options import stage_function, stage_module
 from flexroad.tasks.types import Bools, Floats
 
 MOST_TILES = 48
-"""Number of tiles that are read: those with a doubtful file first, then one of each set of files."""
+"""Number of tiles that are read: first tiles with a doubtful file, then one tile of each set of files."""
 MOST_ERRORS = 5
-"""Number of errors that are told."""
+"""Number of errors that are reported."""
 
 
 @dataclass(frozen=True)
@@ -39,31 +39,31 @@ class Finding:
     fault: bool = False
     """Whether this should be corrected before a run."""
     warning: bool = False
-    """Whether this is said as a warning though it may be right; a fault always is."""
+    """Whether this is printed as a warning although it may be correct; a fault is always a warning."""
     failing: frozenset[str] = frozenset()
     """Ids of the tiles that would fail in a run."""
 
 
 def evenly(tiles: Sequence[Tile], most: int) -> list[Tile]:
-    """Return so many of the tiles at most, spread evenly over them."""
+    """Return at most ``most`` of the tiles, spread evenly over them."""
     number = min(most, len(tiles))
     return [tiles[k * len(tiles) // number] for k in range(number)]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What a run would read of one tile."""
+    """The data that a run would read for one tile."""
 
     tile_id: str
     sheets: frozenset[str]
     """Files of DSM and DTM on the tile: ``dsm a.tif``."""
     offset: Offset | None
     note: str | None
-    """That the DSM lies off the DTM as a whole; None if it does not."""
+    """The offset between DSM and DTM on the complete tile; None without an offset."""
     units: tuple[str, ...]
     """Notes on heights that were converted to metres."""
     road: Mapping[str, float]
-    """Median of DSM minus DTM on the road, and share of it off the DTM, as in metrics; empty if none."""
+    """Median of DSM minus DTM on the road, and share of the road off the DTM; empty without road."""
 
 
 def trials(
@@ -75,13 +75,13 @@ def trials(
 ) -> tuple[list[Trial], list[Finding]]:
     """Read some tiles as the stages of a run do, up to the road mask and the splines.
 
-    - `tiles`: usable tiles; some of them are read (`MOST_TILES`).
-    - `named`: tiles of which something else was found: they are left out.
+    - `tiles`: usable tiles; at most `MOST_TILES` of them are read.
+    - `named`: tiles with other findings: they are left out.
     - `doubtful`: tiles with a file that may fail: they come first.
-    - `absent`: files that are missing or closed, which have been named.
+    - `absent`: files that are missing or closed; they are already reported.
     - `faults`: a line for each error, with the tiles that it would fail.
     """
-    # Chains that read the same with the same splines are one.
+    # Chains that read the same files with the same splines are tried once.
     chains = {
         repr([chain[name] for name in ("load", "segment", "fit")]): chain for chain in config.chains.values()
     }
@@ -105,7 +105,7 @@ def trials(
 
 
 def _trial(tile: Tile, chain: Mapping[str, Any]) -> Trial:
-    """Return what the first stages read of a tile."""
+    """Return the data that the first stages read for a tile."""
     data = load.load(tile, chain["load"])
     road = data.road_mask
     if "roads" in getattr(stage_module(chain["segment"]), "READS", ()):
@@ -160,15 +160,15 @@ def _files(tile: Tile, names: Collection[str]) -> tuple[tuple[str, tuple[str, ..
 
 
 STEP_M = 0.3
-"""Change of the offset between tiles that is taken for another vertical reference (m)."""
+"""Smallest change of the offset between tiles that means another vertical reference (m)."""
 CALM_M = 0.1
-"""Largest spread of the offset of a tile that is compared with those of others (m)."""
+"""Largest spread of a tile's offset (m); tiles with a larger spread are not compared."""
 MOST_ROAD = 0.9
-"""Share of a tile's road from which it lies off the DTM as a whole."""
+"""Share of road cells off the DTM from which a tile's complete road is taken as off the DTM."""
 
 
 def height_findings(trials: Sequence[Trial]) -> Iterator[Finding]:
-    """Yield what DSM and DTM say of each other: a line on units, and one on an offset or a step."""
+    """Yield findings of comparing DSM and DTM: a line on units, and a line on an offset or a step."""
     converted = sorted({note for tile in trials for note in tile.units})
     yield from (Finding(f"{note}: if they are in metres, correct the unit") for note in converted)
     lines = on_tiles([tile.note for tile in trials if tile.note], len(trials))
@@ -183,7 +183,7 @@ def height_findings(trials: Sequence[Trial]) -> Iterator[Finding]:
 
 
 def road_is_off(row: Mapping[str, Any]) -> bool:
-    """Return whether nearly all road of a tile, by its metrics, lies off the DTM, and by less than `FAR_M`.
+    """Return whether nearly all road of a tile lies off the DTM by less than `FAR_M`, from its metrics.
 
     Then DSM or DTM may have another vertical reference; `load` notes an offset from `FAR_M` on.
     """
@@ -191,7 +191,7 @@ def road_is_off(row: Mapping[str, Any]) -> bool:
 
 
 def road_step(rows: Iterable[Mapping[str, Any]], tiles: int) -> Iterator[str]:
-    """Yield a line if the road of some tiles lies above the DTM as a whole, and one if it lies below.
+    """Yield a line if the complete road of some tiles lies above the DTM, and a line if it lies below.
 
     - `rows`: metrics of these tiles (`road_is_off`).
     - `tiles`: number of tiles of the run.
@@ -206,7 +206,7 @@ def road_step(rows: Iterable[Mapping[str, Any]], tiles: int) -> Iterator[str]:
 
 
 def _step(trials: Sequence[Trial]) -> str | None:
-    """Return that the offset changes between tiles, by the widest gap in its values; None if it does not."""
+    """Return a line if the offset changes between tiles: tiles are divided at the widest gap of offsets."""
     calm = [(tile.offset[0], tile) for tile in trials if tile.offset and tile.offset[1] <= CALM_M]
     calm.sort(key=lambda pair: pair[0])
     values = [value for value, _ in calm]
@@ -223,7 +223,7 @@ def _step(trials: Sequence[Trial]) -> str | None:
 
 
 def _of(part: Sequence[Trial], other: Sequence[Trial]) -> str:
-    """Return the sheets that only one part of the tiles has, or its tiles if they have the same sheets."""
+    """Return the sheets that only this part of the tiles has, or its tiles if both have the same sheets."""
     sheets = {sheet for tile in part for sheet in tile.sheets}
     own = [sheet for sheet in sorted(sheets) if not any(sheet in tile.sheets for tile in other)]
     return some(own or [tile.tile_id for tile in part])

@@ -37,7 +37,7 @@ TOOLS = {
 
 
 class _Catalogs(LazyGroup):
-    """The commands of this module, and those of tools."""
+    """The commands of this module and of tools."""
 
     modules = TOOLS
 
@@ -73,7 +73,7 @@ Reproject = Annotated[
 ]
 Date = Annotated[
     datetime | None,
-    options.under(INPUTS, "Date of the survey; default: that of the files.", metavar="YYYY-MM-DD"),
+    options.under(INPUTS, "Date of the survey; default: the date of the files.", metavar="YYYY-MM-DD"),
 ]
 TileSize = Annotated[float, options.under(TILES, "Size of a tile in m.", metavar="METRES")]
 MinCover = Annotated[float, options.under(TILES, MIN_COVER_HELP, min=0, max=1, metavar="SHARE")]
@@ -109,7 +109,7 @@ def catalog_rasters(
     ] = None,
     height_unit: Annotated[
         Literal["metre", "foot", "us-foot"] | None,
-        options.under(INPUTS, "Unit of heights if a file has none; default: metre, or that of the plan."),
+        options.under(INPUTS, "Unit of heights if a file has none; default: metre, or the unit of x and y."),
     ] = None,
     date: Date = None,
     tile_size: TileSize = 250,
@@ -185,7 +185,7 @@ def catalog_gerod(
 ) -> None:
     """List the tiles of the GeRoD dataset.
 
-    Its files are found by the words in their paths. A zip file is unpacked beside itself.
+    Its files are found by the words in their paths. A zip file is unpacked into its own folder.
     """
     dataset = load_config(layout).dataset
     if root.suffix.lower() == ".zip" and not root.is_dir():
@@ -251,10 +251,10 @@ def catalog_show(path: options.CatalogFile) -> None:
 
 
 def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] = ()) -> str:
-    """Return the command that runs a catalog, ready to be pasted, or what a run lacks.
+    """Return the command that runs a catalog, ready to be pasted, or why it cannot be run.
 
     - `path`: the catalog's file.
-    - `config`: the configuration; default: the one for production that fits the catalog's layers.
+    - `config`: the configuration; default: the production configuration that fits the catalog's layers.
     - `changes`: values of ``--set``.
     """
     catalog = Catalog.read(path)
@@ -266,7 +266,7 @@ def after_catalog(path: Path, config: str | None = None, changes: Sequence[str] 
         return f"before a run: {error}"
     # Many catalogs are called catalog.parquet: their folder tells them apart.
     title = path.stem if path.stem != "catalog" else path.absolute().parent.name or "run"
-    # Of all layers, so that the same folders suit `catalog check` and `train`.
+    # The folders of all layers are allowed, so that they also suit `catalog check` and `train`.
     allow = [
         word for folder in needed(catalog, AllowedFolders.of(path.parent)) for word in ("--allow", folder)
     ]

@@ -15,16 +15,16 @@ from flexroad.pipeline.config.options import HEADINGS
 
 OTHERS = "Options"
 RANGES = ((re.compile(r"([\d.]+)<=x<=([\d.]+)"), r"\1 to \2"), (re.compile(r"x>=([\d.]+)"), r"at least \1"))
-"""How typer writes the ranges of numbers, and how a help page does."""
+"""Ranges of numbers as typer writes them, and as our help pages write them."""
 MAX_NAME = 30
-"""Longest name of an option, with its values, beside which a help page writes the meaning."""
+"""Longest name of an option with its values; the meaning of longer ones starts on the next line."""
 
 
 class LazyGroup(TyperGroup):
-    """A group that has commands of modules which are imported when the command is called."""
+    """A group of commands whose modules are imported only when the command is called."""
 
     modules: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    """The module of each such command below `flexroad`, whose `app` has it, and the first line of its help.
+    """The module of each command below `flexroad`, whose `app` has it, and the first line of its help.
 
     Modules are text, so that the core imports no tool.
     """
@@ -35,7 +35,7 @@ class LazyGroup(TyperGroup):
         self.commands = {**self.commands, **listed}
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command, None if there is no such one."""
+        """Return a command, None if it does not exist."""
         if cmd_name in self.modules:
             return _imported(self.modules[cmd_name][0], cmd_name)
         return super().get_command(ctx, cmd_name)
@@ -54,7 +54,7 @@ def _imported(module: str, name: str) -> Any:
 def group(
     name: str | None = None, help: str | None = None, cls: type[TyperGroup] | None = None
 ) -> typer.Typer:
-    """Return what a module registers its commands with: a group of the program if it has a name."""
+    """Return the object with which a module registers its commands: with a name, a group of the program."""
     return typer.Typer(name=name, help=help, cls=cls, no_args_is_help=True, rich_markup_mode=None)
 
 
@@ -87,12 +87,12 @@ class Command(TyperCommand):
             if record := param.get_help_record(ctx):
                 name, text = record[0], _in_words(record[1])
                 if param.param_type_name == "argument":
-                    # Its type adds nothing to its name.
+                    # The type adds nothing to the name.
                     groups.setdefault("Arguments", []).append((name.partition(" <")[0], text))
                 else:
                     heading = getattr(param, "rich_help_panel", None) or OTHERS
                     groups.setdefault(heading, []).append((name, text))
-        # One width for all groups; names that are longer have a line of their own.
+        # All groups have one width; longer names have a line of their own.
         lengths = [len(name) for records in groups.values() for name, _ in records]
         width = max((length for length in lengths if length <= MAX_NAME), default=MAX_NAME)
         for heading in sorted(groups, key=["Arguments", *HEADINGS, OTHERS].index):

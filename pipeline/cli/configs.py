@@ -18,7 +18,7 @@ from flexroad.tasks.options import Options
 
 app = group("config", "Show configurations.")
 
-EXTENDS = f"the configuration that this one overrides; {ROOT}: none, so that options have their own defaults"
+EXTENDS = f"the configuration that this file overrides; {ROOT}: no configuration, only the options' defaults"
 
 
 @app.command("show", cls=Command)

@@ -26,19 +26,19 @@ STORED, TO_DO, DONE = "stored", "to do", "done"
 def plan(
     run: Run, tiles: Collection[Tile], say: Notify, workers: int | None = None, verbose: bool = False
 ) -> int:
-    """Say one line per tile with the reason why it is computed, the totals, and what would fail.
+    """Print a line per tile with the reason why it is computed, the totals, and the expected failures.
 
-    After the number of tiles follows whether worker processes would be started.
+    The line with the number of tiles also says whether worker processes would be started.
 
     In the totals, a node of the graph is ``done`` if its tile is up to date, ``stored`` if its result is in
     the store, else ``to do``. Nodes that are never stored (the rasters that `load` reads) are computed again
     when a later node needs them.
 
-    - `run`: the run, which need not exist yet (`Run.planned`).
+    - `run`: the run, which may not exist yet (`Run.planned`).
     - `tiles`: the selected tiles.
-    - `workers`: largest number of worker processes; by default that of the configuration.
+    - `workers`: largest number of worker processes; by default the number in the configuration.
     - `verbose`: whether each tile also has a line per node of its graph.
-    - result: exit code of the run, which the last line says with its reasons.
+    - result: expected exit code of the run; the last line prints it with its reasons.
     """
     place, totals, reasons = RunPlace.of(run), Counter[tuple[str, str]](), Counter[str]()
     todo: list[Tile] = []
@@ -88,7 +88,7 @@ def _totals(totals: Counter[tuple[str, str]]) -> Iterator[str]:
 
 
 def _verdict(failing: int, pending: int, skipped: int) -> tuple[int, str]:
-    """Return the exit code that is expected, and a line with its reasons."""
+    """Return the expected exit code, and a line with its reasons."""
     parts = (
         (failing, "tile", "would fail"),
         (pending, "other tile", "pending or failed"),
@@ -103,7 +103,7 @@ def _selected(run: Run, selected: set[str], failing: set[str], pending: set[str]
     """Yield the state of each selected tile.
 
     - `failing`: gets the selected tiles that would fail.
-    - `pending`: gets the other tiles that have no result of the present files and options.
+    - `pending`: gets the other tiles without a result for the present files and options.
     """
     incomplete, last_incomplete = 0, None
     for status in peek_statuses(run, run.catalog.tiles):
@@ -128,7 +128,7 @@ def _state(node: Node, place: RunPlace, borders: dict[str, str]) -> str:
 
 
 def _say_nodes(graph: TileGraph, states: dict[str, str], say: Notify) -> None:
-    """Say a line per node of a tile: stage, fingerprint, state, inputs and variants."""
+    """Print a line per node of a tile: stage, fingerprint, state, inputs and variants."""
     users: dict[str, list[str]] = {}
     for variant, nodes in graph.variants.items():
         for name in (*nodes.values(), *graph.nodes[nodes["fit"]].frame):

@@ -1,4 +1,4 @@
-"""Limits that the system sets for this process, and what to do about errors of the system."""
+"""Limits that the system sets for this process, and remedies for errors of the system."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import resource
 from flexroad.pipeline.errors import ConfigError
 
 OPEN_FILES = 256
-"""Open files that a command must be allowed: a process keeps up to 64 rasters open beside its libraries."""
+"""Number of open files that a command needs: a process keeps up to 64 rasters open beside its libraries."""
 ENOUGH_OPEN_FILES = 2**16
 """The soft limit of open files is raised to this at most."""
 ADDRESS_SPACE = 2 * 2**30
 """Smallest address space in which the libraries of a tile can be loaded (bytes)."""
 MORE_SPACE = "raise the limit with `ulimit -v unlimited`, or limit the memory by a control group instead"
 COMPUTING = ("run", "rerun", "prepare", "train", "export", "report", "figures")
-"""Commands that load these libraries."""
+"""Commands that load the libraries of a tile."""
 OUT_OF_MEMORY = (
     "Cannot allocate memory",
     "failed to map segment",
@@ -23,11 +23,11 @@ OUT_OF_MEMORY = (
     "Failed to launch worker thread",
     "malloc of size",
 )
-"""Words of libraries that find no memory; their errors have many types."""
+"""Words in the errors of libraries that find no memory; these errors have many types."""
 
 
 def raise_open_files() -> None:
-    """Raise the soft limit of open files to the hard one, as this needs no permission."""
+    """Raise the soft limit of open files towards the hard limit; this needs no permission."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     target = ENOUGH_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, ENOUGH_OPEN_FILES)
     if soft != resource.RLIM_INFINITY and soft < target:
@@ -48,7 +48,7 @@ def check(command: str | None) -> None:
 
 
 def remedy(error: OSError) -> str:
-    """Return what to do about an error of the system."""
+    """Return the remedy for an error of the system."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return f"this process may open {_limit(resource.RLIMIT_NOFILE)} files; {_more_files()}"
     if error.errno in (errno.EACCES, errno.EPERM):
@@ -59,7 +59,7 @@ def remedy(error: OSError) -> str:
 
 
 def memory_reason(error: BaseException) -> str | None:
-    """Return why an error is one of too little memory or address space, and the remedy; None if it is not."""
+    """Return the reason and remedy of an error for lack of memory or address space; None for other errors."""
     text = str(error)
     if not isinstance(error, MemoryError) and not any(words in text for words in OUT_OF_MEMORY):
         return None
@@ -70,7 +70,7 @@ def memory_reason(error: BaseException) -> str | None:
 
 
 def _limit(kind: int) -> int | None:
-    """Return the soft limit, None if there is none."""
+    """Return the soft limit, None if it is unlimited."""
     soft, _ = resource.getrlimit(kind)
     return None if soft == resource.RLIM_INFINITY else soft
 

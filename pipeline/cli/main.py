@@ -45,7 +45,7 @@ class Commands(LazyGroup):
     modules = COMMANDS
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command, None if there is no such one; the limits of this process suffice for it."""
+        """Return a command, None if it does not exist, after a check of the limits of this process."""
         limits.check(cmd_name)
         return super().get_command(ctx, cmd_name)
 
@@ -66,8 +66,8 @@ def main() -> None:
     limits.raise_open_files()
     if IGNORED:
         echo(f"warning: {IGNORED}", err=True)
-    # Rasterio loads boto3 where it is installed, for a tenth of the time of a short command. It uses it only
-    # for credentials, which GDAL reads by itself.
+    # If boto3 is installed, rasterio loads it, in a tenth of the time of a short command. Rasterio needs it
+    # only for credentials, which GDAL reads by itself.
     sys.modules.setdefault("boto3", None)  # type: ignore[arg-type]
     try:
         with signals_interrupt():
@@ -77,7 +77,7 @@ def main() -> None:
             echo(f"error: {line}", err=True)
         sys.exit(2)
     except (SystemExit, KeyboardInterrupt) as end:
-        # typer ends with 130 without a word. Commands that notice an interruption themselves have said so.
+        # typer ends with 130 without a message. Commands that handle an interruption print their own message.
         cause = getattr(end.__context__, "__cause__", None)
         if isinstance(end, KeyboardInterrupt) or isinstance(cause, KeyboardInterrupt):
             echo("interrupted; repeat the command", err=True)
@@ -94,12 +94,12 @@ def main() -> None:
             try:
                 stream.flush()
             except OSError:
-                # A full disk or a closed pipe: the flush at exit would fail and change the exit code.
+                # With a full disk or a closed pipe, the flush at exit would fail and change the exit code.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _reason(error: Exception) -> str | None:
-    """Return what to print of an error that comes from the machine or the installation; None of others."""
+    """Return the message for an error of the machine or the installation; None for other errors."""
     if reason := limits.memory_reason(error):
         return reason
     if isinstance(error, OSError):

@@ -1,4 +1,4 @@
-"""Options that several commands share, and options that are made of the fields of dataclasses."""
+"""Options that several commands share, and options made from the fields of dataclasses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES, WORK
 
 
 def under(heading: str, help: str, *names: str, **more: Any) -> Any:
-    """Return an option that stands below a heading of a help page."""
+    """Return an option that is listed below a heading of a help page."""
     return typer.Option(*names, help=help, rich_help_panel=heading, **more)
 
 
@@ -78,8 +78,8 @@ def allowed(ctx: typer.Context) -> list[str]:
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """Let a command take the fields of its dataclasses as options, and receive the dataclasses.
 
-    Options are the fields made by `pipeline.config.options.option`; of a parameter that is
-    ``Annotated[Kind, "name", ...]``, only those of these names.
+    Options are the fields made by `pipeline.config.options.option`. A parameter ``Annotated[Kind, "name",
+    ...]`` has only the fields with these names.
     """
     parameters: list[inspect.Parameter] = []
     taken: dict[str, tuple[Any, dict[str, inspect.Parameter]]] = {}

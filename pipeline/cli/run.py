@@ -44,7 +44,7 @@ from flexroad.tasks.io.dsm_and_dtm import is_offset, on_tiles
 app = group()
 
 SHOWN = 5
-"""Tiles to look at that ``status`` names; summary.json has all."""
+"""Number of flagged tiles that ``status`` names; summary.json has all of them."""
 
 
 def _known(value: str) -> str:
@@ -69,7 +69,7 @@ Executor = Annotated[
 ]
 REPAIR = "repair what was skipped, repeat the `flexroad catalog` command, then `flexroad run`"
 MOST_PENDING = 100
-"""Number of pending tiles of which the reasons are looked up."""
+"""Largest number of pending tiles whose reasons are looked up."""
 StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export"]
 
 
@@ -180,7 +180,7 @@ def rerun(
 
 
 class Shown(Observer):
-    """Shows the events of a run on standard error, and has its end; a context manager."""
+    """Shows the events of a run on standard error, and keeps its result; a context manager."""
 
     def __init__(self) -> None:
         self.exit_code = 0
@@ -191,9 +191,9 @@ class Shown(Observer):
         self.display: ProgressDisplay | None = None
         """Progress of the tiles, from the first one on until the block ends."""
         self.offsets: list[str] = []
-        """Notes of tiles whose DSM lies off the DTM as a whole."""
+        """Notes of tiles whose complete DSM lies off the DTM."""
         self.rows: list[MetricsRow] = []
-        """Metrics of tiles, of any variant, whose road lies off the DTM as a whole."""
+        """Metrics of tiles whose complete road lies off the DTM, in any variant."""
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Shown:
@@ -204,7 +204,7 @@ class Shown(Observer):
 
     @contextlib.contextmanager
     def working(self, work: str) -> Iterator[None]:
-        """Name the work of the block if it takes long, as with catalogs of thousands of tiles."""
+        """Print the name of the block's work if it takes long, as for catalogs of thousands of tiles."""
 
         def line(spent_s: float) -> str:
             return f"{work}, {spent_s:.0f} s spent"
@@ -239,7 +239,7 @@ class Shown(Observer):
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[Shown]:
-    """Give what shows the run of the block; an interruption is recorded in it and not raised again."""
+    """Yield an observer for the block; it records an interruption, which is not raised again."""
     shown = Shown()
     try:
         with signals_interrupt():

@@ -1,7 +1,7 @@
-"""SIGINT, SIGTERM and SIGHUP: the first one interrupts the program, a later one ends it at once.
+"""SIGINT, SIGTERM and SIGHUP: the first signal interrupts the program, a later signal ends it at once.
 
-A KeyboardInterrupt can be lost: a callback that a C library calls, as rasterio's for the messages of GDAL,
-cannot pass it on. It is therefore raised again until it is being handled.
+A KeyboardInterrupt can be lost: a callback of a C library, such as rasterio's for messages of GDAL, cannot
+pass it on. It is therefore raised again until it is being handled.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 INTERRUPTED = 130
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ONE_S = 1.0
-"""Signals within this time after the first one count as one with it (s).
+"""Signals within this time after the first signal are taken as the same signal (s).
 
 A shell and the terminal that closes both send SIGHUP, and users press Ctrl-C several times."""
 SOON_S = 0.001
@@ -33,9 +33,9 @@ ENDED = b"ended at once by a second signal; repeat the command\n"
 
 @contextlib.contextmanager
 def signals_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt at the first SIGINT, SIGTERM or SIGHUP; a later one ends the process.
+    """Raise KeyboardInterrupt at the first SIGINT, SIGTERM or SIGHUP; a later signal ends the process.
 
-    A second context inside the first one says where the interrupt is taken up: behind it nothing is raised.
+    A second context inside the first marks where the interrupt is handled: after it, nothing is raised again.
     """
     outer = getattr(signal.getsignal(signal.SIGTERM), "__self__", None)
     if isinstance(outer, _Signals):
@@ -49,7 +49,7 @@ def signals_interrupt() -> Iterator[None]:
 
 
 class _Signals:
-    """The handlers of the signals, and a thread that sees them also while a C library is at work."""
+    """The handlers of the signals, and a thread that receives them even while a C library is at work."""
 
     def __init__(self) -> None:
         self.first_s: float | None = None
@@ -81,7 +81,7 @@ class _Signals:
         sys.unraisablehook, sys.excepthook = self.hooks
 
     def stop_raising(self) -> None:
-        """Raise the interrupt no more: it has been taken up."""
+        """Stop raising the interrupt: it has been handled."""
         if self.raising:
             self.raising = False
             signal.setitimer(signal.ITIMER_REAL, 0)
@@ -104,17 +104,17 @@ class _Signals:
             raise KeyboardInterrupt
 
     def _lost(self, lost: Any) -> None:
-        """Say what could not be raised, but for the interrupt, which is raised again soon."""
+        """Print an error that could not be raised, except the interrupt, which is raised again soon."""
         if not issubclass(lost.exc_type, KeyboardInterrupt):
             self.hooks[0](lost)
         elif self.raising:
-            # The hook is called inside the callback, below the frame that has called the C library.
+            # The hook is called inside the callback, below the frame that called the C library.
             self._raise_in(sys._getframe(1))
 
     def _raise_in(self, frame: FrameType | None) -> None:
-        """Raise the interrupt in a frame as soon as it goes on: its call of a C library has then returned.
+        """Raise the interrupt in a frame as soon as it continues: its call of a C library has then returned.
 
-        A timer alone may meet the library at work each time, and so be lost in its next callback.
+        An interrupt raised by a timer alone could always meet the library at work, and be lost in a callback.
         """
         before = sys.gettrace()
 
@@ -129,7 +129,7 @@ class _Signals:
             sys.settrace(before or (lambda *_: None))
 
     def _show(self, kind: type[BaseException], *error: Any) -> None:
-        """Print an error, but for a lost interrupt, whose traceback Cython prints."""
+        """Print an error, except a lost interrupt, whose traceback Cython prints."""
         if not issubclass(kind, KeyboardInterrupt):
             self.hooks[1](kind, *error)
 
@@ -140,7 +140,7 @@ class _Signals:
 
 @atexit.register
 def _ignore_late() -> None:
-    """Ignore further signals of an interrupted program: Python's own end would make them kill it.
+    """Ignore further signals of an interrupted program: at the end of Python they would kill it.
 
     Registered on import, it is called after the other functions of `atexit`, which may wait.
     """

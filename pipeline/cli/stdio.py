@@ -19,7 +19,7 @@ from flexroad.catalog.text import printable, without_credentials
 def echo(line: str, err: bool = False) -> None:
     """Print one line to standard output or error; characters that cannot be printed are escaped.
 
-    Standard error shows no credentials of addresses. Data on standard output stays as it is.
+    Credentials in addresses are hidden on standard error. Data on standard output is unchanged.
     """
     typer.echo(printable(without_credentials(line) if err else line), err=err)
 
@@ -40,7 +40,7 @@ def echo_document(text: str) -> None:
 
 
 class _LenientStream:
-    """A text stream that ignores write errors; other attributes are those of the wrapped stream."""
+    """A text stream that ignores write errors; other attributes come from the wrapped stream."""
 
     def __init__(self, stream: IO[str]) -> None:
         self._stream = stream

@@ -1,8 +1,8 @@
-"""Read YAML from others: bounded in size, time and memory, and strict about what is written twice.
+"""Read untrusted YAML: limited in size, time and memory. Repeated keys are errors.
 
-YAML can describe far more than it has bytes (aliases of aliases, merge keys), PyYAML takes the last of equal
-keys without notice, and its constructors raise many types of errors. Here all of that is a `ConfigError` of
-one line with the line number. Messages have no text of the file, which may be another one than was meant.
+YAML can describe much more than it has bytes (aliases of aliases, merge keys). PyYAML silently takes the last
+of equal keys, and its constructors raise many types of errors. Here all of these are a `ConfigError` of one
+line with the line number. Messages have no text of the file, which may be a private file given by mistake.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _load(text: str) -> tuple[Any, dict[str, int]]:
         root = loader.get_single_node()
         if root is None:
             return None, {}
-        # Before the construction, which adds the entries of merge keys.
+        # The lines are read before the construction, which adds the entries of merge keys.
         keys = [key for key, _ in root.value] if isinstance(root, yaml.MappingNode) else []
         lines = {key.value: key.start_mark.line + 1 for key in keys if isinstance(key, yaml.ScalarNode)}
         return loader.construct_document(root), lines
@@ -69,7 +69,7 @@ class _Loader(yaml.SafeLoader):
         alias = self.check_event(yaml.AliasEvent)
         mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
         self._level += 1
-        # Also checked before the children: each level takes stack.
+        # The depth is also checked before the children, because each level needs space on the stack.
         self._check(self._level <= MAX_DEPTH, f"nested more than {MAX_DEPTH} deep", mark)
         before = self._values
         node = super().compose_node(parent, index)

@@ -1,6 +1,6 @@
 """Read a configuration from YAML, resolve `extends`, and validate it; one line per error.
 
-A file without ``extends`` extends `USUAL`. The last of a chain has ``extends: defaults``.
+A file without ``extends`` extends `USUAL`. The last file of a chain has ``extends: defaults``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from flexroad.pipeline.config.stages import DEFAULTS
 from flexroad.pipeline.errors import ConfigError
 
 SECTIONS = ("dataset", "export", "cluster", "variants", "extends")
-"""Parts of a configuration that are no stages."""
+"""Parts of a configuration that are not stages."""
 USUAL = "production"
 """The configuration that a file without ``extends`` extends."""
 SUFFIXES = (".yaml", ".yml")
@@ -33,11 +33,11 @@ MAX_VARIANT = 80
 MAX_KEY = 60
 """Longest text of a key in a message."""
 MAX_NAME = 500
-"""Longest name of a file in a message that it does not exist."""
+"""Longest name of a missing file in a message."""
 MAX_ERRORS = 10
 """Most errors of one stage that are listed."""
 HALO_M = 40.0
-"""Smallest halo (m) with levels: farther away nothing decides on those at the border of a tile."""
+"""Smallest halo (m) with levels: levels at the border of a tile depend on nothing farther away."""
 
 
 def shipped() -> dict[str, Path]:
@@ -50,8 +50,8 @@ def shipped() -> dict[str, Path]:
 def load_config(name: str | Path, settings: Sequence[str] | Mapping[str, Any] = ()) -> Config:
     """Read a configuration by shipped name or by file name.
 
-    - `settings`: options that replace those of the file: ``["fit.spacing_m=5"]`` or ``{"fit": {"spacing_m":
-      5}}``. They are a part of the configuration's name, so that no result looks like one of the file alone.
+    - `settings`: options that replace options of the file: ``["fit.spacing_m=5"]`` or ``{"fit":
+      {"spacing_m": 5}}``. They become part of the configuration's name, to distinguish its results.
     """
     config = compose(_raw(name), str(name))
     if not settings:
@@ -62,7 +62,7 @@ def load_config(name: str | Path, settings: Sequence[str] | Mapping[str, Any] = 
 
 
 def compose(raw: Mapping[str, Any], name: str) -> Config:
-    """Validate a configuration that extends no other; ``name`` identifies it in error messages."""
+    """Validate a configuration that does not extend another; ``name`` identifies it in error messages."""
     stages = list(stage_models())
     raw = {"extends": ROOT, **raw}
     if raw["extends"] != ROOT:
@@ -91,7 +91,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
         }
         _check_levels(chains[str(variant)], f"{name}: {where}" if overrides else name)
     given = _mapping(raw.get("export") or {}, name, "export")
-    # By default ``flexroad`` is exported, or else the last variant.
+    # By default the variant ``flexroad`` is exported, else the last variant.
     main = ("flexroad",) if "flexroad" in chains else tuple(chains)[-1:]
     export = _validate(TypeAdapter(Export), {"variants": main} | given, f"{name}: export")
     for variant in export.variants:
@@ -108,7 +108,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
 
 
 def read_mapping(data: bytes, name: str) -> dict[str, Any]:
-    """Return the mapping in a configuration file's bytes, with ``extends`` as it is written."""
+    """Return the mapping in a configuration file's bytes, with ``extends`` unresolved."""
     return _mapping_of(document.parse(data, name)[0], name)
 
 
@@ -149,10 +149,10 @@ def _existing(name: str | Path) -> Path:
 
 
 def _parent(parent: Any, path: Path) -> Path:
-    """Return the path of the configuration that the one in ``path`` extends.
+    """Return the path of the configuration that the file ``path`` extends.
 
-    A configuration may come from others, and all files are read with the user's rights: only files with
-    YAML's endings are read, also behind links.
+    Another user may have written a configuration, but files are read with this user's rights. So only files
+    with YAML's endings are read, also behind links.
     """
     if not isinstance(parent, str):
         raise ConfigError(f"{path}: extends: expected a file or a shipped name, not {shown(parent)}")
@@ -166,7 +166,7 @@ def _parent(parent: Any, path: Path) -> Path:
 
 
 def _read(path: Path, own: bool = True) -> dict[str, Any]:
-    """Return the mapping in a file; ``own`` is False for a file that another one extends."""
+    """Return the mapping in a file; ``own`` is False for a file that another file extends."""
     try:
         with path.open("rb") as file:
             value, lines = document.parse(file.read(document.MAX_BYTES + 1), str(path))
@@ -177,10 +177,10 @@ def _read(path: Path, own: bool = True) -> dict[str, Any]:
     raw = _mapping_of(value, str(path))
     for key in () if own else raw:
         if key not in (*SECTIONS, *stage_models()):
-            # The file may be no configuration at all: its text is not shown.
+            # The file may be something else than a configuration, so its text is not shown.
             line = lines.get(str(key), 1)
             raise ConfigError(
-                f"{path}: line {line}: the key is none of a configuration; correct or remove it"
+                f"{path}: line {line}: the key is unknown in a configuration; correct or remove it"
             )
     return raw
 
@@ -199,11 +199,11 @@ def _extend(parent: dict[str, Any], child: dict[str, Any], name: str) -> dict[st
     for key, value in child.items():
         if key in ("export", "cluster", *stage_models()):
             where = f"{name}: {key}"
-            # A parent without a method has the default one; another method starts from its own defaults.
+            # A parent without a method has the default method; another method starts from its own defaults.
             base = merge(DEFAULTS.get(key), parent.get(key), TAG.get(key), where)
             merged[key] = merge(base, value, TAG.get(key), where)
         elif key == "dataset":
-            # `layers` is replaced: the files of one dataset say nothing about those of another.
+            # `layers` is replaced completely, because the files of datasets are independent of each other.
             merged[key] = _mapping(parent.get(key) or {}, name, key) | _mapping(value or {}, name, key)
         else:
             merged[key] = value
@@ -256,7 +256,7 @@ def _validate(model: TypeAdapter[Any], options: dict[str, Any], where: str) -> A
 
 
 def _error_line(details: Any, model: TypeAdapter[Any], where: str) -> str:
-    """Return one of pydantic's errors as a line with key, message and value."""
+    """Return an error of pydantic as a line with key, message and value."""
     # A discriminated union puts the chosen method first in the path; the file has no such level.
     keys = _keys(model)
     method = next((str(part) for part in details["loc"][:1] if part in keys), "")

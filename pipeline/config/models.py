@@ -20,7 +20,7 @@ TAG = {"segment": "method", "ecsrc": "method", "fit": "method", "sample": "metho
 """Stage or section -> the option that a single word sets."""
 
 ROOT = "defaults"
-"""What a configuration extends whose options start from their own defaults, not from another's values."""
+"""The value of ``extends`` in a configuration that starts from the defaults of the options."""
 
 Chain = Mapping[str, Options]
 """The options of one variant, by stage, in the paper's order."""
@@ -69,68 +69,67 @@ class Cluster(Options):
 
     kind: Literal["local", "slurm"] = Field(
         "local",
-        description="local: processes of this machine; slurm: workers requested there "
-        "(pip install 'flexroad[slurm]')",
+        description="local: processes of this machine; slurm: jobs of SLURM (pip install 'flexroad[slurm]')",
     )
     workers: int | None = Field(
         None,
         ge=1,
         le=100_000,
-        description="most worker processes, of one thread; local: by default one per core",
+        description="largest number of worker processes; local: by default one per core",
     )
     memory: ByteSize | None = Field(
         None,
         ge=100 * 1024**2,
-        description="memory of each worker, as 4 GiB; a value starts workers for any tile; by default an "
-        "equal share of this machine's memory, on slurm 4 GiB; a tile that needs more is "
-        "stopped and becomes a failed row",
+        description="memory of each worker, such as 4 GiB; a tile that needs more is stopped and fails. By "
+        "default an equal share of this machine's memory, with slurm 4 GiB. With a value, all tiles run on "
+        "workers",
     )
     tile_timeout_s: float = Field(
         DEFAULT_TIMEOUT_S,
         ge=1,
         le=604_800,
-        description="longest time for one tile (s): a worker that takes longer is stopped, the tile is tried "
-        "once more alone, and is then a failed row; only on workers: another value starts them for any tile",
+        description="longest time for one tile (s). A worker that takes longer is stopped, and the tile is "
+        "tried once more alone before it fails. With a value other than the default, tiles run on workers",
     )
     security: Literal["tls", "none"] = Field(
         "tls",
         description="tls: scheduler and workers answer only processes with certificates made for this "
-        "command; none: whoever reaches their ports can run programs as you; for a running "
-        "scheduler Dask's own configuration counts",
+        "command. none: whoever reaches their ports can run programs as you. A running scheduler uses "
+        "Dask's own configuration",
     )
     flush: bool = Field(
         True,
-        description="write each tile's products and marker to the disk (fsync) before it counts as done; "
+        description="write each tile's products and marker to the disk (fsync) before the tile is done. "
         "false saves some milliseconds per tile, but a power failure may leave damaged products",
     )
     start_s: float = Field(
         3600,
         gt=0,
         le=604_800,
-        description="slurm: waiting time for the first worker, and for a new one when all are lost (s)",
+        description="slurm: waiting time for the first worker, and for a new worker when all are lost (s)",
     )
     walltime_h: float = Field(8, gt=0, le=10_000, description="slurm: time limit of each job (hours)")
     queue: str | None = Field(None, min_length=1, description="slurm: partition (-p)")
     per_job: int = Field(1, ge=1, le=1024, description="slurm: workers per job, one core each")
     interface: str | None = Field(
-        None, min_length=1, description="slurm: network interface between workers and this machine, as ib0"
+        None, min_length=1, description="slurm: network interface between workers and this machine, like ib0"
     )
-    job_extra: tuple[str, ...] = Field((), description="slurm: further #SBATCH lines, as --account=NAME")
+    job_extra: tuple[str, ...] = Field((), description="slurm: further #SBATCH lines, like --account=NAME")
     prologue: tuple[str, ...] = Field(
-        (), description="slurm: shell lines run before a worker starts, as module load gdal"
+        (), description="slurm: shell lines run before a worker starts, like module load gdal"
     )
 
     @property
     def needs_workers(self) -> bool:
-        """Whether tiles run on workers only: on other machines, or within limits of memory and time."""
+        """Whether tiles must run on workers: on other machines, or within limits of memory and time."""
         limited = self.memory is not None or self.tile_timeout_s != DEFAULT_TIMEOUT_S
         return limited or self.kind != "local"
 
     @property
     def programs(self) -> dict[str, Any]:
-        """The given options that can start programs, or let others do so.
+        """The given options that can start programs, or let other users start programs.
 
-        These are those of free text, in a job's script, and ``security: none``.
+        These are ``security: none``, and options of free text, which are written into a job's script.
         """
         fields = type(self).model_fields.items()
         texts = {name for name, field in fields if get_origin(field.annotation) is not Literal} | {"security"}

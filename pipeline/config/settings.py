@@ -1,4 +1,4 @@
-"""Overrides: options of a stage or section that replace others, and ``--set fit.spacing_m=5`` by dotted key.
+"""Overrides of options in a stage or section, and ``--set fit.spacing_m=5`` by dotted key.
 
 A stage or section that is a single word is its method.
 """
@@ -29,13 +29,13 @@ def parsed(text: str) -> tuple[Keys, Any]:
 
 
 def _selects_method(keys: Keys) -> bool:
-    """Return whether a key is the method of a stage, on which the stage's other options depend."""
+    """Return whether a key selects the method of a stage: its other options depend on the method."""
     stage = keys[2:] if keys[0] == "variants" else keys
     return len(stage) == 1 or (len(stage) == 2 and stage[1] == TAG.get(stage[0]))
 
 
 def texts(settings: Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Return settings as ``KEY=VALUE``, also those of a mapping."""
+    """Return settings as ``KEY=VALUE``, also from a mapping."""
     if isinstance(settings, str):
         return [settings]
     if not isinstance(settings, Mapping):
@@ -55,7 +55,7 @@ def _flow(value: Any) -> str:
 
 
 def applied(raw: Mapping[str, Any], settings: Iterable[tuple[Keys, Any]]) -> dict[str, Any]:
-    """Return a configuration with changed options; equal keys take the last value.
+    """Return a configuration with changed options; of equal keys the last value is used.
 
     Methods are set first: another method starts from its own defaults, in whatever order they are given.
     """
@@ -79,10 +79,10 @@ def _assigned(options: Any, keys: Keys, value: Any, parents: Keys = ()) -> dict[
 
 
 def merge(base: Any, override: Any, tag: str | None, where: str) -> dict[str, Any]:
-    """Merge an override into options, also those within options; another method replaces all.
+    """Merge an override into options, also into nested options; another method replaces all of them.
 
-    - `base`, `override`: options, or the method alone.
-    - `tag`: the option that a single word sets, such as ``method``; None if there is none.
+    - `base`, `override`: options, or only the name of a method.
+    - `tag`: the option that a single word sets, such as ``method``, or None.
     """
     options, changes = tagged(base, tag, where), tagged(override, tag, where)
     if tag in changes and tag in options and changes[tag] != options[tag]:
@@ -91,14 +91,14 @@ def merge(base: Any, override: Any, tag: str | None, where: str) -> dict[str, An
 
 
 def _merged(base: Any, key: str, value: Any, where: str) -> Any:
-    """Return the value of one option: what it leaves out of a mapping or a stage is that of ``base``."""
+    """Return the value of one option; missing keys of a mapping or stage are taken from ``base``."""
     if key in TAG or (isinstance(base, dict) and isinstance(value, dict)):
         return merge(base, value, TAG.get(key), where)
     return value
 
 
 def tagged(options: Any, tag: str | None, where: str) -> dict[str, Any]:
-    """Return options as a mapping, also if they are only the name of a method."""
+    """Return options as a mapping, even if they are only the name of a method."""
     if options is None:
         return {}
     # YAML reads a bare `off` as false.

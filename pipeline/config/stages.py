@@ -1,4 +1,4 @@
-"""The stages of the paper: the module of each or the package of its methods, inputs, versions and models."""
+"""The stages of the paper: their modules or packages of methods, inputs, versions and models."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HOMES = {
 }
 """Stage -> its module, or the package of its methods if it has several; in the paper's order."""
 DEFAULTS = {"segment": "mask", "ecsrc": "paper", "fit": "nurbs"}
-"""Default method of each stage that has several."""
+"""Default method of each stage that has several methods."""
 STAGES: dict[str, tuple[str, ...]] = {
     "load": (),
     "segment": ("load",),
@@ -32,7 +32,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "evaluate": ("sample", "load", "segment", "fit"),
     "assess": ("load", "segment", "ecsrc", "fit"),
 }
-"""The stages of the paper, in its order, and the stages whose results their functions take, in that order."""
+"""Stage -> the stages whose results its function takes, in this order; stages in the paper's order."""
 STAGE_NAMES = tuple(STAGES)
 
 

@@ -1,4 +1,4 @@
-"""Executors: run jobs one after the other, on Dask, or on Dask only if that pays.
+"""Executors: run jobs one after the other, on Dask, or on Dask only if that saves time.
 
 The only package that imports Dask.
 

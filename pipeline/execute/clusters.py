@@ -35,9 +35,9 @@ from flexroad.pipeline.execute.start import (
 )
 
 WORKER_LOST_TIMEOUT_S = 60.0
-"""How long to wait for a new worker when all are lost (s); a local one is replaced in seconds."""
+"""How long to wait for a new worker when all are lost (s); a local worker is replaced in seconds."""
 GRACE_S = 10.0
-"""How long a running scheduler may have no workers (s): a nanny may be replacing one."""
+"""How long a running scheduler may have no workers (s): a nanny may be replacing a worker."""
 ANSWER_S = 10.0
 """How long a scheduler may take to answer (s)."""
 
@@ -55,9 +55,9 @@ class ClusterTarget:
     worker_lost_timeout_s: float = 0
     """How long to wait for a worker when all are lost (s)."""
     remedy: str = "start some (`dask worker ADDRESS --nthreads 1`)"
-    """What to do if no worker comes."""
+    """The remedy if no worker comes."""
     given_up: Callable[[], bool] = lambda: False
-    """Returns whether no worker will come."""
+    """Returns whether no worker can come any more."""
 
 
 @contextlib.contextmanager
@@ -84,7 +84,7 @@ def open_cluster(
     if workers:
         cluster = cluster.model_copy(update={"workers": workers})
     with contextlib.ExitStack() as stack:
-        # Set until the cluster ends, so that workers that replace dead ones get the settings too.
+        # The settings stay until the cluster ends, so that replacements of dead workers get them too.
         stack.enter_context(dask.config.set(settings(cluster, dashboard)))
         if cluster.kind == "local":
             started = stack.enter_context(local(cluster, dashboard))
@@ -152,7 +152,7 @@ def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def connected(target: ClusterTarget, dashboard: bool, notify: Notify) -> Iterator[Client]:
-    """Connect to a cluster and wait for its first worker; say the dashboard's address if it is wanted."""
+    """Connect to a cluster and wait for its first worker; print the dashboard's address if wanted."""
     make = partial(Client, target.target, timeout=ANSWER_S, set_as_default=False)
     with contextlib.ExitStack() as stack:
         try:

@@ -34,7 +34,7 @@ class DaskExecutor:
     """Runs jobs on local worker processes of one thread each, or on another Dask cluster."""
 
     workers: int | None = None
-    """Number of processes; by default that of ``cluster``."""
+    """Number of processes; by default the number in ``cluster``."""
     scheduler: str | None = None
     """Address of a running Dask scheduler, which is used instead of ``cluster``."""
     cluster: Cluster = LOCAL
@@ -44,8 +44,8 @@ class DaskExecutor:
     notify: Notify = lambda line: None
     """Prints one line for the user: the address of the dashboard, a wait for workers."""
     logs: Path | None = None
-    """Folder for the output of SLURM jobs, on a disk that all machines share; by default one in the home
-    folder, which is removed at the end."""
+    """Folder for the output of SLURM jobs, on a disk that all machines share. By default it is in the home
+    folder, and is removed at the end."""
 
     def map(
         self, function: Callable[[J], R], jobs: Iterable[J], lost: Lost[J, R], probe: Probe | None = None
@@ -56,7 +56,7 @@ class DaskExecutor:
         if not first:
             # Without jobs no cluster is started.
             return
-        # The probe is left after the workers have ended, which may still write files of it.
+        # The probe is left after the workers have ended, because they may still write its files.
         with probe or contextlib.nullcontext(), self.held() as connected:
             yield from connected.map(function, chain(first, queue), lost, probe)
 
@@ -80,7 +80,7 @@ class DaskExecutor:
 
 @dataclass(frozen=True)
 class _ConnectedExecutor(Executor):
-    """Runs jobs on the workers of a cluster that is connected."""
+    """Runs jobs on the workers of a connected cluster."""
 
     client: Any
     target: Any

@@ -1,14 +1,13 @@
-"""The interface of all executors, the one without workers, and the adaptive one.
+"""The interface of all executors, the executor without workers, and the adaptive executor.
 
-The adaptive one runs jobs in this process as long as worker processes would not pay for their start. ``n``
-jobs left of ``t`` seconds each take ``n * t`` seconds here and ``START_S + n * t / w`` seconds on ``w``
-workers. Workers are started if they save more than a margin times their start, or if there are more than
-`MANY` jobs: then a job that ends or blocks its process must not end or block the run. Each job done here
-refines ``t``, and workers that were started stay.
+The adaptive executor runs jobs in this process as long as worker processes would not save time. If ``n`` jobs
+of ``t`` seconds each are left, they take ``n * t`` seconds here and ``START_S + n * t / w`` seconds on ``w``
+workers. Workers are started if they save a multiple of their start time. They are also started for more than
+`MANY` jobs: a job that ends or blocks its process must not end or block the run. Each job done here
+refines ``t``. Workers that were started stay.
 
-All times are CPU times: other programs on the machine delay jobs here and the start of workers alike, so
-that wall times would say nothing about which of both is less. Before jobs were measured, ``t`` is their
-median time in an earlier run.
+All times are CPU times: other programs delay both jobs here and the start of workers, so that wall times
+cannot be compared. Before jobs were measured, ``t`` is their median time in an earlier run.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ START_S = 12.0
 """CPU time per core of the start of workers (s): processes, imports, compiled code. Measured: runs of 48
 tiles took 25 s more with two workers than with none."""
 MARGIN = 1.25
-"""How many times their start workers must save if `ENOUGH` jobs were measured."""
+"""Workers must save this many times their start time if `ENOUGH` jobs were measured."""
 UNSURE_MARGIN = 3.0
-"""The same before: a time of fewer jobs, or of an earlier run, may be wrong by a factor."""
+"""The same before that: a time of fewer jobs, or of an earlier run, may be far off."""
 ENOUGH = 4
 """Number of measured jobs whose mean time is reliable."""
 MANY = 200
@@ -41,7 +40,7 @@ MANY = 200
 
 
 class Probe(Protocol):
-    """Checks that a worker can do the jobs; a context manager of the process that has them.
+    """Checks that a worker can do the jobs; a context manager in the process that has the jobs.
 
     It is pickled for the workers.
     """
@@ -53,7 +52,7 @@ class Probe(Protocol):
     ) -> None: ...
 
     def answer(self, job: Any) -> Any:
-        """Check a worker, in its process and with its first job; return the proof that `accept` takes.
+        """Check a worker, in its process and with its first job; return the proof for `accept`.
 
         Raises
         ------
@@ -95,7 +94,7 @@ class Executor(Protocol):
         ConfigError
             If no worker can do the jobs: no workers, other versions, other files, too little memory.
         ClusterLost
-            If the scheduler is gone, or all workers are gone for too long; results yielded before are valid.
+            If the scheduler is lost, or all workers for too long; results yielded before are valid.
         """
 
     def held(self) -> AbstractContextManager[Executor]:
@@ -121,9 +120,9 @@ class Jobs(Generic[J]):
     source: Iterator[J]
     number: int
     job_s: float | None = None
-    """Median time of such jobs in an earlier run (s), None if there was none."""
+    """Median time of such jobs in an earlier run (s), or None."""
     log: Notify = lambda line: None
-    """Takes each decision, one line."""
+    """Takes each decision as a line."""
 
     def __iter__(self) -> Iterator[J]:
         return self.source
@@ -132,10 +131,9 @@ class Jobs(Generic[J]):
 def estimate(times: Sequence[float], known_s: float | None) -> tuple[float | None, bool]:
     """Return the CPU time of one more job (s), None if unknown, and whether `ENOUGH` jobs were measured.
 
-    - `times`: CPU times (s) of the jobs done in this process, in their order. The first job also loads
-      libraries, so it is not counted. A later one may load what the first did not need, so the longest is not
-      counted either: one job alone never decides.
-    - `known_s`: median time in an earlier run (s), which holds before jobs were measured.
+    - `times`: CPU times (s) of the jobs done in this process, in their order. The first job is left out,
+      because it also loads libraries. The longest is left out, because a later job may load further ones.
+    - `known_s`: median time in an earlier run (s), used before jobs were measured.
     """
     measured = sorted(times[1:])
     if len(measured) < 2:
@@ -150,7 +148,7 @@ def workers_of(asked: int | None) -> int:
 
 
 def workers_pay(number: int, workers: int, job_s: float | None, sure: bool = False) -> bool:
-    """Return whether worker processes are worth their start for jobs of a time (s) from `estimate`."""
+    """Return whether worker processes save time for jobs of a time (s) from `estimate`."""
     if number > MANY or job_s is None:
         return number > MANY
     return number * job_s * (1 - 1 / workers) > (MARGIN if sure else UNSURE_MARGIN) * START_S
@@ -171,7 +169,7 @@ def decision(number: int, workers: int, job_s: float | None, sure: bool = False)
 
 
 class AdaptiveExecutor(Executor):
-    """Runs jobs in this process until workers pay for their start; the rest on workers.
+    """Runs jobs in this process until workers would save time; the other jobs run on workers.
 
     - `workers`: largest number of worker processes; by default one per core.
     """
@@ -184,7 +182,7 @@ class AdaptiveExecutor(Executor):
     def map(
         self, function: Callable[[J], R], jobs: Iterable[J], lost: Lost[J, R], probe: Probe | None = None
     ) -> Generator[R, None, None]:
-        """Yield results: first of the jobs done here, in their order, then of those done by workers."""
+        """Yield results: first of the jobs done here, in their order, then of the jobs done by workers."""
         if not isinstance(jobs, Jobs):
             yield from self.parallel.map(function, jobs, lost, probe)
             return

@@ -1,10 +1,10 @@
 """Jobs in flight on one Dask scheduler.
 
-If a worker dies, all jobs that were assigned to it fail, and the one that caused the death is unknown. All
-of them are quarantined: they run last, one at a time on a worker. A job that exceeds the memory or the time
-of its worker then is lost. If its worker dies again for an unknown reason, that may have come from a job on
-another worker of the same machine, which took its memory: such a job runs once more with no other job at the
-same time, and is lost if its worker dies a third time.
+If a worker dies, all jobs that were assigned to it fail, and it is unknown which job caused the death. All of
+them are quarantined: they run last, one at a time on a worker. A job that then exceeds the memory or the time
+of its worker is lost. If its worker dies again for an unknown reason, another job of the machine may have
+taken its memory. So the job runs once more with no other job at the same time. It is lost if its worker dies
+a third time.
 
 A worker that fails its check is left out: one line says why, and its jobs go to other workers. If no worker
 passes, or workers die for memory before any job was done, the session ends.
@@ -37,10 +37,10 @@ FORGET_KEYS_EVERY = 1000
 TICK_S = 1.0
 """Interval between checks of the scheduler and the workers (s)."""
 LONGEST_STEP_S = 5 * TICK_S
-"""Longest time between two checks that counts as waiting (s): a clock jumps when a machine was suspended."""
+"""Longest time between two checks that is counted as waiting (s): a suspended machine makes clocks jump."""
 DEADLY = 20
-"""Number of workers that die for memory before any job is done, at which the session ends, or twice the
-number of threads if that is more. Fewer may be a few large tiles that happen to come first."""
+"""The session ends when this many workers, or twice the number of threads if that is more, have died for lack
+of memory before any job was done. Fewer deaths may come from a few large tiles at the start."""
 
 
 @dataclass(frozen=True)
@@ -71,15 +71,15 @@ class Session(Generic[J, R]):
     """Name of the `WorkerCheck`; part of the task keys, so that they are unique to this session."""
     function: Callable[[J], R]
     jobs: Iterator[J]
-    """They are taken as there is room."""
+    """The jobs; they are taken one by one when there is room."""
     lost: Callable[[J, str], R]
     worker_lost_timeout_s: float
-    """How long to wait for a worker when there is none (s)."""
+    """How long to wait for a worker when no worker is left (s)."""
     limit_s: float
     """Longest time of a job (s)."""
     notify: Notify
     probe: Probe | None = None
-    """That of the `WorkerCheck`."""
+    """The probe of the `WorkerCheck`."""
     quarantined: deque[J] = field(default_factory=deque)
     """Jobs that were assigned to a worker that died."""
     suspects: deque[J] = field(default_factory=deque)
@@ -116,7 +116,7 @@ class Session(Generic[J, R]):
     def _submit_jobs(self) -> None:
         reserved = {flight.workers[0] for flight in self.in_flight.values() if flight.reserved}
         if not reserved:
-            # Any worker may take a job, so that those that join later get some, unless one is left out.
+            # Any worker may take a job, so that later workers get jobs too, unless a worker is left out.
             allowed = tuple(self.workers) if self.admission.left_out else ()
             while self.returned and self.workers:
                 self._submit(InFlight(self.returned.popleft(), allowed))
@@ -137,7 +137,7 @@ class Session(Generic[J, R]):
         number = next(self.numbers)
         if number % FORGET_KEYS_EVERY == 0:
             key_split.cache_clear()
-        # Numbered: Dask would return the old error for a key that failed. Not pure: a job writes files.
+        # Keys are numbered: Dask would return the old error for a failed key. Jobs write files: not pure.
         future = self.client.submit(
             self.run_task,
             dumps((partial(work, limit_s=self.limit_s), self.function, flight.job)),
@@ -165,14 +165,14 @@ class Session(Generic[J, R]):
         if self.workers and time.monotonic() < self.checked_at + TICK_S:
             return
         if self.client.status != "running":
-            # A request would only time out.
+            # A request would only end with a timeout.
             raise self._cluster_lost()
         try:
             self.workers = self.admission.able(self.client.nthreads())
         except OSError as error:
             raise self._cluster_lost() from error
         now = time.monotonic()
-        # A machine that was stopped for an hour did not wait for an hour.
+        # A machine that was suspended for an hour did not wait for an hour.
         since_last_check = min(now - self.checked_at, LONGEST_STEP_S)
         self.checked_at = now
         self._wait_for_workers(since_last_check)
@@ -196,7 +196,7 @@ class Session(Generic[J, R]):
     def _no_worker(self) -> ClusterLost | ConfigError:
         text = f"no worker was left for {self.worker_lost_timeout_s:g} s"
         for fault in self.admission.left_out.values():
-            # Workers are there: without any result, the run could not start.
+            # There are workers, but no result yet: the run could not start.
             return (ClusterLost if self.done else ConfigError)(f"{text}; {fault}")
         return ClusterLost(text)
 
@@ -227,7 +227,7 @@ class Session(Generic[J, R]):
                 self.workers.pop(address, None)
                 self._return(flight)
             elif proof is not None:
-                # Only the worker itself learns in this way that it is accepted.
+                # The job is sent only to this worker, to tell it that it is accepted.
                 self._submit(replace(flight, workers=(address,), accepted=True, submitted=time.monotonic()))
             else:
                 self.done += 1
@@ -239,7 +239,7 @@ class Session(Generic[J, R]):
             try:
                 return future.result(TICK_S)
             except TimeoutError:
-                # A worker that is there may take long to answer: a library may hold its interpreter.
+                # A live worker may take long to answer, because a library may block its interpreter.
                 if future.status != "finished":
                     raise
 
@@ -295,12 +295,12 @@ class Session(Generic[J, R]):
         return ""
 
     def _used_memory(self) -> dict[str, int]:
-        """Return the memory (bytes) of the workers that died for memory, by address."""
+        """Return the used memory (bytes) of the workers that died for lack of memory, by address."""
         events = self.client.get_events("worker-restart-memory") or ()
         return {event["worker"]: event["rss"] for _, event in events}
 
     def _check_deaths(self, error: KilledWorker) -> None:
-        """Raise an error if no job was done and so many workers died for memory that none will be."""
+        """Raise an error if too many workers died for lack of memory before any job was done."""
         if len(self.died) < max(DEADLY, 2 * sum(self.workers.values())):
             return
         if self.died <= self._used_memory().keys():

@@ -1,4 +1,4 @@
-"""Workers as jobs of SLURM; a job that ends is submitted again: at its walltime, cancelled, with its node."""
+"""Workers as jobs of SLURM. A job that ends (walltime, cancelled, lost node) is submitted again."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ from flexroad.pipeline.execute.start import (
 )
 
 CHECK_S = 15.0
-"""Interval between questions to SLURM about the jobs (s)."""
+"""Interval between requests to SLURM about the jobs (s)."""
 TRIES = 3
-"""Number of jobs that may end one after another, in place of one job, before a worker of theirs connects."""
+"""A job is given up if it and its replacements end this many times before a worker of them connects."""
 NAME = "flexroad"
 """Name of the jobs; the names of the files with their output begin with it."""
 
 
 @dataclass(eq=False)
 class SlurmJobs:
-    """The jobs of a cluster. Those that SLURM no longer has are submitted again.
+    """The jobs of a cluster. Jobs that SLURM no longer has are submitted again.
 
     Dask itself does so only for jobs of one worker (dask-jobqueue#611), and not for jobs that end while they
-    wait. It takes a worker that is away for 15 s for a lost job, also if its nanny is about to replace it.
+    wait. It takes a worker that is missing for 15 s for a lost job, even if its nanny is replacing it.
     """
 
     cluster: Any
@@ -55,11 +55,11 @@ class SlurmJobs:
     """Folder of the output of the jobs, for messages."""
     notify: Notify
     failures: Counter[str] = field(default_factory=Counter)
-    """Number of jobs since one had a worker that connected, by name in Dask."""
+    """Number of ended jobs since a worker last connected, by the job's name in Dask."""
 
     @property
     def given_up(self) -> bool:
-        """Whether no job is left that would be submitted again."""
+        """Whether no job is left to be submitted again."""
         return not self.cluster.worker_spec
 
     def start(self, number: int) -> None:
@@ -76,7 +76,7 @@ class SlurmJobs:
 
     @contextlib.contextmanager
     def watched(self) -> Iterator[None]:
-        """Look for ended jobs meanwhile."""
+        """Look for ended jobs during the block."""
         timer = PeriodicCallback(self.check, CHECK_S * 1000)
         self.cluster.loop.add_callback(timer.start)
         try:
@@ -86,13 +86,13 @@ class SlurmJobs:
 
     async def check(self) -> None:
         """Submit the jobs again that SLURM no longer has."""
-        # Before the question: a job that is submitted meanwhile is not in its answer.
+        # The jobs are listed before the request: its answer does not have jobs that are submitted meanwhile.
         jobs = dict(self.cluster.workers)
         listed = await _listed_jobs()
         if listed is None:
             return
         for worker in self.cluster.scheduler_info["workers"].values():
-            # Of several workers in a job each has its number behind the name of the job.
+            # If a job has several workers, each has its number after the name of the job.
             name = worker["name"]
             self.failures.pop(name if name in self.cluster.worker_spec else name.rpartition("-")[0], None)
         ended = [name for name, job in jobs.items() if job.job_id not in listed]
@@ -178,7 +178,7 @@ def slurm_options(cluster: Cluster, dashboard: bool, folder: Path) -> dict[str, 
 def _shared_folder(logs: Path | None) -> Iterator[Path]:
     """Yield a folder for the output of jobs and certificates, without the output of an earlier run.
 
-    All machines share it: it is ``logs``, or one in the home folder, which is removed at the end.
+    All machines share it: it is ``logs``, or a folder in the home folder that is removed at the end.
     """
     with contextlib.ExitStack() as stack:
         if logs is None:
@@ -206,7 +206,7 @@ def _certificates(cluster: Cluster, folder: Path) -> Iterator[Security | None]:
         yield None
         return
     private = folder / ".certificates"
-    # A killed run has left it.
+    # A killed run may have left the folder.
     shutil.rmtree(private, ignore_errors=True)
     private.mkdir(mode=0o700)
     try:
@@ -221,7 +221,7 @@ def _certificates(cluster: Cluster, folder: Path) -> Iterator[Security | None]:
 
 
 def _job_class(jobqueue: Any) -> Any:
-    """Return the class of a job: Dask asserts at the end that jobs are closed; dask-jobqueue's never are."""
+    """Return a class of jobs that can be closed: Dask requires it at the end, dask-jobqueue never does it."""
 
     class Job(jobqueue.slurm.SLURMJob):  # type: ignore[misc]
         async def close(self) -> None:
@@ -243,5 +243,5 @@ async def _listed_jobs() -> set[str] | None:
 
 
 def _answer(error: RuntimeError) -> str:
-    """Return what sbatch says, of an error of dask-jobqueue."""
+    """Return the message of sbatch in an error of dask-jobqueue."""
     return " ".join(str(error).rpartition("stderr:")[2].split())

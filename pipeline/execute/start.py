@@ -33,25 +33,25 @@ SETTINGS = {
     "distributed.nanny.pre-spawn-environ": OF_WORKERS,
 }
 """Dask settings of all workers. Dask's defaults suit data frames that are kept in workers. A tile leaves
-nothing that could be spilled to disk, and a paused worker would wait forever for its only tile to free
-memory: the worker is terminated at the limit instead. Profiling would cost 2% of a tile's time. The logs of
-scheduler and monitor are shorter than by default: they grew for the first hour of a run. Dask also
-makes workers return every freed array to the system at once (MALLOC_TRIM_THRESHOLD_), which costs 15% of a
-tile's time in page faults: it is left out of their environment."""
+nothing to spill to disk, and a paused worker would wait forever for its only tile to free memory. So the
+worker is ended at the limit. Profiling would cost 2% of a tile's time. The logs of scheduler and monitor are
+shorter than by default: they grew for the first hour of a run. Dask makes workers return every freed array to
+the system at once (MALLOC_TRIM_THRESHOLD_). That costs 15% of a tile's time in page faults, so this variable
+is left out of their environment."""
 SILENT_S = 300.0
 """How long a worker may be silent beyond the time limit of a tile (s)."""
 
 
 def settings(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
     """Return the Dask settings of scheduler and workers."""
-    # A worker is silent while a library holds the interpreter. By default it counts as dead after 5 minutes;
-    # the time limit of a tile ends it if it hangs.
+    # A worker is silent while a library blocks the interpreter. By default Dask takes it for dead after
+    # 5 minutes. If it hangs, the time limit of a tile ends it.
     values = SETTINGS | {"distributed.scheduler.worker-ttl": f"{cluster.tile_timeout_s + SILENT_S:.0f} s"}
     if cluster.kind == "local":
-        # A worker that died is started again here. Dask looks for it 15 s after each death, by default, and
-        # gives it up for ever if it has died a second time and is just being started.
+        # A dead worker is started again on this machine. By default Dask looks for it 15 s after each death,
+        # and gives it up if it has died a second time and is just being started.
         values["distributed.deploy.lost-worker-timeout"] = "1000 d"
-    # Web pages ask for no certificate.
+    # Web pages are turned off, because they need no certificate.
     values["distributed.worker.http.routes"] = []
     if not dashboard:
         values["distributed.scheduler.http.routes"] = []
@@ -59,7 +59,7 @@ def settings(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
 
 
 def web_address(dashboard: bool) -> str:
-    """Return the address of the scheduler's web pages: on this machine only, as they ask for no password."""
+    """Return the address of the scheduler's web pages: on this machine only, as they need no password."""
     return f"127.0.0.1:{8787 if dashboard else 0}"
 
 
@@ -78,7 +78,7 @@ def certificates(cluster: Cluster) -> Any:
 def available_bytes(mount: Path = MOUNT, own: Path = OWN) -> int:
     """Return the memory that this process and its workers may use together.
 
-    Dask's number is that of the machine, the container and the limits of the process. It does not have the
+    Dask knows the memory of the machine, the container and the limits of the process. It does not know the
     limits of a systemd unit or of a SLURM job (`group_limits`, with the same parameters).
     """
     return min([int(MEMORY_LIMIT), *group_limits(mount, own)])
@@ -100,14 +100,14 @@ def load_jobqueue() -> Any:
 
 @contextlib.contextmanager
 def opened(make: Callable[[], T]) -> Iterator[T]:
-    """Construct a Dask cluster or client; close it at the end, also if an interrupt comes while it starts.
+    """Construct a Dask cluster or client; close it at the end, even if an interrupt comes while it starts.
 
-    Dask could not close an object whose constructor was interrupted: it is called in a thread. That thread,
-    all threads that Dask starts, and so their processes get no SIGINT and no SIGHUP. A terminal sends both to
-    all processes of a command: this one ends the others, which would only print tracebacks.
+    Dask could not close an object whose constructor was interrupted, so a thread calls it. This thread, all
+    threads that Dask starts, and their processes get no SIGINT and no SIGHUP. A terminal sends both to all
+    processes of a command. This process ends the others, which would only print tracebacks.
     """
     with ThreadPoolExecutor(1, initializer=_block_signals) as pool, contextlib.ExitStack() as stack:
-        # Dask sets the variables of workers in this process, too, and a caller may start others afterwards.
+        # Dask also sets the variables of workers in this process; later processes must not inherit them.
         stack.callback(_restore, {name: os.environ.get(name) for name in OF_WORKERS})
         made = pool.submit(make)
         stack.callback(_close, made)
@@ -123,9 +123,9 @@ def _restore(variables: Mapping[str, str | None]) -> None:
 
 
 def _block_signals() -> None:
-    # A process, too, which Dask would start before it sets the environment.
+    # Dask would start the resource tracker before it sets this environment.
     os.environ.update(OF_WORKERS)
-    # Its start would allow the signals again.
+    # The tracker is started now, because its start would allow the signals again.
     resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
 
@@ -136,7 +136,7 @@ def _close(made: Future[Any]) -> None:
 
 
 def start_workers(opened: Any, number: int) -> None:
-    """Start the missing ones of a number of workers of a Dask `SpecCluster`, or its jobs.
+    """Start the missing workers, or jobs, of a Dask `SpecCluster` with a number of workers.
 
     Unlike ``scale`` it returns when they are started, and raises the error of a start.
     """
@@ -146,5 +146,5 @@ def start_workers(opened: Any, number: int) -> None:
 
 
 async def _started(opened: Any) -> None:
-    # An interrupt cancels the wait alone: Dask could not close a cluster whose start was cancelled.
+    # An interrupt cancels only the wait: Dask could not close a cluster whose start was cancelled.
     await asyncio.shield(opened._correct_state())

@@ -1,6 +1,6 @@
 """Workers of a Dask cluster: their setup, their check before the first tile, and which of them may do jobs.
 
-What is sent to the scheduler is pickled by value, so that the scheduler needs no flexroad.
+Objects for the scheduler are pickled by value, so that the scheduler needs no flexroad.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.executor import J, Probe, R
 
 PICKLING = ("python", "dask", "distributed", "cloudpickle")
-"""Packages whose versions must be equal for processes to exchange objects; also on the scheduler."""
+"""Packages whose versions must be equal on client, workers and scheduler, to exchange objects."""
 RESULTS = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "torch")
-"""Packages whose versions must be equal for tiles to have equal results."""
+"""Packages whose versions must be equal on all workers, for equal results."""
 CODE = "the code of flexroad"
 """Name of the checksum of the installed program among the versions."""
 INSTALLED = Path(str(files("flexroad")))
@@ -52,7 +52,7 @@ class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
 
     def __init__(self, versions: Mapping[str, str], probe: Probe | None = None) -> None:
         self.versions = dict(versions)
-        # Pickled, so that a worker with another program says so before it looks for the class of the probe.
+        # The probe is pickled, so that a worker with another program reports that before it needs its class.
         self.probe = dumps(probe)
 
     def setup(self, worker: Any) -> None:
@@ -68,7 +68,7 @@ class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
         - `packed`: the pickled call of `work`.
         - `accepted`: whether the client has accepted the proof of this worker.
         - `fault`: why the worker cannot do the jobs, empty if it can.
-        - `proof`: what the client has to accept before the worker does a job, None if it may do jobs.
+        - `proof`: the proof that the client must accept before the worker does a job, None if it may do jobs.
         """
         with self._lock:
             self._accepted = self._accepted or accepted
@@ -135,7 +135,7 @@ def pin_threads() -> None:
 def versions() -> dict[str, str]:
     """Return versions of Python and of the packages in `PICKLING` and `RESULTS`, and `checksum_of_code`.
 
-    That of a package that is not installed is "missing".
+    The version of a package that is not installed is "missing".
     """
     installed = {"python": platform.python_version(), CODE: checksum_of_code()}
     for package in (*PICKLING[1:], *RESULTS):
@@ -150,7 +150,7 @@ def versions() -> dict[str, str]:
 def checksum_of_code(root: Path = INSTALLED) -> str:
     """Return 12 hexadecimal digits of the SHA-256 of names and contents of flexroad's Python files.
 
-    It is the same for a wheel and for the checkout that the wheel was made of.
+    It is the same for a wheel and for the checkout from which the wheel was made.
     """
     # The folders of a checkout are links.
     folders = os.walk(root, followlinks=True)
@@ -164,9 +164,9 @@ def checksum_of_code(root: Path = INSTALLED) -> str:
 
 
 def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str:
-    """Return a text with the versions that differ; empty if none do.
+    """Return a text with the versions that differ; empty if all are equal.
 
-    Of Python only major and minor version are compared; a local label (``+cpu``) is ignored.
+    For Python only major and minor version are compared; a local label (``+cpu``) is ignored.
     """
     different = [name for name in there if _comparable(name, there[name]) != _comparable(name, here[name])]
     return ", ".join(f"{name} is {there[name]} there and {here[name]} here" for name in different)
@@ -178,7 +178,7 @@ def _comparable(name: str, version: str) -> str:
 
 @dataclass
 class Admission:
-    """Accepts the proofs of workers, and tells which workers are left out."""
+    """Accepts the proofs of workers, and reports which workers are left out."""
 
     probe: Probe | None
     """The probe of the `WorkerCheck`."""
@@ -191,8 +191,8 @@ class Admission:
     """Host and reason of the workers left out: one line for all workers of a host."""
 
     def able(self, present: Mapping[str, int]) -> dict[str, int]:
-        """Return those of the workers that are present, by address, that are not left out."""
-        # The address of a worker that has ended may be that of another one later.
+        """Return the present workers, by address, without the workers that are left out."""
+        # A new worker may get the address of a worker that has ended.
         self._accepted = {address: proof for address, proof in self._accepted.items() if address in present}
         self.left_out = {address: line for address, line in self.left_out.items() if address in present}
         return {address: n for address, n in present.items() if address not in self.left_out}
@@ -200,7 +200,7 @@ class Admission:
     def accepts(self, address: str, host: str, fault: str, proof: Any) -> bool:
         """Return whether a worker may do jobs, by what `WorkerCheck.admit` returned; else leave it out."""
         if address in self.left_out:
-            # Its other jobs bring the same fault or proof.
+            # Other jobs of this worker bring the same fault or proof.
             return False
         if self.probe and proof is not None and self._accepted.get(address) != proof:
             try:
@@ -217,7 +217,7 @@ class Admission:
 
 
 def check_workers(client: Client, cluster: str, probe: Probe | None) -> str:
-    """Compare versions that pickling needs, register plugins; return the name of the `WorkerCheck`."""
+    """Compare versions for pickling, and register plugins; return the name of the `WorkerCheck`."""
     here = versions()
     name = uuid.uuid4().hex[:8]
     try:
@@ -250,7 +250,7 @@ def _register(client: Client, plugin: Any, name: str) -> None:
 
 
 def _compare(client: Client, here: dict[str, str]) -> None:
-    """Compare the versions that Dask reports: with very different ones no plugin could be unpickled."""
+    """Compare the versions that Dask reports: with very different versions no plugin could be unpickled."""
     here = {name: here[name] for name in PICKLING}
     reported = client.get_versions(packages=list(PICKLING[1:]))
     _compare_process("the scheduler", reported["scheduler"], here)
@@ -270,9 +270,8 @@ def task_function() -> Callable[[bytes, str, bool], tuple[str, str, str, Any, An
     """Return the function of every task: it unpickles a call and runs it if the worker passed its check.
 
     Its arguments are the pickled call, the name of the `WorkerCheck` and whether the client has accepted the
-    worker. It returns address and host of the worker, what `WorkerCheck.admit` returns, and the result, None
-    if the call did not run. A scheduler unpickles the tasks that it receives; a call that is already pickled
-    stays bytes there.
+    worker. It returns address and host of the worker, the result of `WorkerCheck.admit`, and the result of
+    the call, or None. A scheduler unpickles the tasks that it receives; a pickled call stays bytes there.
     """
 
     def run_task(packed: bytes, check: str, accepted: bool) -> tuple[str, str, str, Any, Any]:
@@ -295,7 +294,7 @@ def retry_blocker(client_id: str, check: str) -> SchedulerPlugin:
     """Return a scheduler plugin that fails a client's tasks at the first death of their worker.
 
     By default a scheduler retries such tasks on other workers (setting
-    ``distributed.scheduler.allowed-failures``), so that a tile that kills its worker would kill others, too.
+    ``distributed.scheduler.allowed-failures``): a tile that kills its worker would kill other workers, too.
     Tasks of other clients are not affected. When the client disconnects or is killed, the plugins are
     removed.
     """
@@ -304,7 +303,7 @@ def retry_blocker(client_id: str, check: str) -> SchedulerPlugin:
         def update_graph(self, scheduler: Any, *, client: str, tasks: list[Any], **_: Any) -> None:
             if client == client_id:
                 for key in tasks:
-                    # With this count one more death of a worker fails the task.
+                    # With this number one more death of a worker fails the task.
                     scheduler.tasks[key].suspicious = scheduler.allowed_failures
 
         def remove_client(self, scheduler: Any, client: str) -> None:

@@ -1,7 +1,7 @@
 """Corners and edges of tiles as nodes of the graph; `tasks.border` computes them.
 
-The fingerprint of such a node follows from its position, the options of its stages and the files that reach
-the ground around it, and not from a tile: neighbouring tiles have the same node, and the first one stores its
+The fingerprint of such a node depends on its position, the options of its stages and the files that reach the
+ground around it. So neighbouring tiles have the same node, and the first tile stores its
 result.
 """
 
@@ -33,21 +33,21 @@ from flexroad.tasks.spline.space import check_spacing
 STAGE = "border"
 """Name of the nodes in the store, the log and the table of failures."""
 KEPT = 4096
-"""Corners and edges that are kept because the tiles of the next row have them, too: of a thousand tiles."""
+"""Number of corners and edges that are kept for the tiles of the next row: enough for a thousand tiles."""
 
 
 def has_borders(fit: Options) -> bool:
-    """Return whether a method of the fit shares the border of a tile with its neighbours."""
+    """Return whether a fit method computes the border of a tile together with its neighbours."""
     return hasattr(stage_module(fit), "edge")
 
 
 @dataclass(frozen=True)
 class BorderPattern:
-    """The part of the nodes of corners and edges that is the same for all tiles of a run, computed once."""
+    """The part of border nodes that is the same for all tiles of a run, computed once."""
 
     stages: BorderStages
     head: str
-    """Stages, their `VERSION` and options as JSON, the part of the hashed text that all share."""
+    """Stages, their `VERSION` and options as JSON: the part of the hashed text that all nodes share."""
     reach_m: float
     """`BorderStages.reach_m`."""
     reads: frozenset[str]
@@ -57,7 +57,7 @@ class BorderPattern:
 
     @classmethod
     def of(cls, chain: Chain) -> BorderPattern:
-        """Return that of a variant."""
+        """Return the pattern of a variant."""
         stages = BorderStages.of(chain)
         heads = [stage_head(stage, options) for stage, options in stages.by_name.items()]
         head = to_json([STAGE, stage_module(stages.load).VERSION, stages.heights, heads])[1:-1]
@@ -79,7 +79,7 @@ class BorderPattern:
             yield BorderTask(border, self.stages), place, files_around(layers, bounds, reach)
 
 
-# The text of a position tells -0.0 from 0.0, and the types of the sizes count: they do in fingerprints.
+# Fingerprints distinguish -0.0 from 0.0 and int from float, so the cache does, too: `start` is a text.
 @lru_cache(maxsize=KEPT, typed=True)
 def _described(
     kind: Kind, start: str, tile: tuple[int, int], crs: str, cell: float, reach_m: float
@@ -91,7 +91,7 @@ def _described(
 
 
 def check_tiles(config: Config, catalog: Catalog) -> None:
-    """Check that tiles which meet can have one surface, if a fit joins them."""
+    """Check that adjacent tiles can have a common surface, if a fit joins them."""
     joined = [chain["fit"] for chain in config.chains.values() if has_borders(chain["fit"])]
     tiles = catalog.usable
     if not joined or not tiles:
@@ -121,7 +121,7 @@ def check_tiles(config: Config, catalog: Catalog) -> None:
 def _check_acting(fits: Sequence[Options], tile_m: float) -> None:
     for fit in fits:
         module: Any = stage_module(fit)
-        # The points of small tiles are closer to each other than the options say.
+        # A small tile has a smaller distance of control points than the option.
         acting_m = min(module.acting_m(fit), tile_m)
         if acting_m > REACH_M:
             raise ConfigError(
@@ -131,7 +131,7 @@ def _check_acting(fits: Sequence[Options], tile_m: float) -> None:
 
 
 def _lattice(grid: Grid) -> tuple[object, ...]:
-    """Return what tiles with a common surface have in common: cell, size and position on the lattice."""
+    """Return cell, size and position on the lattice: they are equal for tiles with a common surface."""
     width, height = grid.width * grid.cell, grid.height * grid.cell
     return (
         grid.crs,

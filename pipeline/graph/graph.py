@@ -8,14 +8,14 @@ In addition, `assess` rates the fitted surface without ground truth; it is not p
 
 A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``; the method is one of
 the options. Module names are not part of it, so stores stay valid when files move. A stage that lists a
-source layer in its module's `READS` also hashes the layer's files as (path relative to the catalog, size,
-mtime), or by their bytes; files that only the options name, such as a model (the module's `files`), are
-hashed by their bytes. Of the rasters that `load` reads, only the files that reach the tile or its halo count.
-Variants with equal options up to a stage share its node, so it is computed once; a
-node whose artefact is in the store is not computed.
+source layer in its module's `READS` also hashes the layer's files: (path relative to the catalog, size,
+mtime), or their bytes. Files that only the options name, such as a model (the module's `files`), are
+hashed by their bytes. Rasters that `load` reads are hashed only if they reach the tile or its halo. Variants
+with equal options up to a stage share its node, so it is computed once. A node whose artefact is in the store
+is not computed.
 
-A result that was computed without a file that could not be used has another name, and so have the results
-that follow from it (`TileGraph.renamed`): they are used again only while the file cannot be used.
+If a result was computed without an unusable file, it gets another name, and so do the results computed from
+it (`TileGraph.renamed`). They are used again only while the file cannot be used.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from flexroad.tasks.products import cog, glb, npz, ply
 ITEM_VERSION = 3
 """Raised when the STAC item of a tile changes for the same result."""
 PHOTO = "texture"
-"""Start of the names of the options of the photo on the mesh."""
+"""Start of the names of the options for the photo on the mesh."""
 FORMATS = {"glb": glb, "ply": ply, "cog": cog, "npz": npz}
 
 
@@ -60,15 +60,15 @@ class Node:
     stage: str
     options: Options
     inputs: tuple[str, ...]
-    """Fingerprints of the nodes whose results it takes."""
+    """Fingerprints of the nodes whose results it uses."""
     stored: bool
     """Whether its result is stored; false for `load`, for rasters and for meshes that are not exported."""
     frame: tuple[str, ...] = ()
-    """Fingerprints of the corners and edges that it takes as well, in the order of `Frame`'s fields."""
+    """Fingerprints of the corners and edges that it also uses, in the order of `Frame`'s fields."""
     border: BorderTask | None = None
-    """Its computation if it is a corner or edge; ``options`` are then those of the fit."""
+    """Its computation if it is a corner or edge; ``options`` are then the options of the fit."""
     refit: Options | None = None
-    """The options of the fit if `assess` withholds a part of the road from a second one."""
+    """The options of the fit if `assess` makes a second fit without a part of the road."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class TileGraph:
     """The graph of one tile: the union of its variants' chains."""
 
     tile: Tile
-    """The tile with only those files of its rasters that reach it or its halo (`Tile.within`)."""
+    """The tile with only the raster files that reach it or its halo (`Tile.within`)."""
     around: Tile
     """The tile of the catalog, with all its files: for the ground along its border."""
     nodes: dict[str, Node]
@@ -87,14 +87,14 @@ class TileGraph:
     sources: list[Any]
     """The source layers as hashed in the fingerprints: name, files, values and CRS of each."""
     file_stats: dict[str, FileStat | None]
-    """Size and version of each file when the graph was made, by path; None if the file was missing, or was to
-    be hashed and could not be read."""
+    """Size and version of each file when the graph was made, by path. None if the file was missing, or could
+    not be read to be hashed."""
     fingerprint: str
     """Fingerprint of all requested results; the tile is done when its item has this fingerprint."""
 
     @property
     def reads(self) -> frozenset[str]:
-        """Names of the source layers that its stages and its products are made of."""
+        """Names of the source layers from which its stages and its products are made."""
         return self._stage_reads.union(product_layers(self.export))
 
     @property
@@ -103,14 +103,14 @@ class TileGraph:
 
     @property
     def readable(self) -> Tile:
-        """The tile with only the layers that its stages read: those of other layers may lie anywhere."""
+        """The tile with only the layers that its stages read: files of other layers need no permission."""
         reads = self._stage_reads
         return replace(self.tile, layers=tuple(layer for layer in self.tile.layers if layer.name in reads))
 
     def renamed(self, names: Mapping[str, str]) -> TileGraph:
-        """Return the graph of results of which some were computed without a file that could not be used.
+        """Return the graph with the names of results that were computed without an unusable file.
 
-        - `names`: the names of these results, by fingerprint here (`Evaluator.renamed`).
+        - `names`: the new names by fingerprint (`Evaluator.renamed`).
         """
         if not names:
             return self
@@ -158,16 +158,16 @@ class Step:
     head: str
     """Stage, `VERSION` and options as JSON, the part of the hashed text that all tiles share."""
     inputs: tuple[int, ...]
-    """Indices of the steps whose results it takes."""
+    """Indices of the steps whose results it uses."""
     reads: tuple[str, ...]
     """Names of the source layers that it reads."""
     files: tuple[Path, ...]
     """Files named by its options, such as a model."""
     stored: bool
     borders: BorderPattern | None = None
-    """The stages of the border that it takes, None if it takes none."""
+    """The stages of the border nodes that it uses, or None."""
     framed: int | None = None
-    """Index of the step whose frame it takes, None if it takes none."""
+    """Index of the step whose frame it uses, or None."""
     refit: Options | None = None
     """See `Node.refit`."""
 
@@ -203,7 +203,7 @@ class Pattern:
             variants[variant] = by_stage
         options = config.export.model_dump(mode="json")
         if not config.export.texture:
-            # Without a texture, products do not depend on its options.
+            # Without a texture, products do not depend on the texture's options.
             options = {name: value for name, value in options.items() if not name.startswith(PHOTO)}
         versions = {"item": ITEM_VERSION} | {name: FORMATS[name].VERSION for name in config.export.formats}
         exported = to_json([options, versions])
@@ -212,7 +212,7 @@ class Pattern:
 
     @cached_property
     def reads(self) -> frozenset[str]:
-        """Names of the source layers that any stage reads; files of other layers are not even looked up."""
+        """Names of the source layers that any stage reads; files of other layers are not looked up."""
         return frozenset(layer for step in self.steps for layer in step.reads)
 
     def graph(
@@ -268,7 +268,7 @@ class Pattern:
 
 
 def product_layers(export: Export) -> tuple[str, ...]:
-    """Return the names of the source layers that the products are made of."""
+    """Return the names of the source layers from which the products are made."""
     return ("dop",) if export.texture else ()
 
 
@@ -280,7 +280,7 @@ def _step(stage: str, chain: Chain, inputs: tuple[int, ...], keep_mesh: bool) ->
     head = to_json(stage_head(stage, options))[1:-1]
     shared = has_borders(chain["fit"])
     borders = BorderPattern.of(chain) if shared and stage == "fit" else None
-    # A second fit and the mesh of a tile take the frame of its surface.
+    # A second fit and the mesh of a tile use the frame of its surface.
     refit = chain["fit"] if getattr(options, "holdout", 0) else None
     framed = inputs[STAGES[stage].index("fit")] if shared and (refit or stage == "sample") else None
     return Step(stage, options, head, inputs, reads, model_files(options), stored, borders, framed, refit)
@@ -293,7 +293,7 @@ def _border_nodes(tile: Tile, step: Step, sources: SourceFiles, grid: str) -> li
     models = sources.models(pattern.files)
     for number, (task, place, layers) in enumerate(pattern.parts(tile)):
         ends = tuple(nodes[end].fingerprint for end in ENDS[number - 4]) if number >= 4 else ()
-        # Files of unknown position may have none of their own: it is then that of the tile.
+        # Without extents a border cannot tell which files it needs: the node then also depends on the tile.
         core = "null" if all(layer.extents for layer, _ in layers) else grid
         text = ",".join([sources.text(layer, numbers) for layer, numbers in layers])
         name = hashed(f"[{pattern.head},{place},{core}],{names_json(ends)},[{text}],{models}]")
@@ -302,7 +302,7 @@ def _border_nodes(tile: Tile, step: Step, sources: SourceFiles, grid: str) -> li
 
 
 def files_read(graph: TileGraph, node: Node) -> list[Location]:
-    """Return the files that a stage reads: those of its source layers and those named by its options."""
+    """Return the files that a stage reads: files of its source layers and files named by its options."""
     if node.border:
         ground = node.border.ground(graph.around)
         options = node.border.stages.by_name.values()

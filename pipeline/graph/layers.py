@@ -1,4 +1,4 @@
-"""The layers that a configuration needs, and those that the tiles of a catalog have."""
+"""The layers that a configuration needs, and the layers that the tiles of a catalog have."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flexroad.pipeline.graph.graph import product_layers
 from flexroad.tasks.options import stage_module
 
 PRODUCTION = {"road_mask": "production", "roads": "production_vector"}
-"""Layer of roads -> the shipped configuration that takes the roads from it, the preferred one first."""
+"""Layer of roads -> the shipped configuration that reads the roads from it; the preferred first."""
 METHODS = {"road_mask": "mask", "roads": "vector"}
 """Layer of roads -> the segmentation method that reads it."""
 TITLES = {"road_mask": "a road mask", "roads": "vector roads", "dop": "an orthophoto"}
@@ -69,7 +69,7 @@ def check_layers(config: Config, catalog: Catalog) -> None:
 
 
 def fitting_config(catalog: Catalog) -> str:
-    """Return the shipped configuration for production that takes the roads from a catalog's own layer."""
+    """Return the shipped production configuration that reads the roads from a layer of the catalog."""
     counts = {layer: sum(tile.layer(layer) is not None for tile in catalog.usable) for layer in PRODUCTION}
     return PRODUCTION[max(counts, key=counts.__getitem__)]
 

@@ -28,7 +28,7 @@ Entry = list[Any]
 """Name of a layer, its files (`File`), values, CRS and, if it has one, its conversion."""
 
 JOINED = ',["joined"]]'
-"""End of the description of several rasters: they are resampled together, and were not in earlier versions.
+"""End of the description of several rasters: they are resampled together, unlike in earlier versions.
 Fingerprints of single files stay valid."""
 
 to_json = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
@@ -41,7 +41,7 @@ def hashed(text: str) -> str:
 
 
 def names_json(fingerprints: Iterable[str]) -> str:
-    """Return fingerprints as JSON: they need no escapes."""
+    """Return fingerprints as JSON; they need no escapes."""
     return "[" + ",".join([f'"{name}"' for name in fingerprints]) + "]"
 
 
@@ -71,7 +71,7 @@ class SourceFiles:
     recorded: Recorded = ()
     """Entries of an earlier graph, used for files that no longer exist."""
     stats: dict[str, FileStat | None] = field(default_factory=dict)
-    """Size and version of each file, by path; None if it was missing, or could not be read to be hashed."""
+    """Size and version of each file, by path; None if it is missing, or cannot be read to be hashed."""
     files: dict[tuple[str, str], File] = field(default_factory=dict)
     """Hashed description of each file, by layer and name."""
     texts: dict[tuple[str, str], str] = field(default_factory=dict)
@@ -120,7 +120,7 @@ class SourceFiles:
         return file if file[1] is not None else self._recorded.get((layer, name), file)
 
     def _checksum(self, path: Location, found: FileStat | None) -> str | None:
-        """Return the SHA-256 of a file, None if it is missing or cannot be read; both count as missing."""
+        """Return the SHA-256 of a file, None if it cannot be read: it is then taken as missing."""
         checksum = _checksum(path, found)
         self.stats[str(path)] = found if checksum else None
         return checksum
@@ -136,7 +136,7 @@ def _entry(layer: Layer, files: list[File]) -> Entry:
 
 def _about(layer: Layer) -> list[Any]:
     """Return the part of an entry that does not depend on the files."""
-    # Only where they are set, so that older fingerprints stay valid.
+    # Fields are added only where they are set, so that older fingerprints stay valid.
     how = [["reproject", layer.reproject, layer.height_unit]] if layer.reproject or layer.height_unit else []
     how += [["sublayer", layer.sublayer]] if layer.sublayer else []
     return [list(layer.values), layer.crs, *how]
@@ -154,10 +154,10 @@ def _checksum(path: Location, file: FileStat | None) -> str | None:
 
 @lru_cache(maxsize=65536)
 def _sha256(path: Location, size: int, version: int | str) -> str:
-    """Return the SHA-256 of a file, or of those of its parts; cached by path, size and version."""
+    """Return the SHA-256 of a file, or of its parts' SHA-256; cached by path, size and version."""
     if not isinstance(path, Path):
         return hashlib.sha256(read(path)).hexdigest()
-    # The version of a source of one file is a number.
+    # The version of a source is a number if it has only one file.
     parts = [path] if isinstance(version, int) else files_of(path)
     sums = []
     for part in parts:

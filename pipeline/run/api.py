@@ -50,8 +50,8 @@ class Workers:
     """Where tiles are processed."""
 
     executor: str = "auto"
-    """auto: worker processes if they pay; serial: this process; dask: workers; else the address of a running
-    Dask scheduler, whose workers are used."""
+    """auto: worker processes if they save time; serial: this process; dask: workers. Another value is the
+    address of a running Dask scheduler, whose workers are used."""
     number: int | None = None
     """Most worker processes; None: as the configuration says."""
     dashboard: bool = False
@@ -60,7 +60,7 @@ class Workers:
 
 @dataclass(frozen=True)
 class Selection:
-    """The tiles of a catalog that a run takes; all if nothing is given."""
+    """The tiles of a catalog that belong to a run; by default all."""
 
     tiles: Sequence[str] = ()
     bbox: Bounds | None = None
@@ -71,7 +71,7 @@ class Selection:
     ) -> tuple[Catalog, Catalog]:
         """Read a catalog and select tiles for the run at ``path``.
 
-        - `run`: the tiles of the run, also those of earlier partial runs.
+        - `run`: the tiles of the run, also tiles of earlier partial runs.
         - `selected`: the tiles to bring up to date.
         """
         whole = Catalog.read(catalog, allow)
@@ -82,7 +82,7 @@ class Selection:
         some = self.tiles or self.bbox is not None or self.area
         taken, record = whole, path / "catalog.parquet"
         if some:
-            # Earlier tiles of the run that are still in the catalog stay: their results stay in the tables.
+            # Earlier tiles of the run stay if they are in the catalog: their results stay in the tables.
             earlier = {tile.id for tile in Catalog.read(record).tiles} if exists(record) else set()
             ids = earlier | {tile.id for tile in selected.tiles}
             taken = replace(whole, tiles=tuple(tile for tile in whole.tiles if tile.id in ids))
@@ -91,7 +91,7 @@ class Selection:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run that this process may write, until the block that gave it ends."""
+    """A run that this process may write until the end of the ``with`` block."""
 
     run: Run
     only: Callable[[Tile], bool]
@@ -182,7 +182,7 @@ def process(prepared: Prepared, verify: bool = False) -> Summary:
 
 
 def stages_from(stage: str | None) -> frozenset[str]:
-    """Return a stage and all later ones; none if it is None."""
+    """Return a stage and all later stages; empty without a stage."""
     steps = (*STAGE_NAMES, "export")
     force = frozenset(steps[steps.index(stage) :]) if stage else frozenset()
     # The control points of a border are part of the fit.
@@ -190,9 +190,9 @@ def stages_from(stage: str | None) -> frozenset[str]:
 
 
 def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile], bool]:
-    """Return a filter for the tiles of a rerun: the given tiles, the failed ones, both, or all.
+    """Return a filter for the tiles of a rerun: the given tiles, the failed tiles, both, or all.
 
-    With the failed ones go the tiles that were made without a file.
+    Tiles that were computed without an unusable file are taken as failed.
     """
     files_of = tile_files(run.path)
     ids = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
@@ -205,16 +205,16 @@ def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile
     def selected(tile: Tile) -> bool:
         if tile.id in ids or not (ids or failed):
             return True
-        # The marker is enough, even if it is of other sources: a corrected file is a reason to rerun.
+        # A marker for earlier sources is enough: a corrected file is a reason to rerun.
         return tile.id in without_file or (failed and FAILED in files_of(tile.id))
 
     return selected
 
 
 def _with_lost(path: Location, whole: Catalog) -> tuple[Skipped, ...]:
-    """Return what a catalog skipped, with the tiles of the run at ``path`` that are missing without it.
+    """Return the skipped files of a catalog, with the tiles that the run at ``path`` loses by them.
 
-    Tiles that an earlier execution lost with a file stay lost until the file is no longer skipped.
+    Tiles that an earlier execution lost stay lost until their file is no longer skipped.
     """
     record = path / "catalog.parquet"
     if not whole.skipped or not exists(record):
@@ -235,8 +235,8 @@ def _with_lost(path: Location, whole: Catalog) -> tuple[Skipped, ...]:
 def with_workers(run: Run, settings: Sequence[str]) -> Run:
     """Return a run with options of its workers replaced for one command.
 
-    Those of RUN/config.yaml that can start programs (`Cluster.programs`) count only if they are sealed: the
-    run may come from anyone.
+    Options of RUN/config.yaml that can start programs (`Cluster.programs`) are used only if they are sealed:
+    the run may come from anyone.
     """
     changes = [parsed(text) for text in settings]
     for keys, _ in changes:
@@ -262,11 +262,11 @@ def with_workers(run: Run, settings: Sequence[str]) -> Run:
 
 @contextlib.contextmanager
 def _locked(path: Location, observer: Observer, create: bool = False) -> Iterator[bool]:
-    """Hold the lock of a run folder; with ``create`` a missing one is made, and removed if it stays empty.
+    """Hold the lock of a run folder; ``create`` makes a missing folder, and removes it if it stays empty.
 
     A folder with other files is then refused, before anything is written.
 
-    Yields whether the process that held the lock before has died: one of the tiles may have ended it.
+    Yields whether the process that held the lock before has died: a tile may have ended it.
     """
     taken_over: list[str] = []
 

@@ -1,7 +1,7 @@
 """``flexroad clean``: find and delete files that are no longer needed; files of other programs are kept.
 
-Needed are: artefacts in the current graph of any run of the store; tiles in the run's catalog, or lost with
-a file that it skipped; products in the tiles' items or in the export options.
+Needed files are: artefacts in the current graph of any run of the store; tiles in the run's catalog, or lost
+with a skipped file; products in the tiles' items or in the export options.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def exclusive(
 def find_garbage(runs: Sequence[Run]) -> Iterator[Garbage]:
     """Yield the unneeded files of a store and of the first run's folder; ``runs``: all runs of the store."""
     first = runs[0]
-    # Before the needed ones are known: other commands may write to the store meanwhile, and that stays.
+    # Files are listed before the needed files are known: files that other commands write meanwhile stay.
     unneeded = {name for name, _ in _in_store(first.store)}
     unneeded -= _needed(runs)
     yield from (garbage for name, garbage in _in_store(first.store) if name in unneeded)
@@ -149,7 +149,7 @@ def _in_tiles(run: Run) -> Iterator[Garbage]:
             products = [folder.name + end for end in sorted(ever) if folder.name + end in files]
             tile = tiles.get(folder.name)
             if folder.name in lost:
-                # Its results are the last ones until its file is repaired.
+                # The tile keeps its last results until its file is repaired.
                 continue
             if tile is None:
                 # Markers come last, so that an interrupted deletion is continued by the next clean.
@@ -176,7 +176,7 @@ def _temporary(folder: Location, files: dict[str, int]) -> Iterator[Garbage]:
 def _folders(parent: Location) -> Iterator[tuple[Location, dict[str, int]]]:
     """Yield the folders directly below ``parent`` with the sizes of their files (bytes) by name.
 
-    Links are not followed: what they lead to need not be of the run.
+    Links are not followed: they may lead to files that do not belong to the run.
     """
     if isinstance(parent, Path):
         for path in sorted(parent.iterdir()) if parent.is_dir() and not parent.is_symlink() else []:
@@ -184,7 +184,7 @@ def _folders(parent: Location) -> Iterator[tuple[Location, dict[str, int]]]:
                 yield path, {file: stat.size for file, stat in listing(path).items()}
         return
     parts = ((name.partition("/"), file.size) for name, file in entries(parent))
-    # The files of a folder follow each other.
+    # The listing has the files of a folder one after the other.
     for folder, files in groupby(parts, key=lambda part: part[0][0]):
         below = {name: size for (_, slash, name), size in files if slash}
         if below:

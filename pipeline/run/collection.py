@@ -1,8 +1,8 @@
-"""What describes all tiles of a run at once, for other programs.
+"""Files that describe all tiles of a run, for other programs.
 
-``RUN/collection.json`` is a STAC collection, the way to the items of the done tiles. ``RUN/height.vrt`` and
-the like are their rasters as one, in GDAL's format for this: its own builder is not in rasterio, and the file
-is written as a stream, because a state has hundreds of thousands of tiles. ``RUN/tiles.geojson`` is a map of
+``RUN/collection.json`` is a STAC collection that links the items of the done tiles. ``RUN/height.vrt`` and
+the other mosaics join the rasters of the tiles, in GDAL's format VRT. They are written as a stream, because a
+state has hundreds of thousands of tiles; rasterio has no writer for them. ``RUN/tiles.geojson`` is a map of
 the state of every tile.
 """
 
@@ -55,7 +55,7 @@ METRICS = {
     "roles": ["metadata"],
 }
 VRT = "application/xml"
-"""Media type of mosaics; GDAL's format has none of its own."""
+"""Media type of mosaics; VRT has no registered type."""
 TYPES = {"float32": "Float32", "uint8": "Byte"}
 """GDAL's names of the types of cells."""
 
@@ -67,7 +67,7 @@ def write_collection(run: Run, done: Sequence[Tile]) -> None:
         remove(run.path / COLLECTION)
         return
     content = collection(run, done, mosaics)
-    # As a stream: the parts of its text take more memory than the catalog.
+    # It is written as a stream, because the parts of its text take more memory than the catalog.
     with atomic_file(run.path / COLLECTION, run.config.cluster.flush) as local, local.open("w") as file:
         json.dump(content, file, indent=1, allow_nan=False)
 
@@ -86,7 +86,7 @@ def collection(run: Run, done: Sequence[Tile], mosaics: Sequence[Kind]) -> dict[
         "title": run.collection,
         "description": f"Road surfaces of {count(len(done), 'tile')} by FlexRoad, "
         f"configuration {run.config.name}",
-        # The licence of the results depends on that of the sources.
+        # The licence of the results depends on the licence of the sources.
         "license": "other",
         "extent": {
             "spatial": {"bbox": [_degrees(done)]},
@@ -115,7 +115,7 @@ def _mosaic(kind: Kind) -> dict[str, Any]:
 
 
 def _degrees(tiles: Sequence[Tile]) -> Bounds:
-    """Return the bounds of tiles in degrees; those of the Earth where none of them can be transformed."""
+    """Return the bounds of tiles in degrees; the bounds of the Earth if no tile can be transformed."""
     by_crs: defaultdict[str, list[Bounds]] = defaultdict(list)
     for tile in tiles:
         by_crs[tile.grid.crs].append(tile.grid.bounds)
@@ -129,7 +129,7 @@ def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
 
     Their kinds are returned.
 
-    Tiles without a common lattice, or without exported rasters, give none; older files are then removed.
+    Without a common lattice or exported rasters there are no mosaics; older files are then removed.
     """
     grid = Grid.holding([tile.grid for tile in done]) if "cog" in run.config.export.formats else None
     written = []
@@ -143,7 +143,7 @@ def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
 
 
 def _write_level_0(run: Run, grid: Grid | None, done: Sequence[Tile]) -> list[Kind]:
-    """Write the heights of the ground below decks as one, if there are any, and return their kind."""
+    """Write the mosaic of the ground below decks, if there are decks, and return its kind."""
     kind, variant = of_level(HEIGHT, 0), run.config.export.variants[0]
     names = dict[str, str]()
     if grid and getattr(run.config.chains[variant]["segment"], "levels", False):
@@ -177,10 +177,10 @@ def vrt_name(kind: Kind) -> str:
 def _write_vrt(
     run: Run, grid: Grid, kind: Kind, band: Band, tiles: Sequence[Tile], own: Mapping[str, str] | None = None
 ) -> None:
-    """Write a mosaic of one kind of raster, and on disk its style: in a bucket QGIS would not look for it.
+    """Write a mosaic of one kind of raster, and on disk its style: QGIS does not look for styles in buckets.
 
-    - `own`: names of the files of tiles that have one of this kind, by tile; the others have the heights of
-      their highest level. By default all tiles have one.
+    - `own`: names of files of this kind, by tile; other tiles have the heights of their highest level. By
+      default all tiles have a file of this kind.
     """
     variant, flush = run.config.export.variants[0], run.config.cluster.flush
     with atomic_file(run.path / vrt_name(kind), flush) as local, local.open("w", encoding="utf-8") as file:
@@ -223,13 +223,13 @@ def _describe(xml: XMLGenerator, band: Band) -> None:
 
 
 def _source(xml: XMLGenerator, name: str, whole: Grid, tile: Grid, band: Band) -> None:
-    """Write the file of one tile; where it has nodata, other tiles show."""
+    """Write the entry of one tile; where the tile has nodata, other tiles are visible."""
     kind = "SimpleSource" if band.nodata is None else "ComplexSource"
     size = f'xSize="{tile.width}" ySize="{tile.height}"'
     left, top = round((tile.west - whole.west) / whole.cell), round((whole.north - tile.north) / whole.cell)
     nodata = "" if band.nodata is None else f"<NODATA>{_number(band.nodata)}</NODATA>"
-    # Written as text, because element by element it takes several times as long. With the properties, GDAL
-    # does not open all files when it opens the mosaic.
+    # Text is several times as fast as single elements. With the properties, GDAL does not open all files when
+    # it opens the mosaic.
     xml.ignorableWhitespace(
         f'<{kind}><SourceFilename relativeToVRT="1">{escape(name)}</SourceFilename><SourceBand>1</SourceBand>'
         f'<SourceProperties RasterXSize="{tile.width}" RasterYSize="{tile.height}" '
@@ -256,7 +256,7 @@ def write_states(run: Run, where: Location) -> None:
     """Write the tiles as polygons in longitude and latitude (WGS 84, RFC 7946).
 
     Columns: ``id``; ``state`` (``done``: computed by the last run; ``cached``: done before it; ``failed``;
-    ``pending``); ``stale``, whether a failed or pending tile still has products of an earlier result;
+    ``pending``); ``stale``, whether a failed or pending tile has products of an earlier result;
     ``error``, the reason of a failure; ``seconds``, the computing time; ``error_estimate_m``, the error
     estimate of the surface exported first (m); ``flags``, its flags, such as ``no-road``; ``finished``, the
     time of completion.
@@ -264,7 +264,7 @@ def write_states(run: Run, where: Location) -> None:
     variant = run.config.export.variants[0]
     places, flush = shapely.to_geojson(outlines(run.catalog.tiles)), run.config.cluster.flush
     with open_database(run) as database, atomic_file(where, flush) as local, local.open("w") as file:
-        # As a stream: the features of all tiles take more memory than the catalog.
+        # It is written as a stream, because the features of all tiles take more memory than the catalog.
         file.write('{"type": "FeatureCollection", "features": [')
         rows = zip(recorded(run, database), places, strict=True)
         for number, ((tile_id, state, record), place) in enumerate(rows):
@@ -285,7 +285,7 @@ def outlines(tiles: Sequence[Tile]) -> Any:
         selected = crs_of_tile == crs
         convert = transformer(crs, "EPSG:4326").transform
         shapes[selected] = shapely.transform(shapes[selected], convert, interleaved=False)
-    # Beyond the range of a CRS coordinates are infinite.
+    # Coordinates beyond the range of a CRS become infinite.
     return np.where(
         shapely.is_valid(shapes), shapely.transform(shapes, lambda degrees: degrees.round(7)), None
     )

@@ -1,4 +1,4 @@
-"""The events of a run: for whoever shows them (`Observer`), and in its log (`EventLog`), a JSON line each.
+"""The events of a run: for displays (`Observer`), and in its log (`EventLog`), a JSON line each.
 
 The log is ``RUN/log.jsonl``, in a bucket ``RUN/log/<start>.jsonl``. ::
 
@@ -40,7 +40,7 @@ class EventLog:
 
     def __enter__(self) -> EventLog:
         with contextlib.suppress(OSError):
-            # A pipe without a reader would block the run.
+            # Opening a pipe without a reader would block the run.
             self._file = output_file(self._staged.path).open("a", buffering=1)
             if _is_cut_off(self._staged.path):
                 self._file.write("\n")
@@ -93,20 +93,20 @@ class Observer:
     """Takes the events of a run in their order; each method does nothing unless a subclass overrides it."""
 
     def working(self, work: str) -> AbstractContextManager[None]:
-        """Enclose work before the first tile that may take long: ``reading survey.parquet``."""
+        """Enclose long work before the first tile: ``reading survey.parquet``."""
         return contextlib.nullcontext()
 
     def note(self, text: str) -> None:
         """Take a remark in one line."""
 
     def warning(self, text: str) -> None:
-        """Take a warning in one line: something that could not be done, and does not stop the run."""
+        """Take a warning in one line: a problem that does not stop the run."""
 
     def start(self, tiles: int, selected: int) -> None:
         """Take the number of tiles of the run, and how many of them are to be brought up to date."""
 
     def line(self, text: str) -> None:
-        """Take what the executor tells while it works: a decision, a wait, the address of a dashboard."""
+        """Take a message of the executor: a decision, a wait, the address of a dashboard."""
 
     def tile(self, result: TileResult) -> None:
         """Take the result of a tile, also of one that was up to date."""

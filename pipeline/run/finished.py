@@ -1,8 +1,8 @@
-"""The results of finished tiles: the one reader of what a run has stored.
+"""The results of finished tiles: the only reader of a run's stored results.
 
-The state of tiles is checked once, for all formats of an export, then compared by sizes and times of files.
-To check a tile makes its graph; to compare the sizes and times of its files takes a part of that time. What
-is kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
+The state of tiles is checked once, for all formats of an export. Later, only sizes and times of files are
+compared, because a check of a tile makes its graph and takes longer. Only fingerprints are kept of a tile:
+10,000 graphs would be large.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ESTIMATES = 32
 SURFACES = 128
 """Number of tiles of which a process keeps surface and road mask (some 0.7 MB each)."""
 NO_DISTANCES = (math.nan,) * len(FIGURES)
-"""Distances of a mesh that has none (m)."""
+"""Distances of a tile without a mesh (m)."""
 SEE_REPORT = "`flexroad report` says what is wrong there"
 COMPUTED_AGAIN = "it was computed again while it was exported; export again"
 
@@ -52,7 +52,7 @@ COMPUTED_AGAIN = "it was computed again while it was exported; export again"
 def open_variant(
     path: Location | str, variant: str | None = None, allow: Sequence[str | Path] = ()
 ) -> tuple[Run, str]:
-    """Return an opened run with the variant whose results are used; by default the first one exported."""
+    """Return an opened run with the variant whose results are used; by default the first exported variant."""
     run = Run.open(path, allow)
     variant = variant or run.config.export.variants[0]
     if variant not in run.config.chains:
@@ -62,22 +62,22 @@ def open_variant(
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A tile as it was when its state was checked; small, since an export has one of each of its tiles."""
+    """A tile when its state was checked; small, because an export has a snapshot of each of its tiles."""
 
     fingerprint: str
     """Fingerprint of all requested results."""
     digests: bytes
-    """Fingerprints of the stages of the variant whose results are read, one after the other (`nodes`)."""
+    """Fingerprints of the stages of the variant that is read, joined (`nodes`)."""
     marker: MarkerStat | None
-    """Name, size and version of its marker; None if it had none."""
+    """Name, size and version of its marker, or None."""
     files: bytes = b""
-    """Hash of the sizes and times of all its files (`file_states`); empty if they are not to be compared."""
+    """Hash of the sizes and times of all its files (`file_states`); empty if they are not compared."""
     distances: tuple[float, ...] = NO_DISTANCES
-    """Distances of its mesh from its surface (m) in the order of `FIGURES`; NaN where it has none."""
+    """Distances of its mesh from its surface (m) in the order of `FIGURES`; NaN if unknown."""
 
     @classmethod
     def of(cls, status: TileStatus, variant: str, files: bytes = b"") -> Snapshot:
-        """Return that of a tile whose state has just been checked."""
+        """Return the snapshot of a tile whose state has just been checked."""
         graph, record = status.graph, status.last_record
         digests = _digests(graph, variant)
         if record is None:
@@ -112,7 +112,7 @@ def file_states(run: Run) -> Callable[[Tile], bytes]:
             try:
                 sources += [(str(path), stat_file(path)) for path in tile.paths(layer)]
             except CatalogError as error:
-                # A layer with files that may not be read is looked up only if the tile needs them.
+                # A layer is looked up only if the tile needs it: files of other layers may be forbidden.
                 sources.append((str(error), None))
         products = sorted(files_of(tile.id).items())
         return blake2b(repr((products, sources, models)).encode(), digest_size=16).digest()
@@ -121,13 +121,13 @@ def file_states(run: Run) -> Callable[[Tile], bytes]:
 
 
 def snapshots(run: Run, tiles: Iterable[Tile], variant: str) -> Iterator[tuple[Tile, Snapshot | None]]:
-    """Yield each tile as it is now, with None if it is not finished; checks its sources and its products."""
+    """Yield each tile with its snapshot, None if it is not finished; checks its sources and products."""
     state, seen = file_states(run), b""
 
     def looked_at() -> Iterator[Tile]:
         nonlocal seen
         for tile in tiles:
-            # Before its state is checked: a later change is noticed then.
+            # Files are hashed before the state is checked, so that a later change is noticed.
             seen = state(tile)
             yield tile
 
@@ -138,7 +138,7 @@ def snapshots(run: Run, tiles: Iterable[Tile], variant: str) -> Iterator[tuple[T
 
 @dataclass(frozen=True)
 class RunPlace:
-    """What workers need to read results of a run."""
+    """The data with which workers read results of a run."""
 
     path: str
     store: str
@@ -147,7 +147,7 @@ class RunPlace:
 
     @classmethod
     def of(cls, run: Run) -> RunPlace:
-        """Return that of a run."""
+        """Return the place of a run."""
         return cls(str(run.path), str(run.store), run.pattern, run.checksum)
 
     @cached_property
@@ -156,16 +156,16 @@ class RunPlace:
         return ArtefactStore(parse_location(self.store))
 
     def stored(self, fit: str, segment: str) -> tuple[Surface, RoadMask] | None:
-        """Return surface and road mask by their fingerprints, None if one of them is not in the store."""
+        """Return surface and road mask by their fingerprints, None if the store lacks one of them."""
         surface, road = self.artefacts.find("fit", fit), self.artefacts.find("segment", segment)
         return (surface.value, road.value) if surface and road else None
 
     def marker(self, tile_id: str) -> MarkerStat | None:
-        """Return name, size and version of the marker of a finished tile, None if there is none."""
+        """Return name, size and version of the marker of a finished tile, or None."""
         return marker_stat(self._folder(tile_id), "done")
 
     def graph(self, tile: Tile, snapshot: Snapshot) -> TileGraph:
-        """Return the graph of a finished tile; sources that no longer exist count as recorded."""
+        """Return the graph of a finished tile; recorded values are used for sources that no longer exist."""
         graph = self.pattern.graph(tile, self.checksum)
         folder = self._folder(tile.id)
         changed = graph.fingerprint != snapshot.fingerprint
@@ -195,18 +195,18 @@ class FinishedTile:
     snapshot: Snapshot
     place: RunPlace
     evaluator: Evaluator | None = None
-    """Reads and computes the results where the graph is known (`of`); None: it is made when it is needed."""
+    """Reads and computes the results if the graph is known (`of`); None: it is made when it is needed."""
 
     @classmethod
     def of(cls, run: Run, status: TileStatus, variant: str) -> FinishedTile:
-        """Return a tile whose state has just been checked; all results of an unfinished one are computed."""
+        """Return a tile whose state has just been checked; results of an unfinished tile are computed."""
         place = RunPlace.of(run)
         evaluator = Evaluator(status.graph, place.artefacts)
         return cls(status.graph.around, variant, Snapshot.of(status, variant), place, evaluator)
 
     @classmethod
     def last(cls, run: Run, status: TileStatus, variant: str) -> FinishedTile:
-        """Return a tile as it was last finished; a result that the store no longer has is an error."""
+        """Return the last finished state of a tile; a result that the store no longer has is an error."""
         nodes = run.folder(status.graph.tile.id).nodes(variant)
         try:
             digests = bytes.fromhex("".join(nodes[stage] for stage in STAGE_NAMES))
@@ -215,7 +215,7 @@ class FinishedTile:
         return cls(status.graph.around, variant, Snapshot("", digests, None), RunPlace.of(run))
 
     def in_variant(self, variant: str) -> FinishedTile:
-        """Return the tile in another variant; what both have in common is read or computed once."""
+        """Return the tile in another variant; common results are read or computed once."""
         snapshot = replace(self.snapshot, digests=_digests(self.graph, variant))
         return replace(self, variant=variant, snapshot=snapshot, evaluator=self._evaluator)
 
@@ -231,7 +231,7 @@ class FinishedTile:
 
     @property
     def fingerprint(self) -> str:
-        """Name of the mesh by what it was made of."""
+        """Name of the mesh that depends on all of its inputs."""
         return self.snapshot.nodes["sample"]
 
     @property
@@ -277,19 +277,19 @@ class FinishedTile:
     def level_errors(self, number: int) -> tuple[Floats, NDArray[np.uint8]]:
         """Return estimated error (m) and height source of each cell of the core; needs the source files.
 
-        They are those of a level, or of level 0 if the tile does not have it.
+        If the tile does not have the level, level 0 is used.
         """
         inputs = self.data, self.road, self.clusters, self.surface
         return assess.cell_errors(*inputs, self.assessment, number)
 
     @property
     def top_errors(self) -> tuple[Floats, NDArray[np.uint8]]:
-        """The same of the highest level."""
+        """Estimated error (m) and height source of each cell on its highest level."""
         return assess.top_errors(self.data, self.road, self.clusters, self.surface, self.assessment)
 
     @property
     def flag_places(self) -> dict[str, Place]:
-        """Easting and northing (m) by raised flag, of those that have a place; needs the source files."""
+        """Easting and northing (m) by raised flag, for flags with a place; needs the source files."""
         flags = self.quality.flags
         if not flags:
             return {}
@@ -302,7 +302,7 @@ class FinishedTile:
 
     @cached_property
     def graph(self) -> TileGraph:
-        """The graph of the tile, made again from the files that it had when it was finished."""
+        """The graph of the tile, made again from the files when it was finished."""
         return self.evaluator.graph if self.evaluator else self.place.graph(self.tile, self.snapshot)
 
     def check_unchanged(self) -> None:
@@ -322,7 +322,7 @@ class FinishedTile:
         """Return the result of a stage: from the store, or computed if it is missing or damaged there."""
         name = self.snapshot.nodes[stage]
         if stage not in self._results:
-            # An evaluator searches the store itself; without one, a stored result needs no graph.
+            # An evaluator searches the store itself. Without an evaluator, a stored result needs no graph.
             stored = None if self.evaluator else self.place.artefacts.find(stage, name)
             try:
                 self._results[stage] = stored.value if stored else self._evaluator(name)
@@ -333,17 +333,17 @@ class FinishedTile:
 
 @dataclass(frozen=True)
 class GroundTile:
-    """A finished tile by the name of its assessment, which depends on its surface and on its input."""
+    """A finished tile, identified by the fingerprint of its assessment: it covers surface and input."""
 
     id: str
     name: str
     tile: FinishedTile = field(compare=False, repr=False)
     earlier: bool = field(default=False, repr=False)
-    """Whether it is of earlier sources or options (`FinishedTile.last`)."""
+    """Whether its results are from earlier sources or options (`FinishedTile.last`)."""
 
     @classmethod
     def of(cls, tile: FinishedTile, earlier: bool = False) -> GroundTile:
-        """Return that of a tile."""
+        """Return the ground tile of a tile."""
         return cls(tile.id, tile.snapshot.nodes["assess"], tile, earlier)
 
     @property
@@ -353,7 +353,7 @@ class GroundTile:
 
     @property
     def unread(self) -> FinishedTile:
-        """The tile without the results that were read, which would stay in memory with it."""
+        """The tile without the results that were read, to free their memory."""
         own = self.tile.evaluator
         return replace(self.tile, evaluator=own and Evaluator(own.graph, own.store))
 
@@ -377,7 +377,7 @@ def estimate(tile: GroundTile, number: int) -> tuple[NDArray[np.float32], NDArra
 
 @lru_cache(maxsize=ESTIMATES)
 def flagged(tile: GroundTile, number: int) -> Bits:
-    """Return the flags of each cell of a tile on a level, ``(H, W)``; those of level 0 if it has no other."""
+    """Return the flags of each cell of a tile on a level, ``(H, W)``; level 0 if it has no other level."""
     return tile.unread.quality.at(number).flagged
 
 

@@ -1,13 +1,13 @@
 """The lock of a run folder: one process at a time may write a run; the lock of a dead process is taken over.
 
-``RUN/lock.json`` holds the owner: host, process id and start time. If the owner is on this machine, the
+``RUN/lock.json`` names the owner: host, process id and start time. If the owner is on this machine, the
 process table shows whether it is alive, independent of any clock. An owner on another machine renews the
 file's time every 30 s; the age of the file is measured with the storage's clock. Before such a lock is taken
-over, it is observed for a while, so that a clock that jumped cannot make a living owner lose it.
+over, it is observed for a while: a clock that jumped cannot make a living owner lose it.
 
-Machines made of one image may have the same name and machine id, but never the same boot id. An owner with
-another boot id is a process before the last restart of this machine, or one on such a machine; it counts as
-the latter if it has renewed its lock since this machine was started.
+Machines made from one image may have the same name and machine id, but never the same boot id. So an owner
+with another boot id ran before the last restart of this machine, or runs on another machine. It is on another
+machine if it has renewed its lock since this machine was started.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def run_lock(
     - `notify`: receives one line when the lock of a dead process is observed or taken over, or this lock is
       lost.
     - `interval_s`: interval at which the owner renews its lock (s).
-    - `stale_s`: age at which an owner on another machine counts as dead (s).
+    - `stale_s`: age at which an owner on another machine is taken as dead (s).
     """
     lock = _Lock(run, lock_file(run / NAME), Owner.me(), notify, interval_s, stale_s)
     try:
@@ -200,7 +200,7 @@ class _Lock:
     def renew_until(self, stop: threading.Event) -> None:
         """Renew the lock until ``stop`` is set; if another process has taken it over, end this process."""
         while not stop.wait(self.interval_s):
-            # Storage that is temporarily out of reach does not stop the run.
+            # The run goes on if the storage is temporarily out of reach.
             with contextlib.suppress(OSError):
                 current = self.file.read()
                 if current is None:
@@ -222,9 +222,9 @@ class _Lock:
                 self.file.remove(current)
 
     def _dead(self, holder: Owner | None, current: LockStat) -> str | None:
-        """Return why the owner counts as dead, None if it may be alive."""
+        """Return why the owner is taken as dead, None if it may be alive."""
         watch_s = 1.5 * self.interval_s
-        # A machine that has just been started cannot tell: an owner renews its lock only at intervals.
+        # Just after a start this is not known, because an owner renews its lock only at intervals.
         before_start = current.age_s > max(watch_s, _uptime_s())
         if holder is not None and (holder.boot == self.me.boot or before_start):
             reason = exit_reason(holder)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from upath import UPath
 
 REFUSED = (409, 412)
-"""HTTP status of a rejected conditional request: a conflicting request, or the condition is not met."""
+"""HTTP status of a rejected conditional request: 409 for a conflict, 412 for a condition that is not met."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from flexroad.catalog.text import Notify, count, printable
 from flexroad.pipeline.worker.tile import TileResult
 
 FIRST_S = 1.0
-"""Time after which work that has not ended yet is named (s)."""
+"""Time after which the name of unfinished work is printed (s)."""
 PLAIN_EVERY_S = 10.0
 """Shortest interval of plain progress lines (s)."""
 SILENT_EVERY_S = 60.0
@@ -37,9 +37,9 @@ SILENT_EVERY_S = 60.0
 
 @contextlib.contextmanager
 def said_repeatedly(line: Callable[[float], str], notify: Notify, wait_s: float) -> Iterator[None]:
-    """Say a line if the block takes longer than ``wait_s``, and then every `PLAIN_EVERY_S`.
+    """Print a line if the block takes longer than ``wait_s``, and then every `PLAIN_EVERY_S`.
 
-    - `line`: takes the time since the start of the block (s); an empty line is not said.
+    - `line`: takes the time since the start of the block (s); an empty line is not printed.
     """
     ended, start = threading.Event(), time.monotonic()
 
@@ -60,7 +60,7 @@ def said_repeatedly(line: Callable[[float], str], notify: Notify, wait_s: float)
 
 
 def step_progress(console: Console) -> Callable[[Iterable[Any], str, int], Iterator[Any]]:
-    """Return a function that yields the items of a step and shows how many are done.
+    """Return a function that yields the items of a step and shows the number of done items.
 
     It shows a bar on a terminal, else plain lines if the step takes long. Its arguments are the items, the
     step (``checking tiles``) and the number of items.
@@ -102,7 +102,7 @@ class ProgressDisplay:
         self.told = -1
         """Number of results in the last plain line; -1 before the first one."""
         self.lock = threading.Lock()
-        """Held while counts are changed or read: plain lines are printed by a thread of their own."""
+        """Lock for the counts, because another thread prints plain lines."""
         self.progress = Progress(
             SpinnerColumn(),
             BarColumn(24),
@@ -126,7 +126,7 @@ class ProgressDisplay:
         if self.live:
             self.live.start()
         else:
-            # In a log, or a pipe, the first results may take minutes.
+            # The first results may take minutes; a log or a pipe then gets plain lines.
             self.say(f"starting: {count(self.total, 'tile')}")
             self.stack.enter_context(said_repeatedly(self._due_line, self.say, PLAIN_EVERY_S))
         return self
@@ -168,7 +168,7 @@ class ProgressDisplay:
         return f"{tried}/{tiles}, {self.counts()}, {spent:.0f} s spent, about {left:.0f} s left"
 
     def _due_line(self, _: float) -> str:
-        """Return the plain line if there are new results or it is time for one, else an empty text."""
+        """Return the plain line if there are new results or its time has come, else an empty text."""
         with self.lock:
             tried, now = sum(self.status.values()), time.monotonic()
             if tried == self.told and now - self.last_line < SILENT_EVERY_S:

@@ -71,7 +71,7 @@ from flexroad.pipeline.worker.tile import TileJob
 PACKAGES = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "dask", "torch")
 STORE = "store"
 RECORD = "run.json"
-"""The first file of a run: a folder that has it is a run, also if it is not complete."""
+"""The first file of a run: a folder with this file is a run, even if it is not complete."""
 
 USERS = "runs"
 """Folder of a shared store with a small file for each run that uses it, read by `flexroad clean`."""
@@ -86,7 +86,7 @@ class Run:
     catalog: Catalog
     store: Location
     origin: tuple[float, float]
-    """Whole-metre (easting, northing) that mesh translations are relative to; fixed when the run is made."""
+    """Origin (easting, northing) of mesh translations, whole metres; fixed when the run is made."""
     checksum: bool
     """Whether fingerprints hash the bytes of source files instead of their size and time."""
     versions: dict[str, str]
@@ -98,7 +98,7 @@ class Run:
     collection: str = ""
     """Id of the run's STAC collection: the name of its folder when it was made."""
     programs_sealed: bool = True
-    """Whether this user has given the options of its workers that can start programs (`Cluster.programs`)."""
+    """Whether this user has given its options that can start programs (`Cluster.programs`)."""
 
     @classmethod
     def create(
@@ -111,8 +111,8 @@ class Run:
     ) -> Run:
         """Create a run folder, or update an existing one with a new configuration or catalog.
 
-        The run may read what the catalog may read (`Catalog.read`), or, if the program itself has just made
-        the catalog, the folders of its files.
+        The run may read the folders that the catalog may read (`Catalog.read`). If the program itself has
+        just made the catalog, these are the folders of its files.
         """
         run = cls.planned(path, config, catalog, store, checksum)
         try:
@@ -141,7 +141,7 @@ class Run:
             raise ConfigError(f"no tile can be used: {catalog.tiles[0].fault}")
         check_inputs(config, catalog)
         old = _record(path)
-        # Existing meshes are relative to the earlier origin, which the last summary contains, too.
+        # Existing meshes are relative to the earlier origin, which is also in the last summary.
         origin = (old or read_summary(path)).get("origin")
         if not origin:
             origin = [min(axis) for axis in zip(*(tile.grid.origin for tile in catalog.usable), strict=True)]
@@ -155,8 +155,8 @@ class Run:
     def open(cls, path: Location | str, allow: Sequence[str | Path] = ()) -> Run:
         """Open an existing run with its current configuration and catalog.
 
-        - `allow`: folders and addresses that sources and the store may lie below, besides the run's own
-          folder and those that the user gave when the run was made (`flexroad.pipeline.run.seal`).
+        - `allow`: further folders and addresses below which sources and the store may lie. The run's folder
+          and the folders given when the run was made are always allowed (`flexroad.pipeline.run.seal`).
         """
         path = parse_location(path)
         check_links(path)
@@ -210,7 +210,7 @@ class Run:
 
     def _write(self) -> None:
         if not exists(self.path / RECORD):
-            # An interrupted creation is known by this file, which says nothing yet (`check_folder`).
+            # This empty record marks the folder as a run if the creation is interrupted (`check_folder`).
             write(self.path / RECORD, dump_checked({}), flushed=True)
             flush_names(self.path)
         config = yaml.safe_dump(self.config.raw, sort_keys=False).encode()
@@ -238,10 +238,10 @@ class Run:
 def check_links(path: Location, below: bool = False) -> None:
     """Check that no file or folder of a run is a link that leads out of the run.
 
-    A run may come from anyone, and what is read, written or deleted behind such a link would not be the
-    run's. Tiles and artefacts are checked when they are used (`contained`).
+    A run may come from anyone. Through such a link, files outside the run would be read, written or deleted.
+    Tiles and artefacts are checked when they are used (`contained`).
 
-    - `path`: the run's folder, or a folder in it; itself it may be a link.
+    - `path`: the run's folder, or a folder in it; the path itself may be a link.
     - `below`: whether folders inside it are searched, too.
     """
     try:
@@ -264,9 +264,9 @@ def check_folder(path: Location) -> None:
 def check_own(
     folder: Location, is_own: Callable[[], bool], kind: str, option: str, ignored: Collection[str] = ()
 ) -> None:
-    """Check that a folder has no visible files, or the mark of an earlier command (`is_own`).
+    """Check that a folder has no visible files, or was written by an earlier command (`is_own`).
 
-    - `kind`: what the command writes: ``a run``.
+    - `kind`: the kind of output, for the message: ``a run``.
     """
     try:
         other = visible_entry(folder, ignored)
@@ -333,7 +333,7 @@ def versions() -> dict[str, str]:
 
 
 def _store(record: dict[str, Any] | None, run: Location, remedy: str, allow: Sequence[Any] = ()) -> Location:
-    """Return the store of a run; one outside its folder must be sealed or allowed (`remedy`)."""
+    """Return the store of a run; a store outside its folder must be sealed or allowed (`remedy`)."""
     if record is None or not record["shared_store"]:
         return run / "store"
     named = str(record["store"])
@@ -374,7 +374,7 @@ def _record(run: Location) -> dict[str, Any] | None:
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
     except OSError as error:
-        # After an access or connection error it is unknown whether there is a run.
+        # After an access or connection error it is unknown whether a run exists.
         raise ConfigError(f"cannot read {run / RECORD}: {error.strerror or error}") from error
     required = {"config", "store", "shared_store", "origin", "checksum", "versions"}
     return record if required <= record.keys() else None

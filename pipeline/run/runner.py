@@ -68,7 +68,7 @@ class Plan:
     todo: array[int]
     """Indices in the catalog of the tiles to process."""
     tile_s: float | None
-    """Median computing time of the tiles that were done before (s), None if there are none."""
+    """Median computing time of the tiles that were done before (s), or None."""
     new: int
     changed: int
     vanished: int
@@ -86,9 +86,9 @@ def run_tiles(
 
     - `only`: filter of the tiles to process; the tables contain all tiles.
     - `force`: stages to compute even if their results are in the store.
-    - `watch`: receives every result when it is available, including those of cached tiles.
+    - `watch`: receives every result when it is available, including results of cached tiles.
     - `verify`: compare all products with their checksums, process tiles with a difference again, and make the
-      tables from the markers, whatever the database has.
+      tables from the markers, not from the database.
     """
     check_inputs(run.config, run.catalog)
     remove_abandoned()
@@ -133,7 +133,7 @@ def plan_run(
         if status.last_record and status.last_record.state == "done":
             times.append(status.last_record.seconds)
         new += status.last_record is None
-        # Of a tile whose neighbour lost a file the result is valid, and computed again all the same.
+        # A tile that was computed without an unusable file is computed again, although its result is valid.
         changed += status.last_record is not None and not (status.up_to_date and status.sources_present)
         state: TileState = "done" if status.done else "failed" if status.failed else "pending"
         if status.last_record and status.from_marker:
@@ -155,10 +155,10 @@ def plan_run(
 def refuse_incomplete(run: Run, number: int, last: TileGraph | None) -> None:
     """Check that not each of several tiles lacks a file.
 
-    One error for the run: if each tile failed by itself, all existing results would be lost.
+    This is one error of the run. If each tile failed by itself, all existing results would be lost.
 
     - `number`: number of tiles that lack a file.
-    - `last`: the last of them.
+    - `last`: the last of these tiles.
     """
     tiles = len(run.catalog.usable)
     if last is None or number != tiles or tiles < 2:
@@ -182,15 +182,15 @@ def refuse_incomplete(run: Run, number: int, last: TileGraph | None) -> None:
 def _jobs(run: Run, plan: Plan, force: frozenset[str]) -> Iterator[TileJob]:
     stat_file = run.stat_cache()
     for position in plan.todo:
-        # The graph is made again, because thousands of graphs kept since planning would need much memory and
-        # could be outdated.
+        # The graph is made again: thousands of graphs from the planning would need much memory, and could be
+        # out of date.
         yield run.job(run.graph(run.catalog.tiles[position], stat_file), force)
 
 
 def _results(
     run: Run, executor: Executor, database: RunDatabase, jobs: Jobs[TileJob]
 ) -> Generator[TileResult, None, None]:
-    """Yield the results of the jobs; at the end record tiles that were finished but whose result was lost."""
+    """Yield the results of the jobs; at the end, record finished tiles whose result was lost."""
     in_progress: set[str] = set()
 
     def submitted() -> Iterator[TileJob]:
@@ -215,7 +215,7 @@ def _results(
 
 
 def _with_marker(run: Run, result: TileResult) -> TileResult:
-    """Return the result of a tile; failed if it is said to be done but its marker is not there."""
+    """Return the result of a tile; failed if the tile is done but its marker is missing."""
     reason = ""
     try:
         if result.status != "done" or has_marker(run, result.entry):
@@ -244,7 +244,7 @@ def _close(
 ) -> Summary:
     """Write tables, mosaics, collection, the event ``end`` and the summary; also after an error.
 
-    They have the results so far. ``start`` is the start time (ISO 8601), ``start_s`` the value of
+    These files have the results up to now. ``start`` is the start time (ISO 8601), ``start_s`` the value of
     `time.perf_counter` at the start.
     """
     refused = str(error) if isinstance(error, ConfigError) else ""
@@ -297,7 +297,7 @@ def _done(run: Run, database: RunDatabase) -> Iterator[Tile]:
 def _keep_previous(run: Location, flushed: bool) -> None:
     """Keep metrics.parquet as metrics.previous.parquet, if the last execution was complete.
 
-    One that was interrupted or refused has left a table of some tiles: then the one before it stays.
+    After an interrupted or refused execution, the table is incomplete, so the previous table stays.
     """
     last, table = read_summary(run), run / METRICS
     complete = last.get("pending") == 0 and not last.get("interrupted") and not last.get("refused")
@@ -308,20 +308,20 @@ def _keep_previous(run: Location, flushed: bool) -> None:
 def _final_summary(
     run: Run, database: RunDatabase, start: str, plan: Plan | None, interrupted: bool
 ) -> Summary:
-    """Return the summary at the end of a run, of which ``start`` is the time."""
+    """Return the summary at the end of a run that started at the time ``start``."""
     if plan:
         _repair(run, database, start)
         if plan.todo and not interrupted:
-            # Without any tile to process they have just been looked at.
+            # If no tile had to be processed, the markers have just been checked.
             _check_markers(run, database)
     elif interrupted and not database.lists(tile.id for tile in run.catalog.tiles):
-        # The run is to end soon: checking the tiles would take as long as the start that was interrupted.
+        # An interrupted run should end soon. Checking the tiles would take as long as the interrupted start.
         return summarise(run.catalog, (), "")
     return summarise(run.catalog, recorded(run, database, start), run.config.export.variants[0])
 
 
 def _repair(run: Run, database: RunDatabase, start: str) -> None:
-    """Make the list of tiles anew if it was damaged during the run."""
+    """Write the list of tiles again if it was damaged during the run."""
     if database.load() and database.lists(tile.id for tile in run.catalog.tiles):
         return
     database.set_states(())
@@ -335,7 +335,7 @@ def _repair(run: Run, database: RunDatabase, start: str) -> None:
 
 
 def _check_markers(run: Run, database: RunDatabase) -> None:
-    """Record the done tiles whose marker was removed while the run worked as failed."""
+    """Record done tiles as failed if their marker was removed during the run."""
     files_of = tile_files(run.path)
     for tile in [tile for tile in _done(run, database) if DONE not in files_of(tile.id)]:
         record = database.get(tile.id)

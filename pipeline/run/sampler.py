@@ -4,8 +4,8 @@
 >>> sampler = RunSampler.open("RUN")                      # doctest: +SKIP
 >>> sampler.at(eastings, northings).height                # doctest: +SKIP
 
-Formats along roads have the spline without the steps of kerbs, walls and banks beside roads: a road along a
-centre line may be wider than the road of the mask, and goes on beside it without a kerb.
+Formats along roads use the spline without the steps of kerbs, walls and banks beside roads. A road along a
+centre line may be wider than the road of the mask. Outside the mask it continues without a kerb.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from flexroad.tasks.quality.flagged import UNKNOWN, Bits, passed
 from flexroad.tasks.types import Bools, Floats, RoadMask, Surface
 
 AT_ONCE = 50_000
-"""Number of points of which the tiles are looked up together: geometries take much memory."""
+"""Number of points whose tiles are looked up together: geometries take much memory."""
 
 Numbers = NDArray[np.int8]
 Indices = NDArray[np.intp]
 
 
 LARGEST_STEP_M = 0.05
-"""Step between neighbouring tiles up to which they carry a road; tiles with common borders meet."""
+"""Largest step between tiles for formats along roads (m); tiles with common borders have no step."""
 STEP_REMEDY = "use a run of production, whose tiles have common borders"
 Places = slice | Bools | NDArray[np.intp]
 
@@ -58,11 +58,11 @@ class Heights:
     """Heights of n points on each level."""
 
     numbers: tuple[int, ...]
-    """The k levels, ascending; 0, the ground, is one of them."""
+    """The k levels, ascending, including 0, the ground."""
     z: Floats
-    """``(k, n)``, m; NaN where a level is not, and beyond the surface."""
+    """``(k, n)``, m; NaN where a level does not exist, and beyond the surface."""
     flags: Bits | None = None
-    """``(k, n)``, flags of the surface by `tasks.quality.flagged`; None if it has none."""
+    """``(k, n)``, flags of the surface by `tasks.quality.flagged`, or None."""
 
     def __getitem__(self, places: Places) -> Heights:
         flags = None if self.flags is None else self.flags[:, places]
@@ -90,9 +90,9 @@ class Heights:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Values at n points; NaN and empty strings off the finished tiles.
+    """Values at n points; NaN and empty strings outside the finished tiles.
 
-    Beyond the survey, where a surface is but has no data, only the tile is given.
+    Beyond the survey, where a surface has no data, only the tile is given.
     """
 
     height: Floats
@@ -106,18 +106,18 @@ class Answer:
     flags: Bits
     """``(n,)``, raised flags of the cells at the points, by `tasks.quality.flagged`."""
     earlier: tuple[str, ...] = ()
-    """Ids of tiles whose values are of earlier sources or options (`RunSampler.earlier`)."""
+    """Ids of tiles whose values are from earlier sources or options (`RunSampler.earlier`)."""
     level: NDArray[np.int8] | None = None
-    """``(n,)``, numbers of the levels that the values are of; None if all are of the highest."""
+    """``(n,)``, numbers of the levels of the values; None if all values are on the highest level."""
     numbers: tuple[int, ...] = (0,)
-    """The levels of the tiles that have points."""
+    """The levels of the tiles under the points."""
 
 
 def to_crs(x: Floats, y: Floats, source: str | None, target: str) -> tuple[Floats, Floats]:
     """Return coordinates in another CRS; NaN where they cannot be transformed.
 
     - `x`, `y` ``(n,)``: first east, then north, whatever the order of the axes of the CRS.
-    - `source`: none if they already are in the CRS ``target``.
+    - `source`: None if the points already are in the CRS ``target``.
     """
     if source is None or same(source, target):
         return x, y
@@ -138,16 +138,16 @@ class SurfaceSampler(ABC):
     def under(self, easting: Floats, northing: Floats, free: Bools) -> Iterator[tuple[GroundTile, Indices]]:
         """Yield each tile, in the catalog's order, with the free points on it and on its edge.
 
-        - `free` ``(n,)``: who takes the tiles clears it for points that need no other tile.
+        - `free` ``(n,)``: the caller sets it to False for points that need no further tile.
         """
 
     def at(self, easting: Floats, northing: Floats, level: int | None = None) -> Answer:
         """Return height, normal, tile and class at n points.
 
-        A point on the edge of two finished tiles belongs to the one first in the catalog. A surface goes on
-        beyond the survey, but its heights there are no heights of the ground.
+        A point on the edge of two finished tiles belongs to the tile that is first in the catalog. A surface
+        continues beyond the survey, but its heights there are not heights of the ground.
 
-        - `level`: 0 is the ground, others are where they have decks or tunnels; None: the highest there is.
+        - `level`: 0 is the ground; other levels exist only on decks or in tunnels; None: the highest level.
         """
         easting = np.atleast_1d(np.asarray(easting, dtype=np.float64))
         northing = np.atleast_1d(np.asarray(northing, dtype=np.float64))
@@ -183,9 +183,9 @@ class SurfaceSampler(ABC):
         )
 
     def on_every_level(self, easting: Floats, northing: Floats) -> tuple[Indices, Answer]:
-        """Return what `at` returns for all levels of each point, and the number of the point of each row.
+        """Return values as `at` does, a row for each level of each point, and the number of its point.
 
-        The rows of a point are ordered by level, and its first one is that of the ground.
+        The first row of a point is the ground; further rows are ordered by level.
         """
         ground = self.at(easting, northing, 0)
         others = [self.at(easting, northing, number) for number in ground.numbers if number != 0]
@@ -205,9 +205,9 @@ class SurfaceSampler(ABC):
     ) -> tuple[Heights, tuple[str, ...]]:
         """Return the heights of n points on all levels, with flags, and the ids of the tiles of `earlier`.
 
-        Heights are NaN off the finished tiles and beyond the survey.
+        Heights are NaN outside the finished tiles and beyond the survey.
 
-        - `steps`: whether level 0 has its steps beside roads; without them it is the spline.
+        - `steps`: whether level 0 has its steps beside roads; without steps it is the spline.
         """
         easting, northing = np.asarray(easting, np.float64), np.asarray(northing, np.float64)
         nothing = np.full(easting.shape, np.nan), np.zeros(easting.shape, np.uint16)
@@ -232,10 +232,10 @@ class SurfaceSampler(ABC):
     ) -> Floats:
         """Return heights without steps, or the steps above them (m), at points, in their broadcast shape.
 
-        NaN off the tiles and beyond the survey. Where tiles meet, the first one with a height counts.
+        NaN outside the tiles and beyond the survey. Where tiles meet, the first tile with a height is used.
 
-        - `levels`: the levels of the points, of which heights are; level 0 where the tile does not have it,
-          but NaN in tunnels. None: all of level 0.
+        - `levels`: the levels of the points; where a tile does not have the level, level 0 is used, but in
+          tunnels NaN. None: level 0 for all points.
         """
         easting, northing = np.broadcast_arrays(easting, northing)
         shape, levels = easting.shape, _flat(levels, easting.size)
@@ -250,8 +250,8 @@ class SurfaceSampler(ABC):
     def errors(self, easting: Floats, northing: Floats, numbers: Numbers) -> tuple[Floats, NDArray[np.uint8]]:
         """Return the estimated errors (m) and the `HeightSource` of n points on levels.
 
-        They are those of the cell at each point. NaN and 0 off the finished tiles, and where the sources of a
-        tile have changed or are gone.
+        They are values of the cell at each point. They are NaN and 0 outside the finished tiles, and where
+        the sources of a tile have changed or are missing.
         """
         error, height_source = np.full(easting.shape, np.nan), np.zeros(easting.shape, np.uint8)
         free = np.ones(easting.shape, np.bool_)
@@ -280,11 +280,11 @@ class SurfaceSampler(ABC):
         ends: Indices,
         levels: PlaceLevels | None = None,
     ) -> float:
-        """Return the largest step (m) on lines from one tile to another; 0 if there are none.
+        """Return the largest step (m) on lines from one tile to another; 0 without such lines.
 
-        Both surfaces are taken where the line leaves the first tile.
+        Both surfaces are evaluated where the line leaves the first tile.
 
-        - `starts`, `ends` ``(k,)``: numbers of the points, of n, that a line joins.
+        - `starts`, `ends` ``(k,)``: numbers of the two points that a line joins.
         """
         found, owner = list[tuple[GroundTile, Surface, RoadMask]](), np.full(easting.shape, -1)
         for tile, surface, road, here in self._surfaces(easting, northing):
@@ -307,9 +307,9 @@ class SurfaceSampler(ABC):
     def _surfaces(
         self, easting: Floats, northing: Floats, free: Bools | None = None
     ) -> Iterator[tuple[GroundTile, Surface, RoadMask, Indices]]:
-        """Yield what `under` does, with surface and road of each tile that still has them.
+        """Yield tiles and points as `under` does, with surface and road, if the tile still has them.
 
-        - `free`: None: a point is on the first of its tiles alone.
+        - `free`: None: each point is given only with the first of its tiles.
         """
         left = np.ones(easting.shape, np.bool_) if free is None else free
         for tile, here in self.under(easting, northing, left):
@@ -349,7 +349,7 @@ class RunSampler(SurfaceSampler):
     run: Run
     variant: str
     earlier: bool = False
-    """Whether a tile of which sources or options have changed since has its last finished surface."""
+    """Whether a tile whose sources or options have changed is used with its last finished surface."""
 
     @classmethod
     def open(
@@ -388,9 +388,9 @@ class RunSampler(SurfaceSampler):
                 yield finished, indices
 
     def largest_tile_step(self, easting: Floats, northing: Floats, near_m: float) -> float:
-        """Return the largest step (m) between the tiles of neighbouring points, ``(n,)``; 0 if there is none.
+        """Return the largest step (m) between the tiles of neighbouring points; 0 without such tiles.
 
-        - `near_m`: distance up to which a point and the next one belong to one line (m).
+        - `near_m`: distance up to which a point and the next point belong to one line (m).
         """
         if has_borders(self.run.config.chains[self.variant]["fit"]):
             return 0.0
@@ -407,7 +407,7 @@ class RunSampler(SurfaceSampler):
 
 
 def _inside(road: RoadMask, easting: Floats, northing: Floats, selected: Indices) -> Indices:
-    """Return those of the selected points that are not beyond the survey."""
+    """Return the selected points that are not beyond the survey."""
     return selected[~road.outside[road.grid.cells(easting[selected], northing[selected])]]
 
 
@@ -450,7 +450,7 @@ def on_levels(
         here = levels.number == number
         if number in known:
             level, at = known[number], (easting, northing)
-            # Beyond deck and approach, nothing holds this surface.
+            # Beyond deck and approach, no data determines this surface.
             here &= levels.own | level.covers(*at) | (level.weight(*at) > 0)
             values[here] = 0.0 if steps else surface.at(number).height(easting[here], northing[here])
         elif number < 0:
@@ -459,7 +459,7 @@ def on_levels(
 
 
 def _leaving(bounds: Bounds, start: Floats, end: Floats) -> Floats:
-    """Return where lines from inside a rectangle, ``(2, n)``, leave it, or end."""
+    """Return the points, ``(2, n)``, where lines from inside a rectangle leave it, or end."""
     along = end - start
     edges = np.where(along > 0, np.reshape(bounds[2:], (2, 1)), np.reshape(bounds[:2], (2, 1)))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -478,7 +478,7 @@ def required_crs(sampler: RunSampler) -> str:
     crs = crs_of(sampler)
     if crs is None:
         raise ConfigError(
-            f"the tiles of {sampler.run.path} have several CRSs; give points in that of the tile, as a CSV "
-            "with easting and northing"
+            f"the tiles of {sampler.run.path} have several CRSs; give points in the CRS of their tile, as a "
+            "CSV with easting and northing"
         )
     return crs

@@ -1,10 +1,10 @@
-"""Seals of what a run may do outside its folder: they show that this user gave it, on this machine.
+"""Seals of permissions of a run: they show that this user gave the permissions on this machine.
 
-``RUN/run.json`` holds the folders that the user allowed when the run was made, and the shared store;
-``RUN/config.yaml`` the options of workers that can start programs. A run folder may come from anyone, like a
-catalog, and whoever wrote it could have written anything. So these values are sealed with a secret key of the
-user, and without the right seal they do not count. The key is made on first use and lies in
-``$XDG_STATE_HOME/flexroad/key``, by default ``~/.local/state/flexroad/key``.
+``RUN/run.json`` has the folders that the user allowed when the run was made, and the shared store;
+``RUN/config.yaml`` has the options of workers that can start programs. A run folder may come from anyone,
+with any content. So these values are sealed with a secret key of the user, and ignored without the seal.
+The key is made on first use and lies in ``$XDG_STATE_HOME/flexroad/key``, by default
+``~/.local/state/flexroad/key``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def _path() -> Path:
 
 
 def _key() -> bytes:
-    """Return the user's key, empty if there is none."""
+    """Return the user's key, empty if it does not exist."""
     try:
         key = _path().read_bytes()
     except OSError:
@@ -67,9 +67,9 @@ def _new_key() -> bytes:
         with os.fdopen(descriptor, "wb") as file:
             file.write(secrets.token_bytes(KEY_BYTES))
             file.flush()
-            # A power failure must not leave a key of zeros, which others could guess.
+            # A power failure must not leave a key of zeros, which other users could guess.
             os.fsync(file.fileno())
-        # Unlike a rename, this keeps the key that another process has written meanwhile.
+        # Unlike a rename, a link does not replace a key that another process has just written.
         with contextlib.suppress(FileExistsError):
             os.link(temporary, path)
         flush_names(path.parent, path.parent.parent)

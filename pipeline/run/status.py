@@ -38,7 +38,7 @@ from flexroad.pipeline.store.records import (
 from flexroad.pipeline.worker.tile import marker_stat
 
 Track = Callable[[Iterable[Any], str, int], Iterable[Any]]
-"""Returns the items of a step, whose name and number it takes; it may show how many are done."""
+"""Takes items, name and number of items of a step; returns the items, and may show progress."""
 
 
 def untracked(items: Iterable[Any], step: str, total: int) -> Iterable[Any]:
@@ -48,7 +48,7 @@ def untracked(items: Iterable[Any], step: str, total: int) -> Iterable[Any]:
 
 @contextmanager
 def ended(items: Iterable[Any]) -> Iterator[Iterable[Any]]:
-    """Give the items of a `Track`, and end it: an error refers to it, and would keep its lines going."""
+    """Yield the items of a `Track`, and close it: after an error it would otherwise print further lines."""
     try:
         yield items
     finally:
@@ -61,13 +61,13 @@ class TileStatus:
     """The current state of one tile."""
 
     graph: TileGraph
-    """Graph of the current sources and options; missing sources count as recorded when the tile was done."""
+    """Graph of the current sources and options; missing sources have their recorded state."""
     last_record: TileRecord | None
-    """Record of its last result, which may be of other sources or options; None if there is none."""
+    """Record of its last result, perhaps from other sources or options; None without a result."""
     up_to_date: bool
-    """Whether that result has the graph's fingerprint and its products exist."""
+    """Whether the last result has the graph's fingerprint and its products exist."""
     sources_present: bool
-    """Whether it is up to date, all its source files exist, and none was left out."""
+    """Whether it is up to date, all its source files exist, and no file was left out."""
     from_marker: bool
     """Whether the record was read from the marker, because the database does not have it."""
 
@@ -83,7 +83,7 @@ class TileStatus:
 
     @property
     def stale(self) -> bool:
-        """Whether the tile has products that are not of its current sources and options."""
+        """Whether the tile has products from earlier sources or options."""
         return not self.done and self.last_record is not None and self.last_record.has_products
 
 
@@ -111,9 +111,9 @@ def peek_statuses(run: Run, tiles: Iterable[Tile]) -> Iterator[TileStatus]:
 def tile_statuses(
     run: Run, database: RunDatabase, tiles: Iterable[Tile] | None = None, from_markers: bool = False
 ) -> Iterator[TileStatus]:
-    """Yield the current state of tiles of a run, by default of all, in the catalog's order; read-only.
+    """Yield the current state of tiles of a run, by default all tiles, in the catalog's order; read-only.
 
-    With ``from_markers`` all markers are read, also those that the database has.
+    With ``from_markers`` all markers are read, even if the database has their records.
     """
     files_of, stat_file = tile_files(run.path), run.stat_cache()
     for tile in run.catalog.tiles if tiles is None else tiles:
@@ -126,7 +126,7 @@ def tile_statuses(
 def _status(
     run: Run, tile: Tile, entry: TileRecord | None, files: dict[str, FileStat], stat_file: Stat
 ) -> TileStatus:
-    """Return the state of one tile that has this entry in the database and whose folder has ``files``."""
+    """Return the state of a tile, from its entry in the database and the files in its folder."""
     record = last_record(run.folder(tile.id), entry, files)
     graph = run.graph(tile, stat_file)
     from_marker, renamed = record is not entry, record.renamed if record else {}
@@ -143,7 +143,7 @@ def _status(
 def last_record(
     folder: TileProducts, entry: TileRecord | None, files: dict[str, FileStat]
 ) -> TileRecord | None:
-    """Return a tile's last record: the database entry if it is of the current marker, else the marker's."""
+    """Return a tile's last record: from the database if it belongs to the current marker, else from this."""
     name = DONE if DONE in files else FAILED if FAILED in files else None
     if name is None:
         # A failure on a full disk has no marker, only a database entry.
@@ -176,7 +176,7 @@ def has_marker(run: Run, record: TileRecord) -> bool:
         marker = marker_stat(folder, record.state)
         if marker is not None and marker == record.marker:
             return True
-        # Not every storage keeps the time that the worker was told.
+        # Some storages change the time of a file after the worker has read it.
         found = _from_marker(folder, marker) if marker else None
         if found and (found.fingerprint, found.finished) == (record.fingerprint, record.finished):
             return True
@@ -190,7 +190,7 @@ def open_database(run: Run, write: bool = False) -> RunDatabase:
 
 
 def known_record(run: Run, database: RunDatabase, tile_id: str) -> TileRecord | None:
-    """Return the record of a tile from the database, or from its marker if the database has none."""
+    """Return the record of a tile from the database, else from its marker."""
     folder = run.folder(tile_id)
     return database.get(tile_id) or last_record(folder, None, folder.files())
 
@@ -217,14 +217,14 @@ def tile_states(
 
 
 def last_start(run: Run) -> str:
-    """Return when the active run, or else the last one, started (ISO 8601, UTC); empty if unknown."""
+    """Return the start time of the active or last run (ISO 8601, UTC); empty if unknown."""
     holder = owner(run.path)
     start = holder.since if holder else read_summary(run.path).get("start")
     return start if isinstance(start, str) else ""
 
 
 def recorded(run: Run, database: RunDatabase, since: str | None = None) -> Iterator[Line]:
-    """Yield id, state and record of every tile: from the database, or if that is damaged by `tile_states`."""
+    """Yield id, state and record of every tile: from the database, or by `tile_states` if it is damaged."""
     if database.lists(tile.id for tile in run.catalog.tiles):
         yield from database.entries()
         return

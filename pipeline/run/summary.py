@@ -28,7 +28,7 @@ class Summary:
 
     tiles: int
     done: int
-    """Tiles with a result, including those of earlier executions."""
+    """Tiles with a result, including results of earlier executions."""
     failed: int
     cached: int
     """Done tiles that were already done when the last execution started."""
@@ -47,26 +47,26 @@ class Summary:
     refused: str = ""
     """Error that stopped the last execution as a whole; empty if there was none."""
     without_roads: int = 0
-    """Done tiles that have no road: their surface is that of the terrain."""
+    """Done tiles without a road: their surface is the surface of the terrain."""
     flagged: tuple[str, ...] = ()
-    """Ids of the done tiles to look at: those with flags in the variant exported first, but for no-road."""
+    """Ids of the done tiles to look at: tiles with flags except no-road in the variant exported first."""
     skipped: int = 0
     """Files that the catalog left out because they cannot be used."""
     lost: int = 0
-    """Tiles of earlier executions that the catalog lacks because their file was skipped."""
+    """Tiles of earlier executions that are not in the catalog because their file was skipped."""
     left_out: tuple[str, ...] = ()
-    """What the catalog skipped, one line per reason, the first `MAX_FAILURES`."""
+    """The files that the catalog skipped, one line per reason, the first `MAX_FAILURES`."""
     failures: tuple[Failure, ...] = ()
     """The first `MAX_FAILURES` failures, in the catalog's order."""
 
     @property
     def to_look_at(self) -> str:
-        """``; 4 to look at`` for the end of a line about the tiles; empty if none has flags."""
+        """``; 4 to look at`` for the end of a line about the tiles; empty without flags."""
         return f"; {len(self.flagged)} to look at" if self.flagged else ""
 
     @property
     def files_skipped(self) -> str:
-        """``; 2 files skipped by the catalog`` for such a line; empty if there are none."""
+        """``; 2 files skipped by the catalog`` for the end of a line; empty without skipped files."""
         return f"; {count(self.skipped, 'file')} skipped by the catalog" if self.skipped else ""
 
     @property
@@ -83,7 +83,7 @@ class Summary:
 def summarise(catalog: Catalog, tiles: Iterable[Line], variant: str) -> Summary:
     """Return the summary of a run.
 
-    - `tiles`: id, state and last record of its tiles; those that are missing are pending.
+    - `tiles`: id, state and last record of its tiles; missing tiles are pending.
     """
     counts, without_roads = Counter[TileState](), 0
     flagged, failures = list[str](), list[Failure]()
@@ -111,7 +111,7 @@ def summarise(catalog: Catalog, tiles: Iterable[Line], variant: str) -> Summary:
 
 
 def write_summary(run: Location, summary: Summary, flushed: bool = False, **about: Any) -> None:
-    """Write summary.json: the fields of the summary and those in ``about``.
+    """Write summary.json: the fields of the summary and the fields in ``about``.
 
     With ``flushed`` its content is on the disk before it replaces the old one.
     """

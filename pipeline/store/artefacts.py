@@ -1,7 +1,7 @@
 """Artefacts: the results of stages, stored by fingerprint.
 
-Every file of a store or run is written to a temporary name in the same folder and then renamed, or put into
-a bucket by one request. A reader therefore reads a complete file or none, even if the writer was killed. ::
+Every file of a store or run is written to a temporary name in the same folder and renamed, or put into
+a bucket by one request. A reader therefore never reads an incomplete file, even if the writer was killed. ::
 
     STORE/<stage>/<ab>/<fingerprint>.npz        artefacts
     RUN/tiles/<tile>/<tile>_<variant>.glb ...   products
@@ -9,8 +9,8 @@ a bucket by one request. A reader therefore reads a complete file or none, even 
     RUN/tiles/<tile>/failed.json                written instead if a stage failed
 
 An artefact is an npz with the arrays of a result and a JSON header. The SHA-256 of the npz and of its
-fingerprint is appended to it, where npz readers ignore it. On reading it detects damage, and a file under the
-name of another. No pickle is used, because a store may be shared.
+fingerprint is appended to it, where npz readers ignore it. It detects damaged and wrongly named files. No
+pickle is used, because a store may be shared.
 """
 
 from __future__ import annotations
@@ -68,20 +68,20 @@ class ArtefactStore:
     root: Location
 
     def get(self, node: Node) -> Stored | None:
-        """Return a result with the seconds and notes up to it, None if it is missing or damaged."""
+        """Return a result with its seconds and notes (`Stored`), None if it is missing or damaged."""
         return self.find(node.stage, node.fingerprint)
 
     def find(self, stage: str, fingerprint: str) -> Stored | None:
-        """Return what `get` returns, for a node of which only stage and fingerprint are known."""
+        """Do as `get`, for a node of which only stage and fingerprint are known."""
         try:
             found = decode(paths.read(self._path(stage, fingerprint)), fingerprint)
         except DAMAGED:
-            # A damaged artefact counts as missing: it is computed and written again.
+            # A damaged artefact is treated as missing: it is computed and written again.
             return None
         return found if isinstance(found.value, RESULTS[stage]) else None
 
     def put(self, node: Node, value: Any, seconds: Mapping[str, float], notes: Sequence[str]) -> int:
-        """Store a result with the seconds of each stage and the notes up to it; return the size in bytes."""
+        """Store a result with its seconds and notes (`Stored`); return the size in bytes."""
         data = encode(value, seconds, notes, node.fingerprint)
         paths.write(self._path(node.stage, node.fingerprint), data)
         return len(data)
@@ -91,7 +91,7 @@ class ArtefactStore:
         try:
             return paths.exists(self._path(node.stage, node.fingerprint))
         except OSError:
-            # To store it then raises the error.
+            # The error is raised again when the result is stored.
             return False
 
     def _path(self, stage: str, fingerprint: str) -> Location:
@@ -101,16 +101,16 @@ class ArtefactStore:
 
 HEADER = "header.json"
 SEPARATOR = "."
-"""Between the names of a field and of a field of the result in it, in the names of arrays."""
+"""Separates the names of a field and of a nested field in the names of arrays."""
 CHANGES = ".changes"
-"""End of the name of faces that are stored as differences from the face before, in a quarter of the bytes."""
+"""End of the name of faces stored as differences from the face before, which take a quarter of the bytes."""
 LEVELS = ("level", "levels", "structures")
 """Fields that are left out if they are empty: most results have no levels."""
 SHA256_BYTES = 32
 
 
 class Stored(NamedTuple):
-    """A result with what is known of its making."""
+    """A result with the time and the notes of its computation."""
 
     value: Any
     seconds: dict[str, float]
@@ -120,7 +120,7 @@ class Stored(NamedTuple):
 
 
 def encode(value: Any, seconds: Mapping[str, float], notes: Sequence[str], fingerprint: str) -> bytes:
-    """Return the bytes of a result, of the seconds of each stage and of the notes up to it (`Stored`)."""
+    """Return a result with its seconds and notes (`Stored`) as bytes."""
     arrays: dict[str, Any] = {}
     plain = _fields(value, "", arrays)
     header = {"type": type(value).__name__, "seconds": dict(seconds), "notes": list(notes), "fields": plain}
@@ -130,7 +130,7 @@ def encode(value: Any, seconds: Mapping[str, float], notes: Sequence[str], finge
 
 
 def decode(data: bytes, fingerprint: str) -> Stored:
-    """Return the result, the seconds of each stage and the notes up to it."""
+    """Return the result with its seconds and notes from the bytes of `encode`."""
     payload, checksum = data[:-SHA256_BYTES], data[-SHA256_BYTES:]
     if _checksum(payload, fingerprint) != checksum:
         raise ValueError("the checksum does not match the data and its fingerprint")
@@ -148,7 +148,7 @@ def _checksum(payload: bytes, fingerprint: str) -> bytes:
 
 
 def _fields(value: Any, prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a result as JSON values, and add its arrays to those of the file by name."""
+    """Return the fields of a result as JSON values, and add its arrays to ``arrays`` by name."""
     plain: dict[str, Any] = {}
     for field in fields(value):
         item, name = getattr(value, field.name), prefix + field.name
@@ -165,12 +165,12 @@ def _compact(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
         return {name: array}
     if array.dtype.kind == "i":
         return {name + CHANGES: np.diff(array, axis=0, prepend=np.zeros((1, 3), array.dtype))}
-    # Points are a quarter smaller by columns: many have the same x or y.
+    # Points stored by columns are a quarter smaller, because many have the same x or y.
     return {name: np.asfortranarray(array)}
 
 
 def _arrays(archive: Mapping[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the arrays of a file, as they were before `_compact`, by name."""
+    """Yield the arrays of a file by name, in the form before `_compact`."""
     for name, array in archive.items():
         if name.endswith(CHANGES):
             yield name.removesuffix(CHANGES), np.cumsum(array, axis=0, dtype=array.dtype)
@@ -196,7 +196,7 @@ def _json(item: Any, name: str, arrays: dict[str, Any]) -> Any:
 
 
 def _result(kind: str, plain: Mapping[str, Any], prefix: str, arrays: Mapping[str, Any]) -> Any:
-    """Return a result from its fields of JSON and from the arrays whose names begin with a prefix."""
+    """Return a result from its JSON fields and from the arrays whose names begin with a prefix."""
     own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
     own = {name: array for name, array in own.items() if SEPARATOR not in name and name not in plain}
     return _types()[kind](**{name: _plain(item, arrays) for name, item in plain.items()}, **own)
@@ -209,7 +209,7 @@ def _plain(item: Any, arrays: Mapping[str, Any]) -> Any:
         if "wkb" in item:
             return shapely.from_wkb(arrays[item["wkb"]].tobytes())
         return _result(item["result"], item["fields"], item["prefix"], arrays)
-    # The result types hold tuples, which JSON stores as lists.
+    # The result types have tuples, which JSON stores as lists.
     return tuple(_plain(part, arrays) for part in item) if isinstance(item, list) else item
 
 

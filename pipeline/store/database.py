@@ -1,13 +1,13 @@
 """The states and records of all tiles of a run, in one file: ``RUN/database.txt``.
 
-The file is a cache of the tiles' markers. If it is missing, damaged or of another version, it counts as
+The file is a cache of the tiles' markers. If it is missing, damaged or of another version, it is taken as
 empty, and the markers are read instead. One run writes it; other processes may read it at the same time. ::
 
     flexroad database 5 CHECKSUM            of the checksums of all lines
     CHECKSUM    "tile"    state    record   a line per tile in the catalog's order, then a line per result
 
-The last line of a tile is valid. Lines are only appended, and the first line is changed after that: a run
-that is killed leaves a valid file.
+The last line of a tile is valid. Lines are only appended, and then the first line is changed. So a killed run
+leaves a valid file.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ DIGITS = 2 * CHECKSUM_BYTES
 FLUSH_S = 1.0
 """Interval between writes of recorded tiles (s)."""
 Line = tuple[str, TileState, TileRecord | None]
-"""Id and state of a tile, and the record of its last result; None if it has none."""
+"""Id and state of a tile, and the record of its last result or None."""
 
 
 class RunDatabase:
     """States and records of a run's tiles; a context manager that writes all pending records on exit.
 
-    - `writable`: whether this process writes the file; it is then made empty if it is missing or damaged.
+    - `writable`: whether this process writes the file; a missing or damaged file is then made empty.
     """
 
     def __init__(self, path: Location, writable: bool = False) -> None:
@@ -54,20 +54,20 @@ class RunDatabase:
             self.set_states(())
 
     def load(self) -> bool:
-        """Read the file again, and return whether it is valid; it counts as empty if it is not."""
+        """Read the file again, and return whether it is valid; an invalid file is taken as empty."""
         if self._file:
             self._file.close()
         self._offsets: dict[str, int] = {}
         self._checksums = blake2b(digest_size=CHECKSUM_BYTES)
         self._file, self._end = None, 0
-        # To open a pipe would wait for a writer.
+        # Opening a pipe would wait for a writer.
         if not self._staged.path.is_file():
             return False
         offsets, checksums = {}, self._checksums.copy()
         with contextlib.suppress(OSError):
             self._file = self._staged.path.open("rb")
             header = self._file.read(len(_header(checksums)))
-            # What is appended from now on is not read.
+            # Lines that are appended from now on are not read.
             size, end = os.fstat(self._file.fileno()).st_size, len(header)
             while end < size:
                 line = self._file.readline()
@@ -149,7 +149,7 @@ class RunDatabase:
                 file.seek(0)
                 file.write(_header(checksums))
         except FileNotFoundError:
-            # Someone has deleted the file. At the end of the run the markers are read.
+            # The file was deleted. The markers are read at the end of the run.
             pass
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self._staged.where)) from error
@@ -158,7 +158,7 @@ class RunDatabase:
         self._pending.clear()
 
     def get(self, tile_id: str) -> TileRecord | None:
-        """Return a tile's record, None if it has none or it is damaged."""
+        """Return a tile's record, None if it is missing or damaged."""
         if tile_id in self._pending:
             return self._pending[tile_id]
         line = self._read(tile_id) if tile_id in self._offsets else None

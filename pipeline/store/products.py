@@ -14,7 +14,7 @@ from flexroad.catalog.storage.paths import FileStat, Location, contained
 from flexroad.pipeline.store.records import DONE, FAILED, dump_checked, load_checked
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
-"""What reading a damaged marker raises."""
+"""Errors from reading a damaged marker."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class TileProducts:
         return contained(self.path / name, self.path.parent.parent)
 
     def files(self) -> dict[str, FileStat]:
-        """Return the files of the folder by name; none if it is a link."""
+        """Return the files of the folder by name; empty if the folder is a link."""
         linked = isinstance(self.path, Path) and self.path.is_symlink()
         return {} if linked else paths.listing(self.path)
 
@@ -55,7 +55,7 @@ class TileProducts:
             return {}
 
     def verified(self) -> bool:
-        """Return whether every product named by the item has the checksum it was written with."""
+        """Return whether every product in the item still has its checksum."""
         item = self.marker(DONE) or {}
         try:
             return all(
@@ -68,23 +68,23 @@ class TileProducts:
     def finish(self, item: dict[str, Any], products: Mapping[str, bytes], flushed: bool = False) -> None:
         """Write the products, then the item that marks the tile as done.
 
-        An existing item is removed first, so that a tile with old and new products never counts as done.
-        With ``flushed`` each of these steps is on the disk before the next one.
+        An existing item is removed first, so that a tile with old and new products is never done. With
+        ``flushed`` each of these steps is on the disk before the next step.
         """
         self._unmark(flushed)
         for name, data in products.items():
             paths.write(self.file(name), data)
         if flushed:
-            # Together they take hardly longer than one.
+            # Flushing all products together takes hardly longer than one of them.
             for name in products:
                 paths.flush(self.path / name)
-            # Otherwise a new item could meet an old product of the same size.
+            # Without this, a power failure could leave a new item with an old product of the same size.
             paths.flush_names(self.path)
         self._mark(DONE, item, flushed)
         paths.remove(self.file(FAILED))
 
     def fail(self, failure: dict[str, Any], flushed: bool = False) -> None:
-        """Write failed.json and remove the item, so that the tile no longer counts as done.
+        """Write failed.json and remove the item, so that the tile is no longer done.
 
         With ``flushed`` the file is on the disk at the end.
         """
@@ -92,7 +92,7 @@ class TileProducts:
         self._mark(FAILED, failure, flushed)
 
     def _unmark(self, flushed: bool) -> None:
-        """Remove the item; with ``flushed`` it is not back after a power failure."""
+        """Remove the item; with ``flushed`` also permanently in case of a power failure."""
         paths.remove(self.file(DONE))
         if flushed:
             paths.flush_names(self.path)

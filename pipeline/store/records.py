@@ -1,4 +1,4 @@
-"""The record of one tile of a run: what tables and resumed runs need of its marker; JSON with a checksum."""
+"""The record of one tile of a run: the part of its marker for tables and resumed runs."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from flexroad.tasks.metrics.evaluate import FIGURES
 from flexroad.tasks.quality.assess import NO_ROAD
 
 MetricsRow = dict[str, Any]
-"""One row of metrics.parquet, by column; for a tile with decks or tunnels also its rows of levels.csv."""
+"""One row of metrics.parquet, by column; with decks or tunnels also the tile's rows of levels.csv."""
 LEVELS = "levels"
-"""Name of these rows."""
+"""Key of the rows of levels.csv in a row."""
 MeshDistances = dict[str, dict[str, float]]
 """Largest distances of meshes from their surfaces (m), by variant and column of metrics.parquet."""
 TileState = Literal["cached", "done", "failed", "pending"]
@@ -27,7 +27,7 @@ MarkerStat = tuple[str, int, int | str]
 CHECKSUM = "flexroad:checksum"
 DONE, FAILED = "item.json", "failed.json"
 MARKERS: dict[TileState, str] = {"done": DONE, "failed": FAILED}
-"""Name of the marker file of each state that has one."""
+"""Name of the marker file of each state with a marker."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class TileRecord:
     stale: tuple[str, ...] = ()
     """Names of the products of an earlier result that a failed tile still has."""
     renamed: dict[str, str] = field(default_factory=dict)
-    """Names of results that were made without a file, by fingerprint (`TileGraph.renamed`)."""
+    """Names of results that were computed without an unusable file, by fingerprint (`TileGraph.renamed`)."""
     left_out: tuple[str, ...] = ()
-    """These files, by layer and name in the catalog: they could not be used when the tile was finished."""
+    """Files that could not be used when the tile was finished, by layer and name in the catalog."""
 
     @property
     def has_products(self) -> bool:
@@ -99,7 +99,7 @@ class TileRecord:
 
 
 def needs_look(flags: object) -> bool:
-    """Return whether a row with these flags should be looked at: it has one beside `NO_ROAD`."""
+    """Return whether a row with these flags should be looked at: it has a flag other than `NO_ROAD`."""
     return isinstance(flags, str) and not {*flags.split(", ")} <= {"", NO_ROAD}
 
 
@@ -150,10 +150,7 @@ def from_failed(content: dict[str, Any], marker: MarkerStat | None) -> TileRecor
 
 
 def with_distances(rows: Iterable[MetricsRow], largest: MeshDistances) -> Iterator[MetricsRow]:
-    """Yield the rows, and put the largest distances in them into ``largest``.
-
-    Rows of failed tiles have none.
-    """
+    """Yield the rows, and put their largest distances into ``largest``; rows of failed tiles have none."""
     for row in rows:
         for name, value in distances_of(row).items():
             own = largest.setdefault(row["variant"], {})
@@ -177,9 +174,9 @@ def utc_now() -> str:
 
 
 def dump_checked(content: dict[str, Any]) -> bytes:
-    """Return an object as JSON with a checksum: a flipped bit in a figure leaves valid JSON.
+    """Return an object as JSON with a checksum, because a flipped bit in a number leaves valid JSON.
 
-    What a damaged file held is computed or written again.
+    If the checksum is wrong, the content is computed or written again.
     """
     return json.dumps({**content, CHECKSUM: _checksum(content)}, indent=1, allow_nan=False).encode()
 

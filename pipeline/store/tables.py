@@ -1,4 +1,4 @@
-"""The run's tables: fixed columns, one row per (tile, variant), one row per failure."""
+"""The run's tables with fixed columns: one row per (tile, variant), and one row per failure."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ pandas = lazy("pandas")
 pyarrow = lazy("pyarrow")
 
 METRICS, PREVIOUS = "metrics.parquet", "metrics.previous.parquet"
-"""Tables of a run, and before its last execution."""
+"""Metrics of a run, and its metrics before the last execution."""
 OF_LEVELS = "levels.csv"
 """Figures of decks and tunnels: a row per tile, variant and level."""
 CHUNK = 10_000
-"""Rows held in memory at a time; also the row groups of metrics.parquet."""
+"""Number of rows in memory at a time, and in a row group of metrics.parquet."""
 
 TEXTS = "tile_id variant method stratum status error flags".split()
 NAMES = """
@@ -106,7 +106,7 @@ def _write_csv(path: Location, names: Sequence[str], rows: Iterable[Iterable[Any
 
 
 def csv_text(table: pd.DataFrame, **options: Any) -> str:
-    """Return a table as CSV in which no text is a formula (`no_formula`); ``options`` as of pandas."""
+    """Return a table as CSV in which no text is a formula (`no_formula`); ``options`` go to pandas."""
     safe = table.set_axis([no_formula(name) for name in table.columns], axis="columns")
     for number, kind in enumerate(table.dtypes):
         if not pandas.api.types.is_numeric_dtype(kind):
@@ -115,7 +115,7 @@ def csv_text(table: pd.DataFrame, **options: Any) -> str:
 
 
 def _table(rows: Sequence[MetricsRow], schema: Any) -> Any:
-    """Return rows as a table: by way of JSON, because pyarrow imports pandas to read Python objects."""
+    """Return rows as a table. They pass through JSON, because pyarrow imports pandas for Python objects."""
     lines = "\n".join(json.dumps(row, allow_nan=False) for row in rows).encode()
     table = pyarrow.json.read_json(
         pyarrow.BufferReader(lines),
@@ -123,7 +123,7 @@ def _table(rows: Sequence[MetricsRow], schema: Any) -> Any:
         pyarrow.json.ReadOptions(use_threads=False, block_size=len(lines) + 1),
         pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
     )
-    # The columns have these types already, and a cast would import pyarrow.compute.
+    # The columns already have these types, and a cast would import pyarrow.compute.
     return table.replace_schema_metadata(schema.metadata)
 
 

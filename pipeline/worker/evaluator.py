@@ -54,7 +54,7 @@ class StageCost:
 
     @contextlib.contextmanager
     def measure(self) -> Iterator[None]:
-        """Add time and peak memory of the ``with`` block, also if it raises."""
+        """Add time and peak memory of the ``with`` block, even if it raises an error."""
         self.time = self.time or utc_now()
         _reset_peak()
         start = perf_counter()
@@ -108,9 +108,9 @@ class Evaluator:
     notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Fingerprint -> notes on the sources of the node and of the nodes it depends on."""
     renamed: dict[str, str] = field(default_factory=dict)
-    """Fingerprint -> name of the result, if a file was left out of it, or of what it was computed from."""
+    """Fingerprint -> name of the result, if a file was left out of the result or of its inputs."""
     left_out: dict[str, None] = field(default_factory=dict)
-    """These files, by layer and name in the catalog."""
+    """Files that were left out, by layer and name in the catalog."""
     spans: defaultdict[str, StageCost] = field(default_factory=lambda: defaultdict(StageCost))
     """Cost of each stage in this process."""
     errors: dict[str, StageError] = field(default_factory=dict)
@@ -127,7 +127,7 @@ class Evaluator:
         return self.results[fingerprint]
 
     def _restore(self, node: Node) -> bool:
-        """Read a result from the store, by its name; return whether it is there."""
+        """Read a result from the store, by its name; return whether the store has it."""
         if not node.stored or node.stage in self.force:
             return False
         artefact = self.store.get(self._named(node))
@@ -144,9 +144,9 @@ class Evaluator:
         return replace(node, fingerprint=name) if name else node
 
     def rename(self, name: str, left_out: Iterable[tuple[str, str]], inputs: Iterable[str] = ()) -> None:
-        """Name a result also by the files that are left out of it (`LeftOut`) and of its inputs.
+        """Add the files that are left out of a result (`LeftOut`) and of its inputs to its name.
 
-        Of missing files the fingerprint itself knows.
+        Missing files are left out of the name, because the fingerprint itself depends on them.
         """
         missing = self.graph.tile.missing or ()
         own = sorted((self.graph.in_catalog(file), cells) for file, cells in left_out if file not in missing)
@@ -182,7 +182,7 @@ class Evaluator:
             self._store(node, result, seconds)
 
     def _seconds_before(self, node: Node) -> dict[str, float]:
-        """Return the computing time of each stage before a node (s); that of a border is its own alone."""
+        """Return the computing time of each stage before a node (s); for a border only its own time."""
         if node.border:
             return {}
         seconds = {stage: value for name in node.inputs for stage, value in self.chain_seconds[name].items()}
@@ -200,7 +200,7 @@ class Evaluator:
             function = stage_function(node.stage, node.options)
             return function(*(inputs or [self.graph.readable]), node.options, **framed)
         finally:
-            # Also after an error: a file that is being replaced may be unreadable.
+            # This check also runs after an error: a file that is being replaced may be unreadable.
             check_unchanged(self.graph, files_read(self.graph, node))
 
     def _store(self, node: Node, result: Any, seconds: Mapping[str, float]) -> None:
@@ -237,7 +237,7 @@ def failure_of(tile: Tile, stage: str, error: BaseException) -> Failure:
 
 
 def _file_of(tile: Tile, error: BaseException) -> str:
-    """Return the file that caused an error, ``""`` if there is none."""
+    """Return the file that caused an error, or ``""``."""
     if isinstance(error, TaskError):
         layer = tile.layer(error.layer)
         return error.file or (str(tile.paths(layer)[0]) if layer else "")

@@ -1,7 +1,7 @@
 """The products of a tile: meshes, rasters and the surface itself, in standard formats, and their STAC assets.
 
-The assets are those of a tile's item and, without files, of the run's collection. They are plain
-dictionaries: to import pystac would cost every worker a fifth of a second.
+The assets are written to a tile's item and, without files, to the run's collection. They are plain
+dictionaries, because an import of pystac would cost every worker a fifth of a second.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ EXTENSIONS = (FILE, RASTER, CLASSIFICATION)
 COLLECTION = "collection.json"
 NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"
 QUALITY = 85
-"""Quality of the texture's JPEG (percent): blocks are hardly visible."""
+"""Quality of the texture's JPEG (percent), at which blocks are hardly visible."""
 JSON, GEOJSON = "application/json", "application/geo+json"
 
 
@@ -56,7 +56,7 @@ class Kind:
     media_type: str
     title: str
     band: cog.Band | None = None
-    """The band of a raster, None if it is no raster."""
+    """The band of a raster, None if it is not a raster."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
 
 
 def of_level(kind: Kind, number: int) -> Kind:
-    """Return the kind of raster that shows one level, on tiles where another one is above it."""
+    """Return the kind of raster for one level that lies below another level."""
     stem, ending = kind.suffix.split(".")
     title = f"{kind.title}, level {number}"
     return replace(
@@ -146,7 +146,7 @@ def products(
                 encoded = _cog(graph.tile.grid, nodes, evaluate, vertical)
             else:
                 surface = evaluate(nodes["fit"])
-                # Planes and rasters have no NURBS form, and their npz would only repeat the input.
+                # Planes and rasters are not NURBS surfaces, and their npz would only repeat the input.
                 encoded = {NPZ: npz.encode(surface)} if isinstance(surface, NurbsSurface) else {}
             for kind, data in encoded.items():
                 known = vertical if kind.band is cog.HEIGHT else None
@@ -159,11 +159,11 @@ def _cog(
 ) -> dict[Kind, bytes]:
     road, surface = evaluate(nodes["segment"]), evaluate(nodes["fit"])
     window = road.grid.window(core)
-    # Rasters have the highest level, as the DSM.
+    # Rasters show the highest level, like the DSM.
     heights = surface.highest.lattice(core.eastings, core.northings)
     heights[road.outside[window]] = float("nan")
     kept, quality = top_mask(evaluate(nodes["ecsrc"]))[window], evaluate(nodes["assess"])
-    # Without a common one, GDAL's environment is set up and cleared for each call.
+    # Without a common environment, GDAL's environment would be set up and cleared for each call.
     with quiet():
         height_source, others = _of_levels(core, road.outside[window], surface, quality, vertical)
         return {
@@ -199,8 +199,8 @@ def _of_levels(
 def assets(files: Mapping[str, Product], variants: tuple[str, ...], grid: Grid) -> dict[str, Any]:
     """Return the assets of a tile's item from its files by name.
 
-    The keys are the same for all tiles, as loaders of many items need them: ``height`` for the first of the
-    exported variants, ``height_VARIANT`` for the others.
+    Loaders of many items need equal keys for all tiles: ``height`` for the first exported variant,
+    ``height_VARIANT`` for the other variants.
     """
     return {
         asset_key(product.kind, product.variant, variants): file_entry(
@@ -213,7 +213,7 @@ def assets(files: Mapping[str, Product], variants: tuple[str, ...], grid: Grid) 
 
 
 def item_assets(variants: tuple[str, ...], formats: Iterable[str], cells: set[float]) -> dict[str, Any]:
-    """Return what the assets of all items have in common, for a collection."""
+    """Return the common fields of the assets of all items, for a collection."""
     cell = cells.copy().pop() if len(cells) == 1 else None
     return {
         asset_key(kind, variant, variants): {"type": kind.media_type}
@@ -225,7 +225,7 @@ def item_assets(variants: tuple[str, ...], formats: Iterable[str], cells: set[fl
 
 
 def asset_key(kind: Kind, variant: str, variants: tuple[str, ...]) -> str:
-    """Return the key of the asset of a variant; ``variants`` are all that are exported."""
+    """Return the key of the asset of a variant; ``variants`` are all exported variants."""
     return kind.key if variant == variants[0] else f"{kind.key}_{variant}"
 
 
@@ -261,8 +261,8 @@ def _band(band: cog.Band, cell: float | None) -> dict[str, Any]:
 def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
     """Return the texture of a tile's meshes: its orthophoto, at its own resolution up to `export.texture_px`.
 
-    - `texture`: none if the configuration wants none, or the tile has no photo.
-    - `note`: what the photo lacks, or empty.
+    - `texture`: None if it is not configured, or the tile has no photo.
+    - `note`: the part without a photo, or empty.
     """
     export, tile = graph.export, graph.tile
     if not export.texture:

@@ -14,21 +14,21 @@ from flexroad.catalog.storage.paths import PROBE, FileStat, parse_location
 from flexroad.pipeline.worker.tile import TileJob
 
 MOUNT = "mount it there under the same path"
-"""Remedy for a worker that has other files."""
+"""Remedy for a worker with other files."""
 
 
 Proof = tuple[str, dict[str, FileStat | None]]
-"""Name of the file that a worker has written into each folder; size and version, as the worker has them, of
-the source files that differ from those in the tile's graph."""
+"""Name of the file that a worker has written into each folder, and the source files that differ from the
+tile's graph, with their size and version on the worker."""
 
 
 @dataclass(frozen=True)
 class SharedFiles:
     """The folders that client and workers share (a `flexroad.pipeline.execute.executor.Probe`).
 
-    The client writes a file with a random name into each folder. A worker looks for it, and writes one of its
-    own, which the client looks for. At the end the client removes all of them; ``flexroad clean`` removes
-    those of a client that was killed.
+    The client writes a file with a random name into each folder. A worker looks for it and writes another
+    file, which the client looks for. At the end the client removes all of these files. ``flexroad clean``
+    removes the files of a killed client.
     """
 
     folders: tuple[str, ...]
@@ -75,7 +75,7 @@ class SharedFiles:
         if missing:
             raise OSError(f"what it writes to {missing[0]} does not arrive here; {MOUNT}")
         for file, there in different.items():
-            # A file may have changed since the graph was made: then it differs here, too.
+            # If a file has changed since the graph was made, it differs here, too.
             if source_stat(parse_location(file)) != there:
                 what = "does not exist" if there is None else "has another size or time"
                 raise OSError(f"{file} {what} there; {MOUNT}")
@@ -105,7 +105,7 @@ def _arrived(folder: str, name: str) -> bool:
 
 
 def _different(job: TileJob) -> dict[str, FileStat | None]:
-    """Return size and version of those source files that this process has otherwise: one of each folder."""
+    """Return size and version of source files that differ in this process; at most one file per folder."""
     known = {file: stat for file, stat in job.graph.file_stats.items() if stat is not None}
     one_of_each = {str(PurePath(file).parent): file for file in known}.values()
     here = {file: source_stat(parse_location(file)) for file in one_of_each}

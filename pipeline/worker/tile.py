@@ -63,7 +63,7 @@ class TileJob:
     force: frozenset[str] = frozenset()
     """Stages to compute even if their results are in the store."""
     flushed: bool = False
-    """Whether products and marker are on the disk before the tile counts as done or failed."""
+    """Whether products and marker are written to the disk before the tile is done or failed."""
 
     @property
     def key(self) -> str:
@@ -143,7 +143,7 @@ def record_failure(
 ) -> TileRecord:
     """Write the tile's failed.json and return the record of the failure.
 
-    Products of an earlier result stay, and are named there as stale.
+    Products of an earlier result stay, and failed.json names them as stale.
     """
     tile_id, fingerprint = job.graph.tile.id, job.graph.fingerprint
     marker, stale = None, tuple[str, ...]()
@@ -184,7 +184,7 @@ def _failed(head: MetricsRow, error: str) -> MetricsRow:
 
 
 def without_results(record: TileRecord, failure: Failure) -> TileRecord:
-    """Return the record of a done tile whose results are gone; no marker has it."""
+    """Return the record of a done tile whose results are gone; it is not in a marker."""
     rows = tuple(_failed(row, failure.line) for row in record.rows)
     return replace(record, state="failed", rows=rows, failures=(failure,), sources=[], sizes={}, marker=None)
 
@@ -201,7 +201,7 @@ def _row(graph: TileGraph, variant: str, evaluator: Evaluator) -> MetricsRow:
 
 
 def _of_levels(quality: Quality) -> list[dict[str, Any]]:
-    """Return the figures of the decks and tunnels of a tile, for each level that has some."""
+    """Return the figures of the decks and tunnels of a tile, for each level with decks or tunnels."""
     return [
         no_nan(
             {"level": number}

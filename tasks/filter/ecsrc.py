@@ -71,7 +71,8 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     cell, roots = data.grid.cell, init(points)
     heights = np.ascontiguousarray(data.dsm)
     _join(heights, roots, points, forward_offsets(1.5), options.theta_z_m)
-    # Of any two clusters one is not the largest, so no search starts in the largest, which has most points.
+    # The search starts only in clusters other than the largest. The largest has most points, so time is
+    # saved.
     starts = points & (roots.reshape(points.shape) != largest_of(compress(roots)))
     far = forward_offsets(options.theta_xy_m / cell)
     _join(heights, roots, starts, np.concatenate([far, -far]), options.theta_z_m)
@@ -82,7 +83,7 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
 
 @compiled()
 def _join(heights: Floats, roots: Roots, starts: Bools, steps: NDArray[np.int64], theta_z: float) -> None:
-    """Unite the sets of a start and a point if they are a step apart and within ``theta_z`` in height."""
+    """Unite the sets of a start and a point if one step joins them and their heights agree to ``theta_z``."""
     rows, cols = heights.shape
     for i in np.flatnonzero(starts):
         r, c = i // cols, i % cols

@@ -3,8 +3,8 @@
 Like the paper's ECSRC (`tasks.filter.ecsrc`) it grows clusters, merges them across gaps and cleans them.
 Clusters grow over flat patches instead of cells, so they do not climb onto objects: no plane fits a tree
 crown or the edge of a car, but a bridge deck continues the street at its ends. Clusters merge along the
-street's slope, and each is accepted or dropped as a whole, by its height above the DTM and its area. Cells
-outside all patches are compared, one by one, with the accepted cells around them.
+street's slope. Each cluster is accepted or dropped completely, by its height above the DTM and its area.
+Cells outside all patches are compared, one by one, with the accepted cells around them.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ VERSION = 4
 REACH_M = 4.0
 """Distance up to which a cell is compared with ground cells around it (m)."""
 GROUND_SHARE = 0.2
-"""A cluster is on the ground if this share of its cells is: a deck is one cluster with its approaches."""
+"""Share of cells on the ground from which a cluster is on the ground: a deck is joined to its approaches."""
 BEYOND_M = 3.0
 """Distance beyond the shoulder up to which a smooth surface may not follow the ground yet (m)."""
 UNKNOWN_M = 2.0
@@ -50,12 +50,12 @@ MAX_PLANE_VARIANCE = 0.5
 """A plane is used only where the variance of its height is at most this share of a single cell's."""
 
 Window = tuple[int, int, int, int]
-"""First and last row, first and last column; the last ones are exclusive."""
+"""First and last row, first and last column; the last row and column are exclusive."""
 BEND = 0.1
 """Largest difference between the slope of a flat patch and the slope of the street (m per m)."""
 RAISED_M2_PER_M = 150.0
 """Smallest area of a cluster off the ground, per metre above or below the DTM (m2 per m): an elevated road
-is large for its height, a roof is not. Clusters connected to the ground need none."""
+is large for its height, a roof is not. Clusters connected to the ground need no area."""
 
 
 class Options(base.Options):
@@ -87,34 +87,34 @@ class Options(base.Options):
         0.0,
         ge=0,
         le=50,
-        description="distance beside the road up to which the DTM is ignored (m): terrain models smooth "
-        "kerbs and banks, which would lift the edge of the road surface",
+        description="distance beside the road up to which the DTM is ignored (m). Terrain models smooth "
+        "kerbs and banks, which would lift the road's edge",
     )
 
 
 def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
-    """Label the road cells whose DSM height is the road's; drop cells covered by objects.
+    """Label the road cells whose DSM shows the road; drop cells covered by objects.
 
     Parameters
     ----------
     data : TileData
-        Its DSM gives the points' heights, its DTM the ground's, ``(H, W)``, m.
+        The DSM has the heights of the points, the DTM the heights of the ground, ``(H, W)``, m.
     road : RoadMask
         The raw mask M^r on the same grid.
 
     Returns
     -------
     RoadClusters
-        Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if
-        no cluster is large enough. ``dtm_invalid`` marks the dropped cells where the DTM is not the road's
-        height either (under a car on a bridge it is the valley's), and the shoulder. ``beside`` are the cells
-        of the shoulder and those up to `BEYOND_M` from it. With levels, it is once for each of them.
+        Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if no
+        cluster is large enough. ``dtm_invalid`` marks the shoulder and dropped cells where the DTM shows
+        other ground, such as the valley below a bridge. ``beside`` marks the shoulder and cells up to
+        `BEYOND_M` from it. With levels, there are clusters for each level.
     """
     return ecsrc_near(data, road, options, (slice(0, data.grid.height), slice(0, data.grid.width)))
 
 
 def ecsrc_near(data: TileData, road: RoadMask, options: Options, near: Slices) -> RoadClusters:
-    """Return the result of `ecsrc` with ``dtm_invalid`` and ``beside`` in a part of the raster alone.
+    """Return the result of `ecsrc` with ``dtm_invalid`` and ``beside`` only in a part of the raster.
 
     Elsewhere they may be False. Labels are complete: clusters are judged by all their cells.
 
@@ -123,7 +123,7 @@ def ecsrc_near(data: TileData, road: RoadMask, options: Options, near: Slices) -
     if road.levels:
 
         def of_level(seen: TileData, road: RoadMask, other: bool) -> RoadClusters:
-            # A deck that is named needs no area.
+            # A deck from the vectors needs no minimum area.
             return _clusters_of(seen, road, options, near, 0.0 if other else RAISED_M2_PER_M)
 
         return level_clusters(data, road, of_level, options.shoulder_m, BEYOND_M)
@@ -145,14 +145,14 @@ def _clusters_of(
     clusters = _covered(roots, reach)
     ground = _on_ground(data, clusters, theta, raised_m2_per_m)
     reach = max(1, math.floor(REACH_M / cell + 1e-9))
-    # The plane of a foot goes on up the object's side.
+    # The plane of a patch at the foot of an object continues up its side.
     climbing = climbs & (np.abs(data.dsm - data.dtm) > theta)
     others = points & ~ground & ~climbing
     consistency = ground_consistency(data.dsm, data.dtm, ground, others, reach, theta)
     kept = ground | (consistency == CONSISTENT)
     alone = others & (consistency == NO_NEIGHBOURS)
     kept[alone] = np.abs(data.dsm[alone] - data.dtm[alone]) <= theta
-    # By gaps alone: heights were checked before.
+    # Clusters merge without regard to heights, which were checked before.
     roots = _merged(kept, options.theta_xy_m / cell, data.dsm, trend, math.inf)
     labels = clean(kept, roots, least_cells(options.min_area_m2, cell), options.keep_largest)
     dtm_invalid = invalid_dtm(data, road, labels > 0, near)
@@ -172,7 +172,7 @@ def _streets(mask: Bools, kept: Bools) -> Bools:
     parts = init(mask)
     _join_neighbours(parts, mask)
     parts = compress(parts).reshape(mask.shape)
-    # The last element is that of the cells in no part.
+    # The last element belongs to the cells in no part.
     street = np.zeros(mask.size + 1, np.bool_)
     street[parts[kept]] = True
     return street[parts]
@@ -194,7 +194,7 @@ def _on_ground(data: TileData, clusters: NDArray[np.int32], theta: float, raised
 
 
 def _medians(values: Floats, member: NDArray[np.intp], count: int) -> Floats:
-    """Return the median of each cluster's finite values, `UNKNOWN_M` if it has none, ``(count,)``."""
+    """Return the median of each cluster's finite values, or `UNKNOWN_M`, ``(count,)``."""
     finite = np.isfinite(values)
     values, member = values[finite], member[finite]
     ordered = values[np.lexsort((values, member))]
@@ -213,7 +213,7 @@ def _merged(members: Bools, gap: float, heights: Floats, slope: Floats, theta: f
     """
     forest = init(members)
     _join_neighbours(forest, members)
-    # Of any two sets one is not the largest, so no search starts in the largest, which has most cells.
+    # The search starts only in sets other than the largest. The largest has most cells, so time is saved.
     edges = _edges(members)
     others = edges & (forest.reshape(members.shape) != largest_of(compress(forest)))
     _join_across(forest, others, edges, gap, heights, slope, theta)
@@ -222,7 +222,7 @@ def _merged(members: Bools, gap: float, heights: Floats, slope: Floats, theta: f
 
 @compiled()
 def _edges(members: Bools) -> Bools:
-    """Return the members that have a neighbour outside; the nearest cells of two clusters are among them."""
+    """Return the members with a neighbour outside; they contain the nearest cells of any two clusters."""
     rows, cols = members.shape
     edges = members.copy()
     for r in range(1, rows - 1):
@@ -237,7 +237,7 @@ def _edges(members: Bools) -> Bools:
 
 @compiled()
 def _join_neighbours(roots: Roots, members: Bools) -> None:
-    """Unite the sets of members that are one of the eight neighbours of each other."""
+    """Unite the sets of members that are neighbours, also at corners."""
     rows, cols = members.shape
     for r in range(rows):
         for c in range(cols):
@@ -245,7 +245,7 @@ def _join_neighbours(roots: Roots, members: Bools) -> None:
                 continue
             i = r * cols + c
             if r > 0 and members[r - 1, c]:
-                # The others are neighbours of this one, so they are united with it already.
+                # The other neighbours are also neighbours of this cell, so they are united with it already.
                 unite(roots, i, i - cols)
                 continue
             if c > 0 and members[r, c - 1]:
@@ -282,7 +282,7 @@ def _join_across(
 
 @compiled()
 def _covered(roots: NDArray[np.int32], reach: int) -> NDArray[np.int32]:
-    """Return the lowest root of the clusters whose patches cover each cell, ``(H, W)``; -1 if none does."""
+    """Return the lowest root of the clusters whose patches cover each cell, ``(H, W)``, or -1."""
     rows, cols = roots.shape
     result = np.full((rows, cols), -1, np.int32)
     for r in range(rows):
@@ -304,8 +304,9 @@ def ground_consistency(
     """Return `NO_NEIGHBOURS`, `INCONSISTENT` or `CONSISTENT` for each candidate cell, ``(H, W)``.
 
     A cell is compared with the ground cells at most ``reach`` rows and columns away. It is consistent if its
-    height is within ``theta`` (m) of the DTM plus their mean height above the DTM, or of their least-squares
-    plane where that is determined well enough (`MAX_PLANE_VARIANCE`). Other cells are `NO_NEIGHBOURS`.
+    height is within ``theta`` (m) of the DTM plus their mean height above the DTM. It is also consistent if
+    it is within ``theta`` of their least-squares plane, if that is precise enough (`MAX_PLANE_VARIANCE`).
+    Other cells are `NO_NEIGHBOURS`.
     """
     rows, cols = dsm.shape
     result = np.zeros((rows, cols), np.uint8)
@@ -325,7 +326,7 @@ def ground_consistency(
 
 @compiled()
 def _count_and_offset(dsm: Floats, dtm: Floats, ground: Bools, window: Window) -> tuple[int, float]:
-    """Return the number of ground cells and their mean height above the DTM (m), NaN if that is unknown."""
+    """Return the number of ground cells and their mean height above the DTM (m), NaN if it is unknown."""
     top, bottom, left, right = window
     n, m, offset = 0, 0, 0.0
     for i in range(top, bottom):

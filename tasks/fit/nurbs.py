@@ -1,8 +1,8 @@
 """Fit a NURBS surface to road and terrain (the paper's step C, section "Surface Fitting").
 
 Adam optimises the heights and weights of a fixed grid of control points under the loss of
-`tasks.spline.objective`, starting from the DTM. The surface is that of `tasks.spline.surface`, or with
-``plan: moving`` that of `tasks.spline.moving`.
+`tasks.spline.objective`, starting from the DTM. The surface is defined in `tasks.spline.surface`, or with
+``plan: moving`` in `tasks.spline.moving`.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ class Options(BaseOptions):
     )
     terrain: bool = Field(
         True,
-        description="false: no DTM support: no terrain term, and the start is a plane through the road; "
-        "a tile without roads gets the plane through the DTM",
+        description="false: no DTM support, which means no terrain term, and a start from the plane through "
+        "the road. A tile without roads gets the plane through the DTM",
     )
     plan: Literal["fixed", "moving", "uniform"] = Field(
         "fixed",
-        description="fixed: a graph over easting and northing; moving: x and y move with the weights, for "
-        "comparisons with the paper; uniform: moving, with control points at equal distances",
+        description="fixed: a graph over easting and northing; moving: x and y move with the weights, to "
+        "compare with the paper. uniform: like moving, with control points at equal distances",
     )
     weights: Literal["free", "unit", "softplus", "unbounded"] = Field(
         "free",
@@ -106,7 +106,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
     start, datum = start_heights(data.dsm, data.dtm, clusters.mask, space, options.terrain)
     loss = objective_of(data, clusters.mask, space, datum, options)
     z, weights = (start - datum) * (options.start == "dtm"), np.ones_like(start)
-    # Without terrain term and road only the regulariser is left, which would flatten the plane of the start.
+    # Without terrain term and road, only the regulariser is left. It would flatten the plane of the start.
     if options.terrain or (clusters.mask & np.isfinite(data.dsm)).any():
         z, weights = _adam(loss, z, options)
     surface = surface_on(space, data.grid, data.grid.hull, weights * z, weights, datum)

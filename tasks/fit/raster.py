@@ -18,14 +18,14 @@ from flexroad.tasks.types import Floats, RoadClusters, Surface, TileData
 
 VERSION = 1
 STORED = False
-"""The surface is not stored: its heights are those that `load` reads."""
+"""The surface is not stored: `load` reads its heights again."""
 
 SNAP = 1e-6
-"""Share of a cell: points this close to a cell centre are moved onto it, so nodata beside has no effect."""
+"""Points within this share of a cell from a cell centre are moved onto it, so nodata beside has no effect."""
 
 
 class Options(BaseOptions):
-    """Which raster the heights come from."""
+    """The rasters from which the heights come."""
 
     method: Literal["raster"] = "raster"
     road: Literal["dsm", "dtm"] = Field("dsm", description="heights of filtered road cells")
@@ -38,8 +38,8 @@ class RasterSurface(Surface):
 
     Each quad of four centres is cut along its diagonal from south-west to north-east, as in `tasks.sample`:
     triangles (sw, se, ne) and (sw, ne, nw). Heights are linear on a triangle; they are NaN if a corner is
-    NaN, except on edges and corners that have heights. The outer centres are surrounded by a ring of linearly
-    extrapolated ones.
+    NaN, except on edges and corners that have heights. Around the outer centres lies a ring of linearly
+    extrapolated heights.
     """
 
     crs: str
@@ -107,7 +107,7 @@ def _part(share: float, height: float) -> float:
 
 
 def fit(data: TileData, clusters: RoadClusters, options: Options) -> RasterSurface:
-    """Return a surface with the heights of one raster on filtered road cells and of one elsewhere."""
+    """Return a surface with the heights of one raster on filtered road cells and of another elsewhere."""
     source = {"dsm": data.dsm, "dtm": data.dtm}
     heights = np.where(clusters.mask, source[options.road], source[options.terrain])
     return RasterSurface(crs=data.grid.crs, bounds=data.grid.hull, grid=data.grid, heights=heights)

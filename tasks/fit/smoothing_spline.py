@@ -4,10 +4,10 @@ The surface is the NURBS graph of `tasks.spline.surface` with unit weights. It m
 the height differences plus the bending energy of a thin plate that is stiffer on roads than beside them. The
 problem is convex; `tasks.spline.irls` solves it. docs/fit.md compares it with the paper's fit.
 
-Control points lie on the lattice of `tasks.spline.space`, which all tiles share. Those that act on a corner
-of the tile are fitted first, then those on its edges, each to the ground around it and without regard to the
-tile (`corner` and `edge`). `fit` holds them and fits the points inside to the tile's own cells. So two
-neighbours have one surface, although no tile waits for another (docs/mosaic.md).
+Control points lie on the lattice of `tasks.spline.space`, which all tiles share. Points that act on a corner
+of the tile are fitted first, then points on its edges. Both are fitted to the ground around, without regard
+to the tile (`corner` and `edge`). `fit` keeps them fixed, and fits the points inside to the tile's own cells.
+So two neighbours have one surface, although no tile waits for another (docs/mosaic.md).
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from flexroad.tasks.types import Bools, Floats, Level, LevelSpline, RoadClusters
 VERSION = 8
 
 REACHES_M = (25.0, 50.0, 100.0)
-"""Distances from a corner or edge up to which its control points are fitted (m): the first that is enough,
-else all the ground around it."""
+"""Distances from a corner or edge up to which its control points are fitted (m): the first sufficient
+distance is used, else all the ground around."""
 BEYOND_DATA_M = 15.0
-"""The distance is at least this (m) larger than that of the corner or edge to the farthest ground."""
+"""A distance is sufficient if it exceeds the distance of the farthest needed ground by at least this (m)."""
 NEAR_M = 25.0
 """A corner or edge has control points of the levels within this distance (m)."""
 ON_ABUTMENT_M = 0.05
-"""Crossings of the outline of a level within this distance of its abutments (m) are those of abutments."""
+"""Crossings of a level's outline within this distance of its abutments (m) are crossings of abutments."""
 TOLERANCE, BORDER_TOLERANCE = 1e-4, 1e-6
 """The fit of a tile, and of a corner or edge, ends when the loss falls by less than this share in a step.
 Corners and edges are small, and in a void the loss changes little."""
@@ -68,7 +68,7 @@ class Options(BaseOptions):
     )
     lambda_terrain: float = Field(0.3, ge=0, description="weight of the terrain's height differences")
     huber_m: float = Field(
-        0.1, ge=0, description="differences below this (m) are squared, larger ones count linearly; 0 is L1"
+        0.1, ge=0, description="smaller differences (m) are squared, larger differences are linear; 0 is L1"
     )
     bending_m3: float = Field(30.0, gt=0, description="weight of the road's squared curvature (m3)")
     steps: bool = Field(
@@ -82,7 +82,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
     Parameters
     ----------
     frame : Frame, optional
-        Control points on the tile's border, which are held; None fits all points to the tile alone.
+        Fixed control points on the tile's border; None fits all points to the tile alone.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def _spline(data: TileData, clusters: RoadClusters, options: Options, frame: Fra
     held = frame.control(shape) if frame else np.full(shape, np.nan)
     start = rows.stop, cols.start
     space, z = _fitted(fitted, clusters, lattice, start, (0, n), (0, m), held, options, TOLERANCE)
-    # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
+    # Heights are relative to sea level. With a datum for each tile, sums would differ in the last digits.
     return surface_on(space, core, core.exact_bounds, z, np.ones_like(z), datum=0.0)
 
 
@@ -140,7 +140,7 @@ def near(border: Border, options: Options) -> Slices:
 
 
 def is_near(data: TileData, clusters: RoadClusters, border: Border, options: Options) -> bool:
-    """Return whether that fit uses the cells of `near` alone; the parameters are as of `corner`."""
+    """Return whether the fit of a corner or edge uses only the cells of `near`; parameters as in `corner`."""
     lattice = _lattice(border.tile, border.grid.cell, options)
     nearest = lattice.lines_within(REACHES_M[0])
     levels = [clusters, *(of_level for _, of_level in _near(clusters, border))]
@@ -197,12 +197,12 @@ def edge(
     data, road, clusters : TileData, RoadMask, RoadClusters
         The cells of ``border.grid``, their road mask and the filtered road.
     ends : tuple of Corner
-        The corners at the western and eastern, or the southern and northern end; their points are held.
+        The corners at the western and eastern, or the southern and northern end; their points stay fixed.
     """
     seen, near = level_data(data, clusters), list(_near(clusters, border))
     heights = [level_data(data, clusters, level.number) for level, _ in near]
     lattice = _lattice(border.tile, border.grid.cell, options)
-    # Splines of all levels are on one part of the lattice.
+    # The splines of all levels use the same part of the lattice.
     lines = [_lines(seen, clusters, border, lattice)]
     lines += [_lines(part, own, border, lattice) for part, (_, own) in zip(heights, near, strict=True)]
     reach = max(k for k, _ in lines), max(j for _, j in lines)
@@ -256,7 +256,7 @@ def _along(
 ) -> tuple[Floats, NurbsSurface]:
     """Return the control points of an edge for one level, and the spline around the edge.
 
-    - `reach`: number of intervals up to which it is fitted, along easting and northing.
+    - `reach`: number of intervals around the edge that are fitted, along easting and northing.
     """
     fitted, (k, j) = with_road_heights(data, clusters), reach
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
@@ -296,7 +296,7 @@ def _lines(data: TileData, clusters: RoadClusters, border: Border, lattice: Latt
     cell = data.grid.cell
     for lines in map(lattice.lines_within, REACHES_M):
         reach_m = min(np.multiply(lines, lattice.unit_m))
-        # Ground outside the strip is too far away for this distance.
+        # Ground outside the strip is farther away than this distance.
         window, strip = border.strip(max(math.ceil((reach_m - BEYOND_DATA_M) / cell), 0) + 1)
         missing = np.isnan(ground_to_fit(data, clusters, window))
         along = np.zeros_like(missing)
@@ -314,13 +314,13 @@ def _fitted(
 ) -> tuple[Space, Floats]:  # fmt: skip
     """Return the splines over a part of the lattice, and their control heights (m), fitted to its cells.
 
-    Points with a finite height in ``held`` keep it. The others are NaN if no cell has a height.
+    Points with a finite height in ``held`` keep it. The other points are NaN if no cell has a height.
     """
     space, window = lattice.part(data.grid.shape, start, u, v)
     dsm, road, dtm = data.dsm[window], clusters.labels[window] > 0, valid_dtm(data, clusters, window)
     ground = np.where(road, dsm, dtm)
     if np.isnan(ground).all():
-        # Of a corner or edge: tiles that bridge it must still hold the same points.
+        # At a corner or edge without ground, tiles that bridge it must still share the same points.
         dtm = ground = dsm
     if np.isnan(ground).all():
         return space, held
@@ -338,8 +338,8 @@ def _minimum(
     huber_m: float, tolerance: float,
 ) -> Floats:  # fmt: skip
     """Return the control heights above the datum, ``(m, n)``, that minimise the loss over a raster."""
-    # Divided by the number of cells with a height, like the differences, so that voids do not change the
-    # balance.
+    # The bending energy is divided by the number of cells with a height, like the differences, so that voids
+    # do not change the balance.
     bending = bending_energy(stiffness / np.count_nonzero(np.isfinite(heights)), space)
     loss = HuberObjective(objective(heights, weight, space), held, bending, huber_m)
     return minimise(loss, first, ITERATIONS, tolerance)[0]

@@ -1,7 +1,7 @@
 """NumPy archives (``.npz``) that take little time to write.
 
-ISA-L writes the standard format of deflate, in a fifth of zlib's time. The ZIP file around it is put together
-here: for the many small arrays of a result, `zipfile` would take longer than their compression.
+ISA-L writes the standard format of deflate, in a fifth of zlib's time. This module writes the ZIP file around
+it: for the many small arrays of a result, `zipfile` would take longer than their compression.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from isal import isal_zlib
 from numpy.typing import ArrayLike
 
 LEVEL = 1
-"""Level of ISA-L, 0 to 3: files of level 0 are a quarter larger, those of higher ones no smaller."""
+"""Level of ISA-L, 0 to 3: level 0 makes files a quarter larger, higher levels do not make them smaller."""
 VERSION, DEFLATED, DATE = 20, 8, 0x21
 """Version of the ZIP format, method and time of entries: 1980-01-01, the earliest."""
 READABLE = 0o600 << 16

@@ -1,7 +1,7 @@
-"""Checks of a DSM against a DTM, and what their files declare of survey and vertical CRS.
+"""Checks of a DSM against a DTM, and of survey and vertical CRS in their files.
 
-The two may be swapped, or of two surveys. A DSM that lies above or below the DTM as a whole has another
-vertical datum, or another unit of heights.
+The files may be swapped, or come from two surveys. If the complete DSM lies above or below the DTM, it has
+another vertical datum, or another unit of heights.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from flexroad.tasks.io.raster import Unreadable, read_raster
 from flexroad.tasks.types import Floats
 
 BELOW_M = 1.0
-"""Distance from which a surface below the ground counts, or one above it (m)."""
+"""Least distance at which the surface is taken as below or above the ground (m)."""
 SHARE, TIMES = 0.05, 4.0
-"""Share of the cells with a surface below the ground that is noted, if it is so many times that above it."""
+"""Least share of cells below the ground for a note, and its least ratio to the share of cells above."""
 FAR_M = 1.0
 """Offset from which two vertical references are suspected (m)."""
 SMOOTH_M = 0.2
 """Change of the difference from a cell to its neighbours, up to which the cell may be open ground (m)."""
 LOWEST = 10.0
-"""Percentile of the difference over smooth cells that stands for the ground: roofs are smooth, too, and a
-tile with less ground than this share is rare."""
+"""Percentile of the difference over smooth cells that is taken as ground: roofs are smooth, too, and a tile
+with less ground than this share is rare."""
 CONSTANT_M = 0.2
-"""Largest spread of an offset that is the same over the tile: relief gives more (m)."""
+"""Largest spread of a constant offset over the tile (m); relief gives a larger spread."""
 OPEN_M = 1.0
-"""Open ground is smooth and within this of the lowest (m)."""
+"""Open ground is smooth, and at most this much above the lowest difference (m)."""
 SMOOTH_SHARE, OPEN_SHARE = 0.05, 0.25
-"""Least share of smooth cells in those with both heights, and of open ones in the smooth."""
+"""Least share of smooth cells in cells with both heights, and of open cells in smooth cells."""
 SCALES = {"feet": 0.3048, "dm": 0.1, "cm": 0.01, "mm": 0.001}
 """Units that one of the models may be in, in metres."""
 HIGH_M = 3 * FAR_M
-"""Height of the ground from which a ratio of heights tells more than that both are near 0 (m)."""
+"""Least height of the ground for a ratio of heights (m): near 0 a ratio has no meaning."""
 ABOVE, RATIO = "the DSM lies ", "the heights of the DSM are "
-"""Begin of notes on an offset, and on a ratio."""
+"""Start of notes on an offset, and on a ratio."""
 
 Offset = tuple[float, float]
 """DSM minus DTM over the open cells of a tile (m): median, and spread by the median absolute deviation."""
@@ -50,8 +50,8 @@ Offset = tuple[float, float]
 def below_ground_note(dsm: Floats, dtm: Floats) -> str | None:
     """Return a note if a DSM is below a DTM (m, same shape) in many cells and above it in few; else None.
 
-    Noise, and ground that was dug off between two surveys, puts some cells below; buildings and trees put
-    more of them above, unless the files are swapped.
+    Noise, and ground that was removed between two surveys, puts some cells below. Buildings and trees put
+    more cells above, unless the files are swapped.
     """
     above = dsm - dtm
     known = np.count_nonzero(np.isfinite(above))
@@ -68,7 +68,7 @@ def below_ground_note(dsm: Floats, dtm: Floats) -> str | None:
 
 
 def survey_difference(tile: Tile) -> tuple[str, str]:
-    """Return how DSM and DTM differ, and what their files do not declare; "" if nothing.
+    """Return in which property DSM and DTM differ, and which property is not declared; else "".
 
     - `tile`: with the files to compare (`Tile.within`).
     """
@@ -84,9 +84,9 @@ def survey_difference(tile: Tile) -> tuple[str, str]:
 
 
 def vertical_crs(tile: Tile) -> str | None:
-    """Return the vertical CRS of the heights that `load` gives, in metres; None if it is not known.
+    """Return the vertical CRS of the heights from `load`, in metres; None if it is not known.
 
-    It is known if all files of DSM and DTM on the tile declare the same one.
+    It is known if all files of DSM and DTM on the tile declare the same CRS.
     """
     tile = tile.within(tile.grid.bounds)
     found = {crs for name in ("dsm", "dtm") for _, crs in _declared(tile, name)}
@@ -94,7 +94,7 @@ def vertical_crs(tile: Tile) -> str | None:
 
 
 def _declared(tile: Tile, name: str) -> list[tuple[str, str]]:
-    """Return date and vertical CRS of each file of a layer, "" where it declares none.
+    """Return date and vertical CRS of each file of a layer, "" where they are not declared.
 
     Only headers are read. Files that cannot be read are left out, as by `load`.
     """
@@ -119,8 +119,8 @@ def _declared(tile: Tile, name: str) -> list[tuple[str, str]]:
 def open_offset(dsm: Floats, dtm: Floats) -> Offset | None:
     """Return by how much a DSM lies above a DTM (m, same shape) on open ground.
 
-    Open ground is where the difference is the same in neighbouring cells, and low: crowns of trees are rough,
-    and roofs are higher. None if too few cells are so.
+    On open ground the difference is low and equal in neighbouring cells: crowns of trees are rough, and roofs
+    are higher. The result is None with too few open cells.
     """
     above = dsm - dtm
     known = np.isfinite(above)
@@ -142,12 +142,12 @@ def open_offset(dsm: Floats, dtm: Floats) -> Offset | None:
 
 
 def offset_note(dsm: Floats, dtm: Floats) -> str | None:
-    """Return a note if hardly a cell of a DSM is near the DTM (m, same shape), and the offset is constant.
+    """Return a note if hardly a cell of a DSM is near the DTM (m, same shape), else None.
 
-    Or if the heights of one are those of the other in another unit; else None.
+    The note says that the offset is constant, or that one model is in another unit.
     """
     most = LOWEST / 100
-    # Every fourth row of most tiles has near cells enough for all of it.
+    # In most tiles, every fourth row already has enough near cells.
     if np.count_nonzero(np.abs(dsm[::4] - dtm[::4]) <= FAR_M) > most * dsm.size:
         return None
     above = np.abs(dsm - dtm)
@@ -161,7 +161,7 @@ def offset_note(dsm: Floats, dtm: Floats) -> str | None:
             (metres, f"the DTM in {unit}, the DSM in metres?", (dsm, dtm * metres)),
         ):
             if _agree(*scaled, offset):
-                return f"{RATIO}{ratio:.{2 if ratio > 0.05 else 3}f} times those of the DTM: {which}"
+                return f"{RATIO}{ratio:.{2 if ratio > 0.05 else 3}f} times the DTM heights: {which}"
     median_m, spread_m = offset or (0.0, 0.0)
     if abs(median_m) < FAR_M or spread_m > CONSTANT_M:
         return None
@@ -171,7 +171,7 @@ def offset_note(dsm: Floats, dtm: Floats) -> str | None:
 
 
 def _agree(dsm: Floats, dtm: Floats, unscaled: Offset | None) -> bool:
-    """Return whether a DSM lies on a DTM after one of them was converted, and better than before."""
+    """Return whether a DSM lies on a DTM after a conversion, and better than before."""
     found = open_offset(dsm, dtm)
     if not found or abs(found[0]) > FAR_M or np.nanmedian(np.abs(dtm)) < HIGH_M:
         return False
@@ -179,15 +179,15 @@ def _agree(dsm: Floats, dtm: Floats, unscaled: Offset | None) -> bool:
 
 
 def is_offset(note: str) -> bool:
-    """Return whether a note of a tile is one of `offset_note`."""
+    """Return whether a note of a tile comes from `offset_note`."""
     return note.startswith((ABOVE, RATIO))
 
 
 def on_tiles(notes: Iterable[str], tiles: int) -> list[str]:
     """Return one line for each cause in notes of tiles by `offset_note`, with the number of tiles.
 
-    - `notes`: one for each tile that has one; of each cause the first is shown.
-    - `tiles`: number of tiles looked at.
+    - `notes`: the notes of tiles, at most one per tile; the first note of each cause is shown.
+    - `tiles`: number of tiles that were examined.
     """
     first: dict[str, str] = {}
     number = Counter[str]()

@@ -1,4 +1,4 @@
-"""Units of heights that raster files declare, and heights that are no heights."""
+"""Units of heights that raster files declare, and values that cannot be heights."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flexroad.tasks.io.raster import RasterWindow
 from flexroad.tasks.types import Floats
 
 SMALLER = {"cm": 100, "mm": 1000}
-"""Units that heights outside the range may be in, with their number in a metre."""
+"""Possible units of heights outside the range, with their number in a metre."""
 
 METRE: Unit = ("metre", 1.0)
 
@@ -34,7 +34,7 @@ UNITS = {
 
 
 def with_unit(patch: RasterWindow, layer: Layer) -> RasterWindow:
-    """Return a patch of heights with the unit that the catalog or the CRS gives if none is declared."""
+    """Return a patch of heights with its unit: if it is not declared, from the catalog or the CRS."""
     if patch.unit or patch.crs is None or height_unit(patch.crs):
         return patch
     unit, metres = plan_unit(patch.crs)
@@ -62,7 +62,7 @@ def absurd_note(layer: str, removed: int) -> str:
 
 
 def converted_note(layer: str, patch: RasterWindow) -> str | None:
-    """Return a note that a patch of heights was converted from the unit that its file declares, or None."""
+    """Return a note if a patch of heights was converted from the unit that its file declares, or None."""
     unit, metres = _unit(patch)
     if metres == 1 or patch.unit_assumed:
         return None
@@ -70,16 +70,16 @@ def converted_note(layer: str, patch: RasterWindow) -> str | None:
 
 
 def is_conversion(note: str) -> bool:
-    """Return whether a note of a tile is one of `converted_note`."""
+    """Return whether a note of a tile comes from `converted_note`."""
     return note.endswith(CONVERTED)
 
 
 def smaller_unit_fault(patch: RasterWindow, declare: str) -> str | None:
-    """Return that all heights are outside the range as they are in a smaller unit, to follow the file's name.
+    """Return the fault of heights outside the range that are in a smaller unit, to follow the file's name.
 
-    None if they vary too little or too much for heights in one of `SMALLER`.
+    None if they vary too little or too much for heights in a unit of `SMALLER`.
 
-    - `declare`: the remedy besides the division, with a comma before it; empty if there is none.
+    - `declare`: a further remedy besides the division, with a comma before it; or empty.
     """
     heights = patch.values * _unit(patch)[1]
     most = max(SMALLER.values())
@@ -113,7 +113,7 @@ def _unit(patch: RasterWindow) -> Unit:
 
 
 def check_units(patches: Sequence[RasterWindow]) -> None:
-    """Raise an error if layers differ in their unit of height: probably a missing tag, not a mixed survey.
+    """Raise an error if layers differ in their unit of height: usually a tag is missing.
 
     Files in different CRSs may differ if both declare their unit.
     """

@@ -1,4 +1,4 @@
-"""One layer on a grid: the files that a tile lists for it, laid over each other.
+"""One layer on a grid: a mosaic of the files that a tile lists for the layer.
 
 A tile also lists files around it. A file that cannot be used is left out, and fails only tiles that need it.
 """
@@ -37,13 +37,13 @@ class SourceFile:
     """One file of a layer, as the catalog lists it."""
 
     title: str
-    """Its name in messages: ``dsm a.tif``."""
+    """Name of the file in messages: ``dsm a.tif``."""
     path: Location
     extent: Bounds | None
     """West, south, east and north in the catalog (m, in the tile's CRS), None if they are unknown."""
 
     def may_lie_on(self, grid: Grid) -> bool:
-        """Return whether the file lies on a grid, as far as the catalog knows."""
+        """Return whether the file may lie on a grid, by its extent in the catalog."""
         return self.extent is None or overlap(self.extent, grid.bounds, TOUCH_M)
 
 
@@ -57,12 +57,12 @@ class Mosaic:
     """The lattice."""
     layer: Layer
     files: tuple[SourceFile, ...]
-    """All files of the layer, those that are not read as well."""
+    """All files of the layer, also files that are not read."""
     patches: tuple[RasterWindow, ...]
     """The parts read, in the order of the files."""
     notes: tuple[str, ...]
     left_out: tuple[tuple[SourceFile, Unusable], ...]
-    """Files that cannot be used, or in part."""
+    """Files that cannot be used completely or in part."""
 
     def reached(self, core: Grid) -> Bools:
         """Return the cells of a tile within the bounds of a file that was read there, ``(h, w)``."""
@@ -72,14 +72,14 @@ class Mosaic:
         return cells
 
     def main_file(self, core: Grid) -> SourceFile:
-        """Return the file that covers most of a tile: by its extent in the catalog, else by what was read."""
+        """Return the file that covers most of a tile, by its extent in the catalog, else by its read part."""
         read = {patch.file: patch.lattice.bounds for patch in self.patches if not patch.lattice.crs}
         return max(
             self.files, key=lambda file: shared_m2(file.extent or read.get(str(file.path)), core.bounds)
         )
 
     def check_read(self, core: Grid) -> None:
-        """Raise an error if the layer is missing on the tile itself, or a file that it needs is left out."""
+        """Raise an error if the tile itself has no file of the layer, or needs a file that is left out."""
         main = self.main_file(core) if self.left_out else None
         left_out = sorted(self.left_out, key=lambda pair: pair[0] != main)
         needed = [error for file, error in left_out if file.may_lie_on(core)]
@@ -118,9 +118,8 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
     """Return a layer on a grid; files that cannot be used are left out.
 
     - `tile`: with the files to read (`Tile.within`, `Tile.around`).
-    - `core`: the tile that the files are of: the position of a file without georeference and of unknown
-      extent.
-    - `around`: whether the grid is ground around tiles: then it is not checked whether files have moved.
+    - `core`: the tile of the files: it is the position of a file without georeference and of unknown extent.
+    - `around`: whether the grid is ground around tiles: then no check whether files have moved.
     """
     files = _files(tile, layer)
     read, left_out, absurd_cells = _read(tile, layer, files, grid, core, around)
@@ -145,9 +144,9 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
 def _read(
     tile: Tile, layer: Layer, files: Sequence[SourceFile], grid: Grid, core: Grid, around: bool
 ) -> tuple[list[tuple[SourceFile, RasterWindow]], list[tuple[SourceFile, Unusable]], int]:
-    """Return the parts of files until the grid is covered, those left out, and the number of absurd heights.
+    """Return parts of files until the grid is covered, files left out, and the number of absurd heights.
 
-    The other parameters are those of `read_mosaic`.
+    The other parameters are as in `read_mosaic`.
     """
     read: list[tuple[SourceFile, RasterWindow]] = []
     left_out: list[tuple[SourceFile, Unusable]] = []
@@ -171,7 +170,7 @@ def _read(
             continue
         unchecked.append(patch)
         area_m2 += shared_m2(patch.lattice.bounds, grid.bounds)
-        # Cells are compared only if the areas of the files suffice.
+        # Cells are compared only if the areas of the files are large enough.
         if file is not files[-1] and area_m2 / grid.cell**2 >= 0.999 * missing.size:
             while unchecked:
                 missing &= ~covered(unchecked.pop(), grid)
@@ -183,7 +182,7 @@ def _read(
 def _notes_left_out(
     read: Iterable[tuple[SourceFile, RasterWindow]], left_out: Iterable[tuple[SourceFile, Unusable]]
 ) -> list[str]:
-    """Record the files that are left out, and those of which a part is; return a note on each."""
+    """Record the files that are left out completely or in part; return a note on each."""
     return [
         *(leave_out(error) for _, error in left_out),
         *(leave_out(patch.fault, patch.unreadable) for _, patch in read if patch.fault),
@@ -199,21 +198,21 @@ def _files(tile: Tile, layer: Layer) -> tuple[SourceFile, ...]:
 
 
 def _window(tile: Tile, layer: Layer, file: SourceFile, grid: Grid, core: Grid) -> RasterWindow | None:
-    """Return the part of a file that covers a grid, None if there is none; see `read_window`."""
+    """Return the part of a file that covers a grid, or None; see `read_window`."""
     heights = layer.name in HEIGHTS
     if file.extent and max(map(abs, file.extent)) <= FARTHEST:
-        # Where a file without georeference lies: the same for all tiles.
+        # A file without georeference has the same position for all tiles.
         core = Grid.covering(core.crs, file.extent, core.cell)
     return read_window(file.path, file.title, grid, core, layer.crs, heights, layer.reproject, tile.missing)
 
 
 def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow | None) -> None:
-    """Raise an error if a file lies on the tile by the catalog, but does not now.
+    """Raise an error if a file lies on the tile by the catalog, but not by its present position.
 
-    Its place is compared with the catalog's, because an extent in another CRS holds more than the file.
+    Its bounds are compared with the catalog, because an extent in another CRS is larger than the file.
     """
     core = tile.grid
-    # Files of neighbours only touch the tile.
+    # Files of neighbouring tiles only touch the tile.
     if not (file.extent and shared_m2(file.extent, core.bounds)):
         return
     lattice = patch.lattice if patch else None

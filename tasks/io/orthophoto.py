@@ -1,6 +1,6 @@
 """Read the orthophoto (DOP) of a tile: a window of its files at the requested resolution.
 
-Pixels that coincide with the file's are copied, coarser ones are means of the file's, finer ones are
+Pixels that coincide with pixels of the file are copied, coarser pixels are means, finer pixels are
 interpolated. Pixels that are nodata, masked or transparent in the file are unknown.
 """
 
@@ -36,7 +36,7 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None, finest_m:
 
     - `source`: the photo's files; where files overlap, the first one with a value is used.
     - `grid`: the area to read; only its bounds and CRS are used.
-    - `gsd_m`: ground sampling distance of the result (m); by default that of the first file that reaches the
+    - `gsd_m`: ground sampling distance of the result (m); by default as in the first file that reaches the
       grid.
     - `finest_m`: smallest ground sampling distance (m) if ``gsd_m`` is None: finer photos are averaged.
     - result: its pixels start in the grid's north-west corner and cover the grid.
@@ -131,7 +131,7 @@ def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.flo
         transform = Affine(lattice.dx, 0, lattice.west, 0, lattice.dy, lattice.bounds[1])
     with WarpedVRT(
         src,
-        # If the file's CRS is the same one by another name: prevent a reprojection.
+        # If the file's CRS is the same CRS with another name, this prevents a reprojection.
         src_crs=lattice.crs or pixels.crs,
         crs=pixels.crs,
         src_transform=transform,

@@ -32,10 +32,9 @@ from flexroad.tasks.types import Bools, Floats
 T = TypeVar("T")
 
 EXACT = 1e-9
-"""Largest error of transformed positions, in cells; GDAL interpolates them with 0.125 by default, and takes 0
-for no value."""
+"""Largest error of transformed positions, in cells; GDAL's default is 0.125, and 0 would mean the default."""
 STRIP = 64
-"""Number of rows of means that are computed at once where an alpha band is read cell by cell."""
+"""Number of rows of means that are computed at a time if an alpha band is read cell by cell."""
 Slices = tuple[slice, slice]
 """Rows, from the north, and columns of a file."""
 
@@ -59,21 +58,21 @@ class RasterWindow:
     values: Floats
     """``(rows, cols)``, row 0 in the north; NaN where the file has nodata."""
     lattice: RasterGrid
-    """In the tile's CRS, or in that of the file (`RasterGrid.crs`)."""
+    """The lattice of the cells, in the CRS of the tile or of the file (`RasterGrid.crs`)."""
     unit: str
-    """Unit of the values declared by the band or, of heights, given by the caller; else empty."""
+    """Unit of the values, declared by the band or (for heights) given by the caller; else empty."""
     crs: str | None
-    """CRS of the file, else the one given by the caller."""
+    """CRS of the file, else the CRS given by the caller."""
     unit_assumed: bool = False
     """Whether the file does not declare the unit."""
     step: int = 1
-    """Number of cells of the file along an axis that were read as one."""
+    """Number of cells of the file along an axis that were read as one cell."""
     share: Floats | None = None
-    """Share of each cell read from several that the file has, ``(rows, cols)``; None if it has all."""
+    """Share of each joined cell that the file has, ``(rows, cols)``; None if it has all of every cell."""
     unreadable: Bools | None = None
-    """Cells that cannot be read, ``(rows, cols)``, because the file is damaged; None if all can."""
+    """Cells that cannot be read, ``(rows, cols)``, because the file is damaged; None if all can be read."""
     fault: Unusable | None = None
-    """Why they cannot; None if all can."""
+    """Why these cells cannot be read; None if all can be read."""
 
     @property
     def file_lattice(self) -> RasterGrid:
@@ -101,19 +100,19 @@ def read_window(
 ) -> RasterWindow | None:
     """Read the part of a file that covers a grid.
 
-    Of a file with many cells in one cell of the grid, several are read as one, through the file's overviews
-    where it has them, so that the memory does not depend on the resolution of the file. Of a damaged file
-    the cells that cannot be read are left out (`RasterWindow.unreadable`).
+    If a cell of the grid has many cells of the file, several cells are read as one, from overviews if
+    possible. So the memory does not depend on the resolution of the file. Unreadable cells of a damaged file
+    are left out (`RasterWindow.unreadable`).
 
     - `name`: name of the file in messages: ``dsm a.tif``.
     - `core`: position of a file without georeference, if it has as many cells.
-    - `crs`: CRS of a file without one.
-    - `heights`: whether the file must have heights: one band of real numbers. Several cells are then read
-      as their mean, else as the most frequent of their values.
+    - `crs`: CRS of a file that declares none.
+    - `heights`: whether the file must have heights: one band of real numbers. Joined cells then have the
+      mean, else the most frequent of their values.
     - `reproject`: whether the file may be in another CRS than the grid; the window is then on its own
       lattice.
     - `missing`: see `read_raster`.
-    - result: none if the file does not overlap the grid.
+    - result: None if the file does not overlap the grid.
     """
 
     def read(src: Any, damaged: bool = False) -> RasterWindow | None:
@@ -160,12 +159,12 @@ def read_raster(
     by: Callable[[Location], AbstractContextManager[Any]] = open_raster,
     missing: frozenset[str] | None = None,
 ) -> T:
-    """Return what a function reads from an open raster.
+    """Return the result of a function that reads an open raster.
 
-    Only a file whose own bytes are at fault is `Unreadable`, so that it may be left out. What is computed
-    while a disk or object storage does not give the file must not be stored as if the file had been read.
+    Only a file whose own bytes are at fault is `Unreadable`, so that it may be left out. If a disk or object
+    storage fails, results must not be stored as if the file had been read.
 
-    - `path`, `name`: as of `read_window`.
+    - `path`, `name`: as in `read_window`.
     - `read`: takes the open raster.
     - `missing`: full names of the files that are known to be missing; None if that is not known.
     """
@@ -181,7 +180,7 @@ def read_raster(
     try:
         return attempt()
     except Unreadable:
-        # The system may have failed in between, and a damaged file fails again.
+        # The system may have failed temporarily; a damaged file fails again.
         return attempt()
 
 
@@ -221,7 +220,7 @@ def _is_gone(path: Location) -> bool:
 
 
 def _unread(path: Path) -> str:
-    """Return why the system does not give all bytes of a raster on disk; empty if it does."""
+    """Return why the system cannot read all bytes of a raster on disk; empty if it can."""
     try:
         for file in files_of(path):
             read_through(file)
@@ -236,8 +235,8 @@ def _unread(path: Path) -> str:
 def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
     """Return the patch on the grid's cells, ``(H, W)``; NaN where it has no value.
 
-    Cells that coincide are copied. Others are resampled: source cells without a value have no weight, and
-    a cell whose centre lies in such a cell gets no value, so that voids keep their size.
+    Cells that coincide are copied. Other cells are resampled: source cells without a value have no weight. A
+    cell whose centre lies in a source cell without a value gets no value, so that voids keep their size.
     """
     lattice = patch.lattice
     if lattice.crs:
@@ -256,8 +255,8 @@ def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floa
         src_nodata=np.nan,
         dst_nodata=np.nan,
         resampling=resampling,
-        # GDAL would estimate the ratio of the cells from the window, and then give other values for a cell of
-        # two overlapping windows.
+        # GDAL would estimate the ratio of the cells from the window. A cell of two overlapping windows could
+        # then have two values.
         XSCALE=_scale(lattice.dx / grid.cell),
         YSCALE=_scale(lattice.dy / grid.cell),
     )
@@ -316,16 +315,16 @@ def _warped(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
 
 
 def _scale(ratio: float) -> float:
-    """Return the ratio of cells for GDAL, which averages below 0.95: only where two cells lie in one.
+    """Return the ratio of cells for GDAL, which averages below 0.95: wanted only from two cells in one on.
 
-    Averages over a whole number of cells alone are exact on a plane. The ratio of a warped file differs a
-    little from window to window, so that the number does not change near the sizes that files have.
+    Only averages over a whole number of cells are exact on a plane. The ratio of a warped file differs a
+    little from window to window, so the number must not change near usual cell sizes.
     """
     return 1 / max(1, math.floor(1 / ratio + 0.2))
 
 
 def joined(patches: Sequence[RasterWindow]) -> list[RasterWindow]:
-    """Return the windows with those of one lattice joined, so that no seam is interpolated.
+    """Return the windows, joined if they have one lattice, so that no seam is interpolated.
 
     Where windows overlap, the first one with a value is used.
     """
@@ -392,7 +391,7 @@ def _share(lattice: RasterGrid, step: int) -> Floats | None:
 def readable_cells(
     src: Any, lattice: RasterGrid, step: int, slices: Slices, resampling: Resampling
 ) -> tuple[Floats, Bools]:
-    """Return the cells as `_cells` does, NaN where they cannot be read, and which these are.
+    """Return the cells as `_cells` does, NaN where they cannot be read, and a mask of unreadable cells.
 
     GDAL reads blocks. A window with a damaged block is halved along borders of blocks, until each part is
     read, or is one block.
@@ -412,11 +411,11 @@ def readable_cells(
 
 
 def _halves(src: Any, lattice: RasterGrid, step: int, slices: Slices) -> tuple[int, list[Slices]]:
-    """Return the axis along which a window is halved, and its halves; none if it is within one block."""
+    """Return the axis along which a window is halved, and its halves; no halves within one block."""
     rows, cols = slices
     tall, wide = src.block_shapes[0]
     above, left = lattice.before(step)
-    # Blocks are counted from the first row of the file, which may be the southern one.
+    # Blocks are counted from the first row of the file, which may be the southern row.
     row = _border(rows, tall, lattice.height % tall if lattice.northward else 0, step, above)
     col = _border(cols, wide, 0, step, left)
     if row and (not col or (rows.stop - rows.start) * wide >= (cols.stop - cols.start) * tall):
@@ -427,14 +426,14 @@ def _halves(src: Any, lattice: RasterGrid, step: int, slices: Slices) -> tuple[i
 
 
 def _border(part: slice, block: int, first: int, step: int, before: int) -> int:
-    """Return the border of blocks, in whole steps, that is nearest to the middle of a slice; 0 if none."""
+    """Return the border of blocks, in whole steps, that is nearest to the middle of a slice, or 0."""
     middle = (part.start + part.stop) / 2
     border = (first + round((middle - first) / block) * block + before) // step * step - before
     return border if part.start < border < part.stop else 0
 
 
 def _cells(src: Any, lattice: RasterGrid, step: int, slices: Slices, resampling: Resampling) -> Floats:
-    """Return the cells of a window, ``step`` x ``step`` of them as one; rows from the north."""
+    """Return the cells of a window, ``step`` x ``step`` cells as one; rows from the north."""
     first = lattice.before(step)
     tall, wide = (_steps(part, step, before) for part, before in zip(slices, first, strict=True))
     if len(tall) == len(wide) == 1:
@@ -443,7 +442,7 @@ def _cells(src: Any, lattice: RasterGrid, step: int, slices: Slices, resampling:
 
 
 def _steps(part: slice, step: int, before: int) -> list[slice]:
-    """Return the complete steps of a slice, and those with fewer cells at the ends of the file."""
+    """Return the complete steps of a slice, and steps with fewer cells at the ends of the file."""
     start = min(part.stop, -(-(part.start + before) // step) * step - before)
     stop = max(start, (part.stop + before) // step * step - before)
     edges = part.start, start, stop, part.stop
@@ -464,7 +463,7 @@ def _part(
     values: Floats = src.read(1, **how).astype(np.float64)
     if (src.scales[0], src.offsets[0]) != (1.0, 0.0):
         values = values * src.scales[0] + src.offsets[0]
-    # Cells whose nodata value is NaN are NaN already.
+    # If the nodata value is NaN, these cells are NaN already.
     if not found.all_valid and not (found.nan_is_nodata and step == 1):
         how |= {"resampling": Resampling.mode} if step > 1 else {}
         values[src.read_masks(1, **how) == 0] = np.nan
@@ -476,7 +475,7 @@ def _part(
 def _means(src: Any, lattice: RasterGrid, step: int, rows: slice, cols: slice) -> Floats:
     """Return the means of ``step`` x ``step`` cells; NaN where fewer than half have a value.
 
-    GDAL would average the cells that an alpha band of this type marks as without a value, too.
+    GDAL would also average the cells without a value by an alpha band of this type.
     """
     strips = []
     for top in range(rows.start, rows.stop, step * STRIP):

@@ -1,4 +1,4 @@
-"""The lattice of a raster file's cells, the part of it that covers a grid, and what the header says of it."""
+"""The lattice of a raster file's cells, its part that covers a grid, and the file's header."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from flexroad.tasks.errors import Unusable
 from flexroad.tasks.types import Bools, Floats
 
 SHIFT = 0.28713
-"""Added to positions in cells before they are rounded down: a lattice with a common offset, such as half a
-cell, would be rounded differently from file to file."""
+"""Added to positions in cells before they are rounded down. Without it, a usual offset such as half a cell
+would be rounded differently from file to file."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class RasterGrid:
     northward: bool = False
     """True if the file's rows run northward, as in XYZ files sorted by northing."""
     crs: str = ""
-    """CRS of the coordinates if it is another one than that of the grids to read; else empty."""
+    """CRS of the coordinates if it differs from the CRS of the grids to read; else empty."""
 
     @classmethod
     def of(cls, transform: Affine, width: int, height: int, crs: str = "") -> RasterGrid:
@@ -87,7 +87,7 @@ class RasterGrid:
         return (rows, cols) if rows.start < rows.stop and cols.start < cols.stop else None
 
     def step_for(self, grid: Grid) -> int:
-        """Return the number of cells along an axis to be read as one, so that 2 to 4 lie in a grid's cell."""
+        """Return the number of cells along an axis to read as one, so that 2 to 4 lie in a grid's cell."""
         cell_x, cell_y = self.cell_of(grid)
         return max(1, math.floor(min(cell_x / self.dx, cell_y / self.dy) / 2 + 1e-9))
 
@@ -123,8 +123,8 @@ class RasterGrid:
     def before(self, step: int) -> tuple[int, int]:
         """Return the numbers of rows and columns between the start of the first step and this lattice.
 
-        Steps are counted from the origin of the coordinates, so that cells are read together in the same way
-        in every window and in all files of one lattice.
+        Steps are counted from the origin of the coordinates. So cells are joined in the same way in
+        every window and in all files of one lattice.
         """
         row, col = SHIFT - self.north / self.dy, SHIFT + self.west / self.dx
         return math.floor(row) % step, math.floor(col) % step
@@ -144,7 +144,7 @@ class RasterGrid:
         return tall, wide
 
     def coarser(self, step: int) -> RasterGrid:
-        """Return the lattice of cells read together; steps with fewer cells count as complete."""
+        """Return the lattice of joined cells; steps with fewer cells are taken as complete."""
         above, left = self.before(step)
         return replace(
             self,
@@ -158,7 +158,7 @@ class RasterGrid:
         )
 
     def continues(self, other: RasterGrid) -> bool:
-        """Return whether two lattices are parts of one: the corners of the other are corners of cells."""
+        """Return whether two lattices are parts of one lattice: corners of the other are corners of cells."""
         if (self.crs, self.northward) != (other.crs, other.northward):
             return False
         west, south, east, north = other.bounds
@@ -169,7 +169,7 @@ class RasterGrid:
         return off < LATTICE_TOLERANCE and count == (other.width, other.height)
 
     def cells_in(self, other: RasterGrid) -> tuple[slice, slice]:
-        """Return the (row, col) slices of this lattice in another one that it continues; may be negative."""
+        """Return the (row, col) slices of this lattice in a lattice that it continues; may be negative."""
         col, row = round((self.west - other.west) / self.dx), round((other.north - self.north) / self.dy)
         return slice(row, row + self.height), slice(col, col + self.width)
 
@@ -191,7 +191,7 @@ class RasterGrid:
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says of its cells."""
+    """The header of a file."""
 
     lattice: RasterGrid | None
     """None if the file has no georeference."""
@@ -202,16 +202,16 @@ class Header:
     all_valid: bool
     """Whether the first band has no cells without a value."""
     nan_is_nodata: bool
-    """Whether its cells without a value are NaN, and only they."""
+    """Whether exactly its cells without a value are NaN."""
     alpha: int | None
-    """Number of the alpha band that GDAL does not take for a mask, None without one."""
+    """Number of the alpha band that GDAL does not use as a mask, or None."""
 
 
 _headers = WeakKeyDictionary[Any, Header]()
 
 
 def header(src: Any) -> Header:
-    """Return the header of an open raster. rasterio makes parts of it anew at each access, so it is kept."""
+    """Return the header of an open raster; kept, because rasterio makes parts of it at each access."""
     if src in _headers:
         return _headers[src]
     transform, masks = src.transform, src.mask_flag_enums[0]
@@ -232,7 +232,7 @@ def header(src: Any) -> Header:
 
 
 def file_crs(src: Any, given: str | None) -> str | None:
-    """Return the CRS of an open raster: its own, else or where that cannot be, the given one (`crs_of`)."""
+    """Return the CRS of an open raster; if it has none or a wrong one, the given CRS (`crs_of`)."""
     found = header(src)
     return crs_of(found.crs, given, found.lattice.bounds) if found.lattice else found.crs or given
 
@@ -264,7 +264,7 @@ def place(
     if same(own_crs, grid.crs):
         return lattice
     west, south, east, north = bounds_in(grid.crs, own_crs, lattice.bounds)
-    # False for bounds that cannot be transformed (inf, NaN): they are an error.
+    # This is False for bounds that cannot be transformed (inf, NaN): they are an error.
     if east <= grid.bounds[0] or grid.bounds[2] <= west or north <= grid.bounds[1] or grid.bounds[3] <= south:
         return None
     if reproject:

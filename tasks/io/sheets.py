@@ -1,8 +1,8 @@
-"""Files of one layer laid on a grid together, so that no cell at a file's border lacks its neighbours.
+"""Resample the files of one layer together, so that no cell at a file's border lacks its neighbours.
 
-Interpolation takes the cells around a place, and at the border of a file some of them are in the next file.
-Files of one lattice are joined. Beside files of other lattices a file is extended by the cells that
-interpolation needs, with heights interpolated in those files.
+Interpolation uses the cells around a place. At the border of a file, some of these cells are in the next
+file. Files of one lattice are joined. If the next file has another lattice, a file is extended by the cells
+that interpolation needs, with heights interpolated in the next file.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ def shared_m2(extent: Bounds | None, bounds: Bounds) -> float:
 
 
 def reach_m(patches: Sequence[RasterWindow], grid: Grid) -> float:
-    """Return how far beyond a grid the heights are needed for those at its edge (m); 0 for one lattice.
+    """Return how far beyond a grid heights are needed for the heights at its edge (m); 0 for one lattice.
 
-    Cells beyond a file's border are interpolated in files of other lattices, and these in further ones.
+    Cells beyond a file's border are interpolated in files of other lattices, and so on.
     """
     lattices = [group[0].lattice for group in same_lattice(patches)]
     if len(lattices) < 2:
@@ -45,15 +45,15 @@ def reach_m(patches: Sequence[RasterWindow], grid: Grid) -> float:
 
 
 def lay_classes(patches: Sequence[RasterWindow], grid: Grid) -> Floats:
-    """Return the parts of files of classes on a grid's cells; see `lay_heights`."""
+    """Return files of classes on a grid's cells, ``(H, W)``; see `lay_heights`."""
     return _filled(sorted(patches, key=_is_warped), grid, Resampling.nearest)
 
 
 def lay_heights(patches: Sequence[RasterWindow], grid: Grid) -> Floats:
-    """Return the parts of files of heights on a grid's cells, ``(H, W)``; NaN where none has a value.
+    """Return files of heights on a grid's cells, ``(H, W)``; NaN where no file has a value.
 
-    Where files overlap, the first one with a value is used, those in the grid's CRS before others, which lose
-    by the transformation.
+    Where files overlap, the first file with a value is used. Files in the grid's CRS come before other files,
+    because a transformation loses precision.
     """
     ordered = sorted(patches, key=_is_warped)
     fitting = [patch for patch in ordered if patch.lattice.fits(grid)]
@@ -96,15 +96,15 @@ def _resampled_together(groups: Sequence[Sequence[RasterWindow]], grid: Grid) ->
         else joined(group)[0]
         for group in groups
     ]
-    # The mean of a step with fewer cells is off its centre: heights of other files go before.
+    # The mean of an incomplete step is not at its centre, so heights of other files are preferred.
     known = [
         replace(sheet, values=np.where(sheet.share < 1 - EXACT, np.nan, sheet.values))
         if sheet.share is not None
         else sheet
         for sheet in sheets
     ]
-    # The coarsest first: its cells beyond its border are farthest from the borders of the others, and these
-    # then interpolate up to their own borders.
+    # The coarsest comes first: its cells reach farthest beyond its border. Finer sheets then interpolate up
+    # to their own borders.
     for number in sorted(range(len(sheets)), key=lambda number: -_cell_m2(sheets[number].lattice, grid)):
         others = [*known[:number], *known[number + 1 :]]
         known[number] = _extended(known[number], sheets[number], others, grid)
@@ -123,9 +123,9 @@ def _cell_m2(lattice: RasterGrid, grid: Grid) -> float:
 def _extended(
     known: RasterWindow, sheet: RasterWindow, others: Sequence[RasterWindow], grid: Grid
 ) -> RasterWindow:
-    """Return a sheet with the cells around it, and those without a value, interpolated in other sheets.
+    """Return a sheet with cells around it, and cells without a value, interpolated in other sheets.
 
-    - `known`: the sheet, with NaN where heights of others are to be preferred.
+    - `known`: the sheet, with NaN where heights of other sheets are preferred.
     """
     lattice = sheet.lattice
     across, along = lattice.cell_of(grid)

@@ -1,8 +1,8 @@
 """Read the features of a vector file near a tile; a file is read and indexed once per process, not per tile.
 
-Files with a spatial index that has all features (GeoPackage, FlatGeobuf) are read by large squares, of which
-a process keeps a few, so that memory does not grow with the file. Others are read once, as a whole. A file in
-a bucket is copied once per process, because reading a GeoPackage in place takes hundreds of requests.
+Files with a complete spatial index (GeoPackage, FlatGeobuf) are read in large squares. A process keeps a few
+squares, so that memory does not grow with the file. Other files are read completely, once. A file in a bucket
+is copied once per process, because reading a GeoPackage in place takes hundreds of requests.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ CACHE_SIZE = 8
 OSM = {"lines": "highway IS NOT NULL", "multipolygons": "other_tags LIKE '%highway%'"}
 """Layers of the OSM format with roads, and SQL conditions that select their candidate features."""
 OTHER_TAGS = "other_tags"
-"""Column in which GDAL's OSM driver packs the tags it has no column for: ``"lanes"=>"2","width"=>"7"``."""
+"""Column in which GDAL's OSM driver packs tags without a column: ``"lanes"=>"2","width"=>"7"``."""
 ENCODING = "encoding"
-"""Attribute of a table whose text is not in the encoding that its file declares: the one it was read in."""
+"""Attribute of a table with the encoding of its text, if the file declares another encoding."""
 MOST_NAMED = 12
 """Number of columns that an error names."""
 WHOLE = 8
@@ -72,9 +72,9 @@ class Query:
     where: str | None
     """SQL condition that features must meet, or None."""
     columns: tuple[str, ...]
-    """Names of columns or OSM tags, in lower case; those the file lacks are left out."""
+    """Names of columns or OSM tags, in lower case; names that the file lacks are left out."""
     bare_crs: str | None
-    """CRS if the file carries none."""
+    """CRS for a file that declares none."""
     crs: str
     """CRS of the result (m)."""
 
@@ -87,7 +87,7 @@ class _Layer:
     fields: tuple[str, ...]
     """All columns."""
     columns: tuple[str, ...]
-    """Those that are read."""
+    """The columns that are read."""
     where: str | None
     tested: tuple[str, ...]
     """Further columns that ``where`` may name: most drivers filter only by columns that are read."""
@@ -96,7 +96,7 @@ class _Layer:
 def read_near(request: Query, bounds: Bounds) -> Any:
     """Return the features whose bounding boxes touch ``bounds`` (m, in ``request.crs``).
 
-    - result: in ``request.crs``, with those of the columns that exist, named in lower case.
+    - result: in ``request.crs``, with the requested columns that exist, named in lower case.
     """
     try:
         version = source_stat(request.path)
@@ -114,7 +114,7 @@ def read_near(request: Query, bounds: Bounds) -> Any:
         for part in parts:
             attributes |= part.attrs
         whole = pandas.concat([_touching(part, bounds) for part in parts])
-        # A feature that reaches into several squares has the same index in all of them.
+        # A feature in several squares has the same index in all of them.
         tables.append(whole[~whole.index.duplicated()])
     near = pandas.concat(tables, ignore_index=True)
     near.attrs = attributes
@@ -150,7 +150,7 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
     try:
         file = _file(request, version)
         kinds = dict(pyogrio.list_layers(file))
-        # The file may also hold styles and other tables without geometries.
+        # The file may also have styles and other tables without geometries.
         spatial = [name for name, kind in kinds.items() if kind is not None]
         names = [request.layer] if request.layer else list(OSM) if set(OSM) <= set(spatial) else spatial
         if request.layer and request.layer not in kinds:
@@ -161,7 +161,7 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
                 f"has {count(len(kinds), 'layer')}: {_listed(file, kinds)}; make the catalog with "
                 "--roads 'FILE|layername=NAME', or name one with segment.layer",
             )
-        # Only where the file's CRS may be replaced: the bounds of a GeoJSON take a reading of all of it.
+        # Bounds are read only if the file's CRS may be replaced: for a GeoJSON, GDAL reads the complete file.
         bounds = bool(request.bare_crs) and set(names) != set(OSM)
         infos = (layer_info(file, name, force_total_bounds=bounds) for name in names)
         return tuple(
@@ -207,7 +207,7 @@ def _copied(path: UPath, version: FileStat) -> _Copy:
 
 
 def _indexed(request: Query, version: FileStat, file: str, info: Any) -> bool:
-    """Return whether the features of a square can be read alone; all others are read as a whole."""
+    """Return whether the features of a square can be read alone; other files are read completely."""
     if has_complete_index(file, info):
         return True
     if info["capabilities"]["fast_spatial_filter"]:
@@ -244,7 +244,7 @@ def _described(request: Query, name: str, info: Any, indexed: bool) -> _Layer:
 
 @lru_cache(maxsize=CACHE_SIZE)
 def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | None) -> Any:
-    """Return a layer's features, or those that touch a square (m, in ``request.crs``), in ``request.crs``."""
+    """Return a layer's features, or its features that touch a square (m), in ``request.crs``."""
     try:
         table = _read_square(request, version, layer, square)
         attributes = table.attrs
@@ -253,7 +253,7 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
     except (RuntimeError, ValueError, ProjError, CatalogError) as error:
         # A failed transformation also raises RuntimeError.
         hint = f"; check segment.where: its columns are {_names(layer)}" if request.where else ""
-        # SQLite's error follows GDAL's complete query, which has the square.
+        # GDAL's complete query comes before SQLite's error, and contains the square.
         why = reason(error).rpartition(f"({layer.where}): ")[2]
         raise _error(request, f"cannot be read as roads: {why}{hint}") from error
     table = table.rename(columns={name: name.lower() for name in layer.columns})
@@ -272,7 +272,7 @@ def _names(layer: _Layer) -> str:
 
 
 def has_place(features: NDArray[np.object_]) -> Bools:
-    """Return which geometries have only coordinates that can be a place, ``(n,)``: none infinite or NaN."""
+    """Return which geometries have only finite coordinates, ``(n,)``."""
     coordinates, owner = shapely.get_coordinates(features, return_index=True)
     placed = np.ones(len(features), bool)
     placed[owner[~(np.abs(coordinates) <= FARTHEST).all(axis=1)]] = False
@@ -280,7 +280,7 @@ def has_place(features: NDArray[np.object_]) -> Bools:
 
 
 def _read_square(request: Query, version: FileStat, layer: _Layer, square: Bounds | None) -> Any:
-    """Return a layer's features, or those that touch a square, in the layer's CRS."""
+    """Return a layer's features, or its features that touch a square, in the layer's CRS."""
     file = _file(request, version)
     bbox = square and transformer(request.crs, layer.crs).transform_bounds(*square, densify_pts=21)
     try:
@@ -288,8 +288,8 @@ def _read_square(request: Query, version: FileStat, layer: _Layer, square: Bound
     except (RuntimeError, pyogrio.errors.FeatureError) as error:
         if bbox is None or "NaN/Inf" not in str(error):
             raise
-        # GEOS cannot tell whether a feature with a coordinate that is no number touches the square, and GDAL
-        # then returns no feature at all.
+        # GEOS cannot decide whether a feature with a coordinate that is not a number touches the square. GDAL
+        # then returns no feature.
         remedy = "remove features with infinite coordinates, or convert the file with ogr2ogr -skipfailures"
         memory.check(WHOLE * version.size, f"{request.path}, read as a whole,", remedy, str(request.path))
         return _read(request, file, layer, None)
@@ -335,7 +335,7 @@ def _unpacked(table: Any, columns: tuple[str, ...]) -> Any:
 
 @contextlib.contextmanager
 def vector_date(date: datetime) -> Iterator[None]:
-    """Make GDAL write a date (UTC) in place of the current one, as GeoPackages have; a context manager."""
+    """Make GDAL write a given date (UTC) into GeoPackages, not the current date; a context manager."""
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": f"{date:%Y-%m-%dT%H:%M:%SZ}"})
     try:
         yield

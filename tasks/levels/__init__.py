@@ -1,1 +1,1 @@
-"""Roads above and below other roads: where levels begin, and what each of them sees."""
+"""Roads above and below other roads: where levels begin, and which heights belong to each level."""

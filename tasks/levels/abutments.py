@@ -1,9 +1,9 @@
 """Where the roads of other levels begin: the abutments of decks and tunnels, and their approaches.
 
-Roads of one level that cross in plan are noted, as a level has one height at each place.
+A note is made on roads of one level that cross in plan, because a level has one height at each place.
 
-Everything is decided from the vectors and from cells near each abutment alone, so that a tile, its neighbour
-and their edge find the same levels.
+All decisions depend only on the vectors and on cells near each abutment. So a tile, its neighbour and
+their edge find the same levels.
 """
 
 from __future__ import annotations
@@ -27,41 +27,41 @@ from flexroad.tasks.types import BLEND_M, Bools, Floats, Level, TileData
 APPROACH_M = 16.0
 """Length of an approach (m): a control point of 3.6 m distance acts up to 10.8 m away."""
 REACH_M = APPROACH_M + BLEND_M + 1.0
-"""A level that is farther from a tile (m) has no effect on its surface."""
+"""A level farther from a tile than this (m) has no effect on its surface."""
 GAP_M = 1.5
 """Widest gap between a deck and its approach (m)."""
 SHORTEST_M = 1.5
 """Shortest abutment (m)."""
 STEP_M = 0.25
-"""Distance of the places along an outline at which an abutment is looked for (m)."""
+"""Distance of the places along an outline at which an abutment is searched (m)."""
 BELOW_M = 2.5
-"""A street of level 0 that reaches so far below a deck (m) passes below it."""
+"""A street of level 0 that reaches at least this far below a deck (m) passes below it."""
 PASSES_M2 = 1.0
-"""Least area of its part so far within the outline (m2)."""
+"""Least area of the part of a street that lies so far within the outline (m2)."""
 INNER = 0.4
-"""Share of the width of a narrow deck that replaces this distance."""
+"""Share of the width of a narrow deck that replaces `BELOW_M`."""
 TURN_DEG = 45.0
-"""At sharper turns an outline has a corner (degrees)."""
+"""An outline has a corner where it turns by more than this (degrees)."""
 WIDEST_M = 40.0
-"""A straight side up to this length (m), of which half is an abutment, is one with its pavements."""
+"""If half of a straight side up to this length (m) is an abutment, the whole side is, with its pavements."""
 RISE_M = 0.75
-"""Visible roads on both sides of an abutment differ at most by this in height (m)."""
+"""Largest difference in height of visible roads on both sides of an abutment (m)."""
 BESIDE_M = 6.0
-"""Distance from the middle of an abutment up to which they are compared (m)."""
+"""Distance from the middle of an abutment up to which these roads are compared (m)."""
 AROUND_M = 16.0
 """Distance from there up to which cells decide whether a road is visible (m)."""
 ROUGHNESS_M, BEND = 0.15, 0.1
-"""A visible road has flat patches of at most these residuals (m) and differences of slope."""
+"""Largest residuals (m) and differences of slope of the flat patches of a visible road."""
 APART_M = 0.02
-"""Roads of level 0 are kept apart by this from decks (m)."""
+"""Distance between decks and roads of level 0 (m)."""
 TUNNEL_M = 50.0
-"""Longest tunnel (m): heights of a longer one would be guessed."""
+"""Longest tunnel (m): heights of a longer tunnel would be guessed."""
 SAME_M = 0.01
 """Vertices within this distance are the same (m)."""
 PART_M2 = 1.0
-"""Smaller parts of a road beside another one are slivers (m2)."""
+"""Parts of a road beside another road that are smaller than this are slivers (m2)."""
 MOST_SHARED = 0.5
-"""A road with more than this share of its area in common with another one lies on it: it is on its deck."""
+"""A road that shares more than this part of its area with another road lies on the same deck."""
 
 Lines = NDArray[np.object_]
 
@@ -69,11 +69,11 @@ Lines = NDArray[np.object_]
 def levels_of(
     areas: NDArray[np.object_], shapes: NDArray[np.object_], numbers: NDArray[np.int64], data: TileData
 ) -> tuple[tuple[Level, ...], tuple[str, ...]]:
-    """Return the levels that the surface of a tile depends on, by ascending number, and notes.
+    """Return the levels on which the surface of a tile depends, by ascending number, and notes.
 
-    - `areas`, `shapes`, `numbers` ``(n,)``: the roads on and around the tile's grid as polygons, what these
-      were made of (`rasterise.Roads`), and their levels.
-    - `data`: its heights refuse abutments between roads that differ in height.
+    - `areas`, `shapes`, `numbers` ``(n,)``: the roads on and around the tile's grid as polygons, their
+      original shapes (`rasterise.Roads`), and their levels.
+    - `data`: heights of the tile; abutments between roads of different heights are refused.
     """
     if not numbers.any():
         return (), ()
@@ -118,7 +118,7 @@ def _grown(grid: Grid, distance_m: float) -> shapely.Polygon:
 def _level(number: int, areas: shapely.MultiPolygon, streets: Lines, data: TileData) -> Level:
     """Return a level with all its areas."""
     near = streets[shapely.dwithin(streets, areas, APPROACH_M + GAP_M)]
-    # Streets with a part well within an outline pass below the deck, or above the tunnel.
+    # Streets with a part far within an outline pass below the deck, or above the tunnel.
     parts = shapely.get_parts(areas)
     width = 2 * shapely.area(parts) / shapely.length(parts)
     inner = shapely.union_all(shapely.buffer(parts, -np.minimum(BELOW_M, INNER * width)))
@@ -128,7 +128,7 @@ def _level(number: int, areas: shapely.MultiPolygon, streets: Lines, data: TileD
     if number > 0:
         window = _grown(data.grid, 0.0)
         lines = [line for line in lines if shapely.intersects(line, window)]
-        # The road beyond a portal lies below the ground around it, and crowns hang over it.
+        # The road beyond a portal lies below the ground around it, and under tree crowns.
         deck = cells(np.array([areas]), data.grid)
         street = cells(touching, data.grid) & ~deck
         lines = [line for line in lines if _is_level(line, deck, street, data)]
@@ -144,7 +144,7 @@ def _level(number: int, areas: shapely.MultiPolygon, streets: Lines, data: TileD
 
 
 def _ends(areas: shapely.MultiPolygon, streets: Lines) -> Iterator[shapely.LineString]:
-    """Yield the lines on outlines in front of which a street ends; one that goes on below is left out."""
+    """Yield the lines on outlines at which a street ends; streets that continue below are left out."""
     for polygon in shapely.get_parts(shapely.orient_polygons(areas)):
         for ring in (polygon.exterior, *polygon.interiors):
             for side in _sides(ring):
@@ -152,7 +152,7 @@ def _ends(areas: shapely.MultiPolygon, streets: Lines) -> Iterator[shapely.LineS
 
 
 def _sides(ring: shapely.LinearRing) -> list[shapely.LineString]:
-    """Return an outline in pieces between its corners, the first of which begins at one."""
+    """Return an outline in pieces between its corners; the first piece begins at a corner."""
     corners = shapely.get_coordinates(shapely.remove_repeated_points(ring, 1e-6))[:-1]
     steps = np.diff(corners, axis=0, append=corners[:1])
     angle = np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))
@@ -189,7 +189,7 @@ def _is_at(area: shapely.Geometry, places: Floats) -> Bools:
 
 
 def _is_level(abutment: shapely.LineString, deck: Bools, street: Bools, data: TileData) -> bool:
-    """Return whether deck and street have one height at an abutment, or one of them is not visible there."""
+    """Return whether deck and street have the same height at an abutment, or one of them is not visible."""
     x, y = shapely.get_coordinates(abutment.interpolate(0.5, normalized=True))[0]
     grid = data.grid
     row, col = (int(value) for value in grid.cells(np.array(x), np.array(y)))
@@ -221,7 +221,7 @@ def _touching(areas: shapely.MultiPolygon, abutments: shapely.MultiLineString) -
 
 
 def _with_portals(level: Level, core: Grid) -> tuple[Level, list[str]]:
-    """Return the tunnels that begin and end within reach, and a note about the others on the tile."""
+    """Return the tunnels that begin and end within reach, and a note about other tunnels on the tile."""
     parts, kept, notes = shapely.get_parts(level.areas), list[shapely.Polygon](), list[str]()
     abutments = shapely.get_parts(level.abutments)
     for part in parts:
@@ -243,7 +243,7 @@ def _with_portals(level: Level, core: Grid) -> tuple[Level, list[str]]:
 
 
 def lack_abutment(parts: Lines, abutments: shapely.MultiLineString, grid: Grid, core: Grid) -> Bools:
-    """Return which decks on a tile have no abutment, ``(n,)``; one beyond its grid may have some there."""
+    """Return which decks on a tile have no abutment, ``(n,)``; decks beyond its grid may have one there."""
     known = shapely.contains_properly(_grown(grid, 0.0), parts) & shapely.intersects(parts, _grown(core, 0.0))
     return np.asarray(known & ~shapely.dwithin(parts, abutments, APART_M))
 
@@ -251,11 +251,11 @@ def lack_abutment(parts: Lines, abutments: shapely.MultiLineString, grid: Grid, 
 def crossing_notes(areas: Lines, shapes: Lines, numbers: NDArray[np.int64], core: Grid) -> tuple[str, ...]:
     """Return a note for each level but 0 on the pairs of its roads that cross on the core by mistake.
 
-    Two roads that cross have a common vertex, as a junction on a deck has. Without one, one of them lies on
-    another level in truth, and the surface of both is a compromise.
+    Roads that cross correctly have a common vertex, such as a junction on a deck. Without a common vertex,
+    one of them really lies on another level, and the surface of both is a compromise.
 
-    - `areas`, `shapes`, `numbers` ``(n,)``: valid polygons of roads, the polygons or lines that they were
-      made of, and their levels. Areas that only close wedges between roads have the shape None.
+    - `areas`, `shapes`, `numbers` ``(n,)``: valid polygons of roads, the polygons or lines from which they
+      were made, and their levels. Areas that only close wedges between roads have the shape None.
     """
     on_core, notes = shapely.box(*core.bounds), list[str]()
     for number in np.unique(numbers[numbers != 0]).tolist():

@@ -1,4 +1,4 @@
-"""The level of each place along a route: by its centre lines, and beyond the ends of structures."""
+"""The level of each place along a route, from its centre lines; decks continue beyond their ends."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from flexroad.tasks.types import Bools, Floats
 
 @dataclass(frozen=True, eq=False)
 class PlaceLevels:
-    """The level of each of some places, in their shape."""
+    """The level of each place, in the shape of the places."""
 
     number: NDArray[np.int8]
     own: Bools
-    """Whether the centre line there is of this level; else it is of level 0, near a deck or tunnel."""
+    """Whether the centre line there has this level; else it has level 0, near a deck or tunnel."""
 
     def __getitem__(self, places: Bools | NDArray[np.intp]) -> PlaceLevels:
         return PlaceLevels(self.number[places], self.own[places])
@@ -53,9 +53,9 @@ def structures(levels: NDArray[np.int8], s: Floats) -> tuple[Structure, ...]:
 
 
 def route_levels(route: Route) -> Callable[[Floats, Floats], PlaceLevels] | None:
-    """Return a function of x and y of places on and beside a route; None if all of it is on level 0.
+    """Return a function from x and y of places on and beside a route to their levels.
 
-    It returns their levels in their broadcast shape.
+    None if the complete route is on level 0.
     """
     if not any(part.level for part in route.parts):
         return None
@@ -71,9 +71,9 @@ def route_levels(route: Route) -> Callable[[Floats, Floats], PlaceLevels] | None
 
 
 def _spans(route: Route) -> Iterator[tuple[shapely.LineString, int, bool]]:
-    """Yield lines with their level, and whether it is their own; decks go on for the length of an approach.
+    """Yield lines with their level, and whether it is their own; an approach continues a deck.
 
-    Between two decks that are so near that their approaches would overlap, each goes on to the middle.
+    Between two decks whose approaches would overlap, each deck continues to the middle.
     """
     groups = [(level, list(parts)) for level, parts in groupby(route.parts, lambda part: part.level)]
     for k, (level, parts) in enumerate(groups):

@@ -1,8 +1,8 @@
-"""What each level sees of the heights of a tile: levels differ in nothing else.
+"""The heights of a tile that each level uses ("sees"): levels differ in nothing else.
 
-Level 0 does not see the decks, and not the approaches, where it takes the surface of their level. A deck sees
-itself and its approaches, and beyond 12 m of them everything that level 0 sees. A tunnel sees its approaches;
-its own heights are inferred from them.
+Level 0 does not see the decks. It does not see the approaches either, where it has the surface of their
+level. A deck sees itself and its approaches, and more than 12 m away from them all that level 0 sees. A
+tunnel sees its approaches; its own heights are inferred from them.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from flexroad.tasks.types import Bools, Floats, Level, RoadClusters, RoadMask, T
 HIDDEN_M = 1.0
 """Distance beside a deck up to which the DSM shows neither level (m)."""
 APART_M = 12.0
-"""Heights of level 0 so near to a deck (m) are left out: a control point acts up to 10.8 m away."""
+"""Heights of level 0 this near to a deck (m) are left out: a control point acts up to 10.8 m away."""
 MOST = 400
-"""Most cells of the approaches from which the heights of a tunnel are inferred."""
+"""Largest number of cells of the approaches from which the heights of a tunnel are inferred."""
 LEAST = 20
-"""Fewest cells with which they are inferred."""
+"""Smallest number of cells from which they are inferred."""
 SMOOTHING = 10.0
-"""Smoothing of the thin plate through them."""
+"""Smoothing of the thin plate through these cells."""
 
 Filter = Callable[[TileData, RoadMask, bool], RoadClusters]
-"""The filter of one level, with whether it is another level than 0."""
+"""The filter of one level; its last argument says whether the level is another than 0."""
 
 
 def level_data(data: TileData, clusters: RoadClusters, number: int = 0) -> TileData:
     """Return the heights that a level sees; the data itself if the tile has no levels.
 
-    - `clusters`: those of level 0, with the other levels.
+    - `clusters`: the clusters of level 0, with the other levels.
     """
     if not clusters.levels:
         return data
@@ -54,7 +54,7 @@ def level_data(data: TileData, clusters: RoadClusters, number: int = 0) -> TileD
 def level_clusters(
     data: TileData, road: RoadMask, ecsrc: Filter, shoulder_m: float, beyond_m: float
 ) -> RoadClusters:
-    """Return the filtered roads of level 0, with those of the other levels.
+    """Return the filtered roads of level 0, with the filtered roads of the other levels.
 
     - `ecsrc`: the filter of one level.
     - `shoulder_m`, `beyond_m`: width of the shoulder, and distance beyond it, up to which the ground beside
@@ -64,8 +64,8 @@ def level_clusters(
     approach = _any(grid, [_taken(level, grid) for level in levels])
     below = _hidden(levels, grid) & road.mask
     own = ecsrc(_masked(data, levels, 0), road, False)
-    # A road below a deck goes on between its visible parts, as stiff as a road. The DTM is interpolated
-    # there, from walls, too; ground so near that it acts on the road has its height by steps alone.
+    # A road below a deck continues between its visible parts, as stiff as a road. The DTM there is
+    # interpolated, also from walls. Ground that is near enough to act on the road gets its height by steps.
     shoulder = within(below, grid.cell, APART_M) & ~road.mask
     labels = np.where(below, max(1, int(own.labels.max())), own.labels)
     own = _without(replace(own, labels=labels.astype(np.int32)), approach)
@@ -79,7 +79,7 @@ def level_clusters(
 
 
 def with_approaches(clusters: RoadClusters) -> RoadClusters:
-    """Return the clusters of level 0 with those of its approaches, which other levels have."""
+    """Return the clusters of level 0 together with the clusters of its approaches, from other levels."""
     for own in clusters.levels:
         assert own.level
         taken = _taken(own.level, clusters.grid)
@@ -101,7 +101,7 @@ def top_mask(clusters: RoadClusters) -> Bools:
 
 
 def hidden(levels: tuple[Level, ...], number: int, grid: Grid) -> Bools:
-    """Return the cells of a level that decks above it hide, and those beside the decks, ``(H, W)``."""
+    """Return the cells of a level below decks and beside decks, ``(H, W)``: the decks hide them."""
     if number == 0:
         return _hidden(levels, grid)
     level = next(level for level in levels if level.number == number)
@@ -115,7 +115,7 @@ def off_ground(levels: tuple[Level, ...], grid: Grid) -> Bools:
 
 
 def level_road(road: RoadMask, number: int) -> RoadMask:
-    """Return the road mask of a level: for others than 0 its areas, beyond which it has no mesh."""
+    """Return the road mask of a level; for levels other than 0 their areas, which limit their mesh."""
     if number == 0:
         return road
     level = next(level for level in road.levels if level.number == number)
@@ -134,7 +134,7 @@ def _of_level(data: TileData, road: RoadMask, level: Level, ecsrc: Filter) -> Ro
         labels = np.where(own, max(1, int(clusters.labels.max())), clusters.labels)
         clusters = replace(clusters, labels=labels.astype(np.int32))
     if data.decks is not None and level.number > 0 and clusters.dtm_invalid is not None:
-        # The layer of decks has their height, also where it departs from the slope of the approaches.
+        # The layer of decks has their height, even where it differs from the slope of the approaches.
         valid = own & np.isfinite(data.decks)
         clusters = replace(clusters, dtm_invalid=clusters.dtm_invalid & ~valid)
     return replace(_without(clusters, apart), beside=None, level=level)
@@ -146,7 +146,7 @@ def _masked(data: TileData, levels: tuple[Level, ...], number: int) -> TileData:
     below = _hidden(levels, grid)
     if number == 0:
         dsm = np.where(below, np.nan, data.dsm)
-        # A terrain model that has the deck tells nothing of the ground below it.
+        # If a terrain model shows the deck, it does not show the ground below it.
         dtm = np.where(below & (np.abs(data.dtm - data.dsm) <= DSM_DTM_TOLERANCE_M), np.nan, data.dtm)
         return _replaced(data, dsm, dtm)
     level = next(level for level in levels if level.number == number)
@@ -191,7 +191,7 @@ def _without(clusters: RoadClusters, cells: Bools) -> RoadClusters:
 
 
 def _hidden(levels: tuple[Level, ...], grid: Grid) -> Bools:
-    """Return the cells on decks and beside them, but for approaches."""
+    """Return the cells on decks and beside them, except approaches."""
     approach = _any(grid, [_taken(level, grid) for level in levels])
     return _any(grid, [_over(deck, grid) for deck in _decks(levels)]) & ~approach
 
@@ -233,7 +233,7 @@ def _taken(level: Level, grid: Grid) -> Bools:
 def _once(level: Level, grid: Grid, name: str, make: Callable[[], Bools]) -> Bools:
     """Return a raster of a level, ``(H, W)``; it is made once and kept with the level.
 
-    It is kept without the rows and columns around it that are empty: a tile has many cells, a deck few.
+    Empty rows and columns around it are not kept, because a tile has many cells and a deck few.
     """
     key, result = (name, grid), np.zeros(grid.shape, np.bool_)
     if key not in level.rasters:

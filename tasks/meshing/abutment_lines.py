@@ -1,8 +1,8 @@
 """The outlines of decks and tunnels as lines of meshes, and their abutments with the ground.
 
 An abutment is an edge of two meshes: of level 0, and of the level that begins. Both have the same vertices
-on it, with the heights of the other level. Below a deck, level 0 has a second line beside it, with heights of
-its own, at the foot of the abutment. So the wall there is steep, and level 0 stays below the deck.
+on it, with the heights of the other level. Below a deck, level 0 has a second line beside it, at the foot of
+the abutment, with its own heights. So the wall there is steep, and level 0 stays below the deck.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class LevelOutline:
     area: shapely.Geometry
     """The decks or tunnels on the tile."""
     abutments: NDArray[np.object_]
-    """The lines of their outline that are abutments."""
+    """The lines of the outline that are abutments."""
     rim: NDArray[np.object_]
     """The other lines."""
     feet: NDArray[np.object_]
@@ -56,7 +56,7 @@ class LevelOutline:
         return np.asarray(shapely.dwithin(self.on_abutments, shapely.points(points[:, :2]), SAME_M))
 
     def with_shared(self, border: Floats, ground: Floats, local: Bounds) -> Floats:
-        """Return the vertices of the level on the border of a tile, on abutments those of level 0.
+        """Return the vertices of the level on the border of a tile; on abutments the vertices of level 0.
 
         - `border` ``(n, 3)``: vertices along the complete border.
         - `ground` ``(m, 3)``: the vertices of level 0.
@@ -67,9 +67,9 @@ class LevelOutline:
         return np.asarray(every[near])
 
     def covered(self, area: shapely.Geometry, segments: Floats, local: Bounds) -> shapely.Geometry:
-        """Return an area with the segments, ``(n, 2, 2)``, as its outline, which differs by rounding.
+        """Return an area whose outline is replaced by the segments, ``(n, 2, 2)``, which differ by rounding.
 
-        Faces between vertices of the outline can be slivers; which of them lie inside follows from this.
+        Faces between vertices of the outline can be slivers. This area decides which of them lie inside.
         """
         lines = shapely.union_all([*shapely.linestrings(segments), shapely.box(*local).exterior])
         parts = shapely.get_parts(shapely.polygonize(shapely.get_parts(lines)))
@@ -78,7 +78,7 @@ class LevelOutline:
 
 
 def level_outline(level: Level, core: Grid, local: Bounds, spacing_m: float) -> LevelOutline | None:
-    """Return the outline of a level on a tile, None if nothing of it lies there.
+    """Return the outline of a level on a tile, None if it does not lie there.
 
     - `core`: the tile.
     - `local`: west, south, east and north of the tile, from its origin (m).
@@ -109,7 +109,7 @@ def level_outline(level: Level, core: Grid, local: Bounds, spacing_m: float) -> 
 
 
 def _pieces(line: shapely.LineString, abutments: shapely.Geometry) -> list[tuple[shapely.LineString, bool]]:
-    """Return a line in pieces that are abutments or not, and which they are."""
+    """Return a line in pieces, each with whether it is an abutment."""
     corners = shapely.get_coordinates(line)
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
     ends = shapely.get_parts(shapely.boundary(abutments))
@@ -129,7 +129,7 @@ def _pieces(line: shapely.LineString, abutments: shapely.Geometry) -> list[tuple
 def _divided(line: shapely.LineString, spacing_m: float, local: Bounds) -> shapely.LineString:
     """Return a line with points at most a distance (m) apart, on the grid of lines.
 
-    Ends on the border of the tile stay where they are, and no other point is so near to it that it would be
+    Ends on the border of the tile are not moved. No other point is so near to the border that it would be
     moved there.
     """
     points = shapely.get_coordinates(shapely.segmentize(line, spacing_m))
@@ -165,10 +165,10 @@ def with_abutments(
     heights: Floats, easting: Floats, northing: Floats, surface: Surface, outlines: Sequence[LevelOutline],
     origin: tuple[float, float],
 ) -> Floats:  # fmt: skip
-    """Return heights of points, ``(n,)``, m, with those of the other level on abutments.
+    """Return heights of points, ``(n,)``, m; on abutments the heights of the other level.
 
-    - `surface`: that of level 0, with the other levels.
-    - `origin`: easting and northing that the outlines are relative to (m).
+    - `surface`: the surface of level 0, with the other levels.
+    - `origin`: easting and northing of the origin of the outlines (m).
     """
     points, result = np.column_stack([easting, northing]), heights.copy()
     for outline in outlines:

@@ -1,4 +1,4 @@
-"""Points of meshes: lattices, places without duplicates, middles of faces, and lines that are edges."""
+"""Points of meshes: lattices, unique points, centroids of faces, and lines that become edges."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from flexroad.catalog.grid import Bounds
 from flexroad.tasks.types import Bools, Floats
 
 GRID_M = 2.0**-8
-"""Where lines cross, their points are moved to multiples of this (m): no two of them are too close."""
+"""Where lines cross, points are moved to multiples of this (m), so that no two points are too close."""
 AT_BORDER_M = 0.005
-"""Points of lines within this distance of the border lie on it (m); more than crossings are moved."""
+"""Points of lines within this distance of the border lie on it (m); larger than the moves at crossings."""
 DECIMALS = 6
 """Decimals (of a metre) to which lattice offsets are rounded, so that 3 * 0.1 m equals 1 * 0.3 m."""
 SNAP_M = 1e-3
@@ -34,7 +34,7 @@ def axis(start: float, stop: float, step: float, to_end: bool) -> Floats:
 
 
 def without_duplicates(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Return points by northing, then easting, each place once, and the new numbers of the given ones."""
+    """Return points by northing, then easting, each place once, and the new numbers of the given points."""
     order = _by_northing(points)
     ordered = points[order]
     first = np.ones(len(points), bool)
@@ -47,8 +47,8 @@ def without_duplicates(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
 def _by_northing(points: Floats) -> NDArray[np.intp]:
     """Return the order of points by northing, then easting."""
     x, y = np.ascontiguousarray(points[:, :2].T)
-    # A stable sort of one number is fast, as the points come in a few ordered parts. Rounding makes it wrong
-    # where two points on nearly the same northing are nearly at the same place.
+    # A stable sort of one number is fast, because the points come in a few ordered parts. Rounding makes the
+    # order wrong if two points with nearly the same northing are nearly at the same place.
     order = np.argsort(y * 2.0 ** np.ceil(np.log2(np.abs(x).max() + 1.0) + 1.0) + x, kind="stable")
     x, y = x[order], y[order]
     ordered = (y[:-1] < y[1:]) | ((y[:-1] == y[1:]) & (x[:-1] <= x[1:]))
@@ -58,7 +58,7 @@ def _by_northing(points: Floats) -> NDArray[np.intp]:
 def middles(points: Floats, faces: NDArray[np.int32]) -> Floats:
     """Return the centroids of faces in plan, ``(F, 2)``."""
     a, b, c = faces.T
-    # Three short sums are several times faster than one of numpy over an axis of three.
+    # Three short sums are several times faster than numpy's sum over an axis of length three.
     axes = np.ascontiguousarray(points[:, :2].T)
     return np.stack([(axis[a] + axis[b] + axis[c]) / 3.0 for axis in axes], axis=1)
 
@@ -74,7 +74,7 @@ def divided(
     """Return lines with additional points, as an array of lines.
 
     - `fine_m`, `coarse_m`: largest distance of points where ``is_fine``, and elsewhere (m).
-    - `is_fine`: tells for points, ``(n, 2)``, whether lines are fine there, ``(n,)``.
+    - `is_fine`: returns for points, ``(n, 2)``, whether lines are fine there, ``(n,)``.
     """
     pieces = shapely.linestrings(_segments(shapely.segmentize(lines, coarse_m)))
     dense = shapely.segmentize(pieces, fine_m)
@@ -106,7 +106,7 @@ def points_and_segments(
 
     - `lines`: lines within the tile.
     - `border` ``(b, 2)``: the vertices on the border of the tile. Lines that reach the border end in the
-      nearest one, or before the border if none is near.
+      nearest vertex, or before the border if no vertex is near.
     - `local`: west, south, east and north of the tile (m). Segments along this border are left out.
     - `same_m`: largest distance of such a vertex (m).
     """
@@ -127,13 +127,13 @@ def points_and_segments(
     points, number = np.unique(points, axis=0, return_inverse=True)
     pairs = np.unique(np.sort(number.reshape(-1)[pairs], axis=1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    # Along the border, its vertices alone count: those of the neighbour are the same.
+    # Along the border only its own vertices are used: the neighbour has the same vertices.
     along = (points[pairs][..., [0, 1, 0, 1]] == np.array(local)).all(axis=1).any(axis=1)
     return points, pairs[~along]
 
 
 def _noded(lines: Sequence[NDArray[np.object_]]) -> shapely.Geometry:
-    """Return lines that have no points in common but ends."""
+    """Return lines whose only common points are ends."""
     every = shapely.multilinestrings(np.concatenate(lines))
     return every if len(lines) == 1 else shapely.union_all(every, grid_size=GRID_M)
 
@@ -146,7 +146,7 @@ def _segments(lines: shapely.Geometry) -> Floats:
 
 
 def _moved(points: Floats, local: Bounds) -> tuple[Floats, Bools]:
-    """Return points with those close to the border moved onto it, and which these are."""
+    """Return points, moved onto the border if they are close to it, and which points lie on it."""
     moved = points.copy()
     at_border = np.zeros(len(points), np.bool_)
     for axis, at in zip((0, 1, 0, 1), local, strict=True):

@@ -18,13 +18,12 @@ ROUNDING_M = 1e-6
 
 
 def mesh_normals(mesh: Mesh, surface: Surface | None = None) -> Floats:
-    """Return unit normals of a mesh's vertices, ``(V, 3)``, by its faces; those on its border by its surface.
+    """Return unit normals of a mesh's vertices, ``(V, 3)``.
 
-    Tiles of one surface have equal normals on their common border, so that no line is seen along it. By the
-    faces of each tile alone they would differ.
+    Inner vertices have the mean normal of the adjacent faces. Border vertices have the normal of the surface,
+    so that neighbouring tiles agree and no line is visible along their border.
 
-    - `surface`: that of the mesh. A spline over more than the tile has no border there, and other surfaces
-      have none.
+    - `surface`: the fitted surface of the mesh. Only a spline over exactly the tile has a border.
     """
     if mesh.level is not None:
         every = np.empty_like(mesh.vertices)
@@ -43,9 +42,9 @@ def mesh_normals(mesh: Mesh, surface: Surface | None = None) -> Floats:
 
 
 def vertex_normals(points: Floats, faces: NDArray[np.int32]) -> Floats:
-    """Return unit normals, ``(V, 3)``: the mean of those of the faces around, by their angle at the vertex.
+    """Return unit normals, ``(V, 3)``: the mean normal of the adjacent faces, weighted by angle.
 
-    The weights are those of Thürmer and Wüthrich (1998), Computing vertex normals from polygonal facets.
+    The weights follow Thürmer and Wüthrich (1998), Computing vertex normals from polygonal facets.
 
     - `points` ``(V, 3)``: a vertex without faces, or with lines only, has the normal (0, 0, 1).
     - `faces` ``(F, 3)``: counter-clockwise seen from the side of their normals.
@@ -58,14 +57,14 @@ def vertex_normals(points: Floats, faces: NDArray[np.int32]) -> Floats:
 
 @compiled()
 def _add(points: Floats, faces: NDArray[np.int32], normals: Floats) -> None:
-    """Add the normal of each face, times its angle, to those of its vertices."""
+    """Add the normal of each face, times its angle, to the normals of its vertices."""
     for a, b, c in faces:
         ux, uy, uz = (points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2])
         vx, vy, vz = (points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2])
         wx, wy, wz = vx - ux, vy - uy, vz - uz
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
         area = math.sqrt(nx * nx + ny * ny + nz * nz)
-        # Twice the area is the sine of an angle times the sides beside it.
+        # Twice the area is the sine of an angle times its two sides.
         at_a = math.atan2(area, ux * vx + uy * vy + uz * vz)
         at_b = math.atan2(area, -(ux * wx + uy * wy + uz * wz))
         at_c = math.pi - at_a - at_b
@@ -79,7 +78,7 @@ def _add(points: Floats, faces: NDArray[np.int32], normals: Floats) -> None:
 
 @compiled()
 def _to_units(normals: Floats) -> None:
-    """Scale vectors, ``(V, 3)``, to length 1; one of length 0 becomes (0, 0, 1)."""
+    """Scale vectors, ``(V, 3)``, to length 1; a vector of length 0 becomes (0, 0, 1)."""
     for i in range(normals.shape[0]):
         x, y, z = normals[i]
         length = math.sqrt(x * x + y * y + z * z)

@@ -1,7 +1,7 @@
 """The outline of roads from vectors as lines, so that roads end in the mesh where they end in the vectors.
 
-Coordinates are metres from the whole-metre origin of a grid (`Grid.origin`). Points are moved to multiples of
-`GRID_M`, equal ones for all tiles, before the areas are united.
+Coordinates are metres from the whole-metre origin of a grid (`Grid.origin`). Before the areas are united,
+points are moved to multiples of `GRID_M`, which are the same for all tiles.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def crossings(areas: NDArray[np.uint8] | None, border: Border) -> Floats:
 
 
 def _closed(areas: shapely.Geometry) -> shapely.Geometry:
-    """Return areas with their gaps closed, but possibly without their tips."""
+    """Return areas with closed gaps; narrow tips may be lost."""
     # GEOS buffers areas of a fixed precision on their grid, and so fills large holes.
     areas = shapely.set_precision(areas, 0)
     wider = shapely.buffer(areas, GAP_M / 2, join_style="mitre")

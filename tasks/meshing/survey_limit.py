@@ -1,10 +1,10 @@
 """The limit of the survey as lines: meshes end there, and not at the next vertex of a coarse lattice.
 
 The lines run half-way between the centres of cells with data and of cells beyond the survey ("marching
-squares"), and are simplified by less than the distance to any centre. So every centre with data stays inside,
-every other one outside, and the lines follow the limit to within a cell.
+squares"). They are simplified by less than the distance to any centre. So every centre with data stays
+inside, every other centre outside, and the lines follow the limit to within a cell.
 
-The edges of kerbs and walls are found alike. Each is two lines side by side, one on each height.
+The edges of kerbs and walls are found in the same way. Each edge is two lines side by side, one per height.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ APART = 0.2
 
 @dataclass(frozen=True, eq=False)
 class SurveyLimit:
-    """Where the survey ends on a tile."""
+    """The limit of the survey on a tile."""
 
     lines: shapely.MultiLineString
     """Lines through the tile, each closed or from border to border."""
@@ -77,8 +77,8 @@ def survey_limit(outside: Bools, corner: tuple[float, float], cell: float, withi
 def _steps(outside: Bools) -> Floats:
     """Return the segments of the limit, ``(n, 2, 2)``: ends as (column, row) of cell corners.
 
-    Each square between four cell centres has none, one or two of them, from side to side. Beyond the tile
-    cells are taken as those at its border, so that the limit meets the border at the corner of a cell.
+    Each square between four cell centres has up to two segments, from side to side. Beyond the tile, cells
+    repeat the cells at its border, so that the limit meets the border at the corner of a cell.
     """
     padded = np.pad(outside, 1, mode="edge")
     north_west, north_east = padded[:-1, :-1], padded[:-1, 1:]
@@ -93,7 +93,7 @@ def _steps(outside: Bools) -> Floats:
         "south": south_west != south_east,
     }
     crossed = passed["west"] & passed["east"] & passed["north"] & passed["south"]
-    # Cells with data that touch at a corner are joined; those beyond the survey are not.
+    # Cells with data that touch at a corner are joined; cells beyond the survey are not.
     cuts = {
         ("west", "east"): passed["west"] & passed["east"] & ~crossed,
         ("north", "south"): passed["north"] & passed["south"] & ~crossed,
@@ -107,7 +107,7 @@ def _steps(outside: Bools) -> Floats:
 
 
 def _covered(lines: shapely.MultiLineString, area: shapely.Polygon, outside: Bools) -> shapely.MultiPolygon:
-    """Return the parts of an area between the lines whose cells have data, in columns and rows."""
+    """Return the parts of an area, divided by the lines, whose cells have data, in columns and rows."""
     network = shapely.union_all([lines, shapely.boundary(area)])
     parts = shapely.get_parts(shapely.polygonize(shapely.get_parts(network)))
     number = rasterio.features.rasterize(
@@ -122,16 +122,16 @@ def _covered(lines: shapely.MultiLineString, area: shapely.Polygon, outside: Boo
 def breaklines(
     surface: SteppedSurface, local: Bounds
 ) -> tuple[shapely.MultiLineString, Callable[[Floats], Floats]]:
-    """Return the edges of the steps of a surface, and a function of points, ``(n, 2)``.
+    """Return the edges of the steps of a surface, and a function from points, ``(n, 2)``, to heights (m).
 
-    It returns their heights (m) by the side of the lines on which they lie.
+    The height depends on the side of the lines on which a point lies.
 
     - `local`: west, south, east and north of the tile, from the origin of its cells (m).
     """
     cells = surface.cells
-    # The median leaves straight edges where they are. Noise of single cells would break lines into pieces.
+    # The median does not move straight edges. Noise of single cells would break lines into pieces.
     large = np.abs(scipy.ndimage.median_filter(surface.steps, 3)) >= LEAST_M
-    # Lines end before the border of the tile: those of the neighbour need not meet them there.
+    # Lines end before the border of the tile, because the neighbour's lines may not meet them there.
     large[[0, -1]], large[:, [0, -1]] = False, False
     parts, _ = scipy.ndimage.label(large)
     size = np.bincount(parts.ravel())

@@ -1,12 +1,12 @@
 """Delaunay triangulation in plan, and the same with given edges.
 
-An edge that the Delaunay triangulation lacks is put in place of the edges that cross it: the faces that it
-crosses are removed, and the polygons on both sides are triangulated anew (Anglada 1997). No point is added.
+A missing edge is inserted as follows (Anglada 1997): the faces that it crosses are removed, and the polygons
+on both sides are triangulated again. No point is added.
 
 The squares of a lattice need no search: their corners lie on one circle. If no other point lies in it, both
-diagonals give two faces of a Delaunay triangulation; if one corner has no point, the other three are a face.
-Where such faces are side by side, only the points on the outer edge of their area are needed to triangulate
-the rest: these edges are part of every Delaunay triangulation of the points outside.
+diagonals give two faces of a Delaunay triangulation. If one corner has no point, the other three are a face.
+Where such faces are side by side, only the points on the outer edge of their area are needed for the other
+faces: these edges are part of every Delaunay triangulation of the points outside.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from flexroad.tasks.meshing.lines import middles
 from flexroad.tasks.types import Bools, Floats
 
 SNAP_TOLERANCE_M = 1e-9
-"""Points closer to each other than this are one point (m); callers keep theirs farther apart."""
+"""Points closer to each other than this are one point (m); callers give points that are farther apart."""
 
 Faces = NDArray[np.int32]
 Edges = NDArray[np.intp]
 Lattice = tuple[tuple[float, float], float]
 """South-western node (x, y) and step of a lattice (m); all points lie north-east of the node."""
 ON_LATTICE = 1e-5
-"""Points closer than this to a node are on it (share of the step), for offsets are rounded to 1e-6 m."""
+"""Points closer than this to a node (share of the step) are on it, because offsets are rounded to 1e-6 m."""
 WITHOUT = ((1, 3, 2), (0, 3, 2), (0, 1, 3), (0, 1, 2))
 """The corners of a square without one of them, counter-clockwise; in the order of `_corners`."""
 
@@ -40,10 +40,10 @@ WITHOUT = ((1, 3, 2), (0, 3, 2), (0, 1, 3), (0, 1, 2))
 def delaunay(points: Floats, lattices: Sequence[Lattice] = ()) -> Faces:
     """Return the faces of a Delaunay triangulation in plan, ``(F, 3)``, counter-clockwise.
 
-    Points of a lattice are cocircular. What makes the triangulation unique is the order of insertion (corners
-    of the bounding box, then by northing and easting) and, in the squares of the lattices, one diagonal.
+    Points of a lattice are cocircular. The triangulation is unique by the order of insertion (corners of the
+    bounding box, then by northing and easting) and, in the squares of the lattices, by one diagonal.
 
-    - `points` ``(n, 2 or more)``: no two at the same place in plan.
+    - `points` ``(n, 2 or more)``: no two points have the same place in plan.
     - `lattices`: lattices on which many of the points lie. Their full squares are triangulated without a
       search.
     """
@@ -77,10 +77,10 @@ def constrained(points: Floats, segments: Edges, lattices: Sequence[Lattice] = (
     """Return the faces of a triangulation in plan that has the segments as edges, ``(F, 3)``.
 
     - `points` ``(n, 2 or more)``: no two at the same place in plan.
-    - `segments` ``(m, 2)``: numbers of the points at their ends. A segment that passes through a point is two
-      edges. One that crosses an earlier segment is left out.
+    - `segments` ``(m, 2)``: numbers of the points at their ends. A segment through a point becomes two edges.
+      A segment that crosses an earlier segment is left out.
     - `lattices`: lattices on which many of the points lie.
-    - result ``(F, 3)``: counter-clockwise; beside the segments the triangulation is Delaunay's.
+    - result ``(F, 3)``: counter-clockwise; except at the segments it is a Delaunay triangulation.
     """
     faces = delaunay(points, lattices)
     if not len(segments):
@@ -104,14 +104,14 @@ def _has_edges(faces: Faces, segments: Edges, count: int) -> NDArray[np.bool_]:
 
 
 def _beside(points: Floats, faces: Faces, segments: Edges) -> NDArray[np.bool_]:
-    """Return the faces whose rectangle meets that of a segment, ``(F,)``: among them all that it crosses."""
+    """Return the faces whose bounding box meets the box of a segment, ``(F,)``, such as crossed faces."""
     corners, ends = points[faces, :2], points[segments, :2]
     return _meeting(corners.min(axis=1), corners.max(axis=1), ends.min(axis=1), ends.max(axis=1))
 
 
 @compiled()
 def _meeting(low: Floats, high: Floats, segment_low: Floats, segment_high: Floats) -> Bools:
-    """Return which rectangles, by two corners each, ``(F, 2)``, meet one of the others, ``(m, 2)``."""
+    """Return which rectangles, by two corners each, ``(F, 2)``, meet a rectangle of a segment, ``(m, 2)``."""
     result = np.zeros(len(low), np.bool_)
     for f in range(len(low)):
         west, south, east, north = low[f, 0], low[f, 1], high[f, 0], high[f, 1]
@@ -136,7 +136,7 @@ class _Star:
         self.apex: dict[tuple[int, int], int] = {}
         """The third vertex of the face on the left of an edge."""
         self.neighbour: dict[int, int] = {}
-        """For each vertex the end of an edge from it."""
+        """The other end of an edge of each vertex."""
         self.kept = {(min(a, b), max(a, b)) for a, b in segments.tolist()}
         """Edges that are not to be removed."""
         for face in faces.tolist():
@@ -144,12 +144,12 @@ class _Star:
 
     @property
     def faces(self) -> Faces:
-        """The faces, each from its smallest vertex on, in ascending order."""
+        """The faces, each beginning with its smallest vertex, in ascending order."""
         ordered = sorted((a, b, c) for (a, b), c in self.apex.items() if a < b and a < c)
         return np.array(ordered, np.int32).reshape(-1, 3)
 
     def insert(self, a: int, b: int) -> None:
-        """Make the segment an edge, or several ones if it passes through points."""
+        """Make the segment an edge, or several edges if it passes through points."""
         while a != b:
             crossed = self._crossed(a, b)
             if crossed is None:
@@ -157,7 +157,7 @@ class _Star:
             end, removed, left, right = crossed
             if removed:
                 added = [*self._fill(left, a, end), *self._fill(right[::-1], end, a)]
-                # Rounding may leave no room for a face; the triangulation then stays as it is.
+                # Rounding may leave no room for a face; the triangulation is then unchanged.
                 if min(self._side(*face) for face in added) <= 0.0:
                     return
                 for p, q, r in removed:
@@ -181,8 +181,8 @@ class _Star:
     def _crossed(self, a: int, b: int) -> tuple[int, list[tuple[int, int, int]], list[int], list[int]] | None:
         """Return the first vertex on the segment after a, the faces crossed before it, the vertices beside.
 
-        The vertices are those on the left and on the right, each from a on. None if an edge to be kept is in
-        the way.
+        The vertices are listed on the left and on the right, each from a on. None if the segment crosses an
+        edge that must stay.
         """
         start = self._first_face(a, b)
         if start is None:
@@ -210,7 +210,7 @@ class _Star:
                 on_right.append(right)
 
     def _first_face(self, a: int, b: int) -> tuple[int, int] | None:
-        """Return the two other vertices of the face at a through which the segment leaves it."""
+        """Return the other two vertices of the face at a that the segment crosses first."""
         start = v = self.neighbour[a]
         while (v, a) in self.apex and self.apex[v, a] != start:
             v = self.apex[v, a]  # clockwise, up to the rim of the triangulation or once around
@@ -258,9 +258,9 @@ class Squares:
     step: float
     """Side of a square (m)."""
     numbers: NDArray[np.int32]
-    """Number of the point at each node, -1 where none is, ``(n + 1, m + 1)``, row 0 in the south."""
+    """Number of the point at each node, -1 without a point, ``(n + 1, m + 1)``, row 0 in the south."""
     clear: Bools
-    """The squares whose circle has no point but at their corners, ``(n, m)``."""
+    """The squares whose circle has no point except at their corners, ``(n, m)``."""
 
     @cached_property
     def full(self) -> Bools:
@@ -293,13 +293,13 @@ class Squares:
 
     @property
     def inner(self) -> NDArray[np.int32]:
-        """Numbers of the points with faces of the squares all around; no other face needs them."""
-        # A half square fills the angle at the corner opposite to the one that lacks a point.
+        """Numbers of the points surrounded by faces of the squares; no other face needs them."""
+        # A half square fills the angle at the corner opposite to the missing corner.
         filled = (_corners(self.full | half)[k] for k, half in enumerate(self.halves))
         return self.numbers[1:-1, 1:-1][np.logical_and.reduce(list(filled))]
 
     def contains(self, places: Floats) -> Bools:
-        """Return which places, ``(n, 2)``, lie in one of the faces and not on its edge, ``(n,)``."""
+        """Return which places, ``(n, 2)``, lie inside a face and not on its edge, ``(n,)``."""
         place = (places - self.corner) / self.step
         column, row = np.floor(place).astype(np.intp).T
         x, y = (place - np.floor(place)).T
@@ -313,9 +313,9 @@ class Squares:
 
 
 def squares(points: Floats, corner: tuple[float, float], step: float) -> Squares:
-    """Return the squares of a lattice that points fill alone.
+    """Return the squares of a lattice that have points only at their corners.
 
-    - `points` ``(n, 2 or more)``: no two at the same place in plan, none west or south of the corner.
+    - `points` ``(n, 2 or more)``: no two have the same place in plan; none lies west or south of the corner.
     - `corner`: X and y of the south-western node (m).
     - `step`: distance of the nodes (m).
     """
@@ -325,7 +325,7 @@ def squares(points: Floats, corner: tuple[float, float], step: float) -> Squares
     on_node = np.flatnonzero((np.abs(place - nearest) < ON_LATTICE).all(axis=1))
     numbers = np.full((row.max() + 2, column.max() + 2), -1, np.int32)
     numbers[row[on_node], column[on_node]] = on_node
-    # A second point at a node is not in `numbers`, and so is off the lattice, too.
+    # A second point at a node is not in `numbers`, and is treated as off the lattice.
     off_node = numbers[row, column] != np.arange(len(points))
     clear = np.ones((numbers.shape[0] - 1, numbers.shape[1] - 1), np.bool_)
     # The circle of a square lies within it and the eight squares around it.

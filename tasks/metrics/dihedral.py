@@ -14,9 +14,9 @@ Indices = NDArray[np.int32]
 
 
 def mean_angles(mesh: Mesh) -> Floats:
-    """Return each face's mean angle to the faces it shares an edge with, ``(F,)``, 0 to 90 degrees.
+    """Return each face's mean angle to the faces that share an edge with it, ``(F,)``, 0 to 90 degrees.
 
-    The paper averages over three neighbours; a face at the border has two or one. NaN if it has none.
+    The paper averages over three neighbours; a face at the border has fewer. NaN without a neighbour.
     """
     totals, counts = np.zeros(len(mesh.faces)), np.zeros(len(mesh.faces))
     start, far, owner = edges(mesh.faces, len(mesh.vertices))
@@ -76,7 +76,7 @@ def _add_angles(
                 cross = math.sqrt(
                     (ny * mz - nz * my) ** 2 + (nz * mx - nx * mz) ** 2 + (nx * my - ny * mx) ** 2
                 )
-                # The arccos of the paper's formula loses half the digits where faces are nearly parallel.
+                # The arccos of the paper's formula loses half the digits if faces are nearly parallel.
                 angle = math.atan2(cross, abs(nx * mx + ny * my + nz * mz))
                 for f in (owner[i], owner[j]):
                     totals[f] += angle

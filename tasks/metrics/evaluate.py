@@ -2,12 +2,12 @@
 
 Distances are vertical, at the reference's cell centres in the tile's core. The evaluation mask classes cells,
 and faces by the cell under their centroid, as road or terrain. It is the reference's road mask, else the raw
-segmented one; the paper uses the segmented one.
+segmented mask; the paper uses the segmented mask.
 
 Only a mesh without faults (`tasks.metrics.mesh_check`) is measured, so that a tile with a broken mesh fails.
 
-Of a mesh with levels each one is checked, and level 0 is measured, without the cells below decks: no layer
-has their height.
+Each level of a mesh is checked. Only level 0 is measured, without the cells below decks, because no layer has
+their height.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ VERSION = 3
 GAUSSIAN = 1.4826
 """Standard deviation of a Gaussian divided by its median absolute deviation."""
 OFF_CENTRE = 0.25
-"""Distance of the places from the centre of their cell, to the east and to the north (cells). Meshes have
-vertices at centres and corners of cells and half-way between, where they meet the surface by construction."""
+"""Offset of the measured places from their cell centre, to the east and to the north (cells). At centres and
+corners of cells and half-way between, meshes have vertices, which lie on the surface by construction."""
 FIGURES = ("mesh_p95_road_m", "mesh_max_road_m", "mesh_p95_terrain_m", "mesh_max_terrain_m")
 """Names of the distances in `Metrics`."""
 
 
 class Options(base.Options):
-    """Optional metrics, the mask that classes cells as road, and the heights that count as true."""
+    """Optional metrics, the mask that classes cells as road, and the heights that are taken as true."""
 
     nearest: bool = Field(False, description="also measure 3-D distances (slower)")
     classes: Literal["reference", "segmented"] = Field(
         "reference",
-        description="mask of the road cells: reference: the true mask, else the raw segmented one; "
-        "segmented: the raw segmented one, as in the paper",
+        description="mask of the road cells. reference: the true mask, else the raw segmented mask; "
+        "segmented: the raw segmented mask, as in the paper",
     )
     truth: Literal["reference", "dsm"] = Field(
         "reference",
-        description="heights that the mesh is compared with: reference: the catalog's, else the DTM; "
+        description="heights with which the mesh is compared. reference: the catalog's, else the DTM; "
         "dsm: the DSM",
     )
 
@@ -62,7 +62,7 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
         Reference heights, else the DTM, are the truth, or with ``truth: dsm`` the DSM.
     road : RoadMask
         Its raw mask classes the cells with ``classes: segmented``, or if the tile has no reference mask.
-        The distance from the surface is always by the raw mask, by which the mesh was sampled.
+        The distance from the surface always uses the raw mask, with which the mesh was sampled.
     surface : Surface
         The surface that the mesh samples.
     options : Options
@@ -71,13 +71,13 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
     Returns
     -------
     Metrics
-        Metres and degrees. Distances are over the cells where both mesh and reference have a height;
-        NaN for a class without any.
+        Metres and degrees. Distances are over the cells where both mesh and reference have a height. A class
+        without such cells has NaN.
 
     Raises
     ------
     MeshFault
-        If the mesh of a level is no height field triangulated once.
+        If the mesh of a level is not a height field triangulated once.
     """
     for number in mesh.numbers:
         mesh_check.check(mesh.at(number))
@@ -121,7 +121,7 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
 
 
 def _distances_3d(mesh: Mesh, data: TileData, heights: Floats, difference: Floats) -> Floats:
-    """Return the 3-D distance of each cell that has a vertical distance, ``(H, W)``, m; others NaN."""
+    """Return the 3-D distance of each cell that has a vertical distance, ``(H, W)``, m; else NaN."""
     row, col = np.nonzero(np.isfinite(difference))
     east, north = data.core.eastings[col] - mesh.origin[0], data.core.northings[row] - mesh.origin[1]
     points = np.column_stack([east, north, heights[row, col]])
@@ -131,9 +131,9 @@ def _distances_3d(mesh: Mesh, data: TileData, heights: Floats, difference: Float
 
 
 def _angles(mesh: Mesh, data: TileData, is_road: Bools) -> tuple[float, float]:
-    """Return the mean angle to neighbouring faces (degrees) of the road's and the terrain's faces.
+    """Return the mean angle to neighbouring faces (degrees) of road faces and of terrain faces.
 
-    For a class with cells but without faces the mean is over all faces, as for the road of a two-face plane.
+    For a class with cells but without faces, such as the road of a two-face plane, all faces are used.
     """
     per_face = mean_angles(mesh)
     x, y = (mesh.vertices[:, axis][mesh.faces].mean(axis=1) + mesh.origin[axis] for axis in (0, 1))
@@ -150,7 +150,7 @@ def _angles(mesh: Mesh, data: TileData, is_road: Bools) -> tuple[float, float]:
 def mesh_distances(mesh: Mesh, surface: Surface, road: RoadMask) -> dict[str, float]:
     """Return the vertical distances of a mesh from its surface, steps included, by the names `FIGURES` (m).
 
-    - `road`: its raw mask classes the places, one in each cell of the core.
+    - `road`: its raw mask classes the places; each cell of the core has one place.
     - result: 95th percentile and largest distance per class; NaN for a class without a place on the mesh, and
       for a surface whose heights are not above their places (`MovingNurbs`).
     """

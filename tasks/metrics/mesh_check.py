@@ -1,17 +1,17 @@
 """Check of a mesh: a height field triangulated once, with at most one face over any place.
 
-The number w(p) of faces over a place p (beside the edges) is shown to be 0 or 1 as follows. All faces are
+The number w(p) of faces over a place p (not on an edge) is shown to be 0 or 1 as follows. All faces are
 counter-clockwise, so w(p) is the sum of the winding numbers of their outlines around p. An edge of two faces
-is passed once in each direction and cancels out. What remains are the edges of one face, the rim: w is the
-winding number of the rim. It is constant in every part of the plan without rim, and smaller by one on the
-right of a rim edge than on its left. Rim edges meet at common ends only, so both sides of an edge are of one
-part each. The middle of every edge has 0 faces on its right, hence 1 on its left. Every part borders on an
+is passed once in each direction and cancels out. The rim, which is the edges of one face, remains: w is the
+winding number of the rim. It is constant in every part of the plan without rim. It is smaller by one on the
+right of a rim edge than on its left. Rim edges meet only at common ends, so each side of an edge belongs to
+one part. The middle of every edge has 0 faces on its right, hence 1 on its left. Every part borders on an
 edge, so w is 0 or 1 everywhere.
 
-So no two faces overlap, and a vertex of one face is inside of no other face or edge: its own face would
-overlap the other, or it is the end of a rim edge that touches another. For the same reason only vertices of
-the rim can share a place, and only these are compared. To compare the sum of the areas with the area in the
-rim would not do: both are equal with overlaps, too.
+So no two faces overlap. A vertex of a face is not inside another face or edge: its own face would overlap the
+other, or it is the end of a rim edge that touches another. For the same reason only vertices of the rim can
+share a place, and only these are compared. The sum of the areas and the area in the rim are not compared,
+because they are equal with overlaps, too.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from flexroad.tasks.types import Bools, Floats, Mesh
 ROUNDING = 3.3306690738754716e-16
 """Bound of the rounding error of a doubled area, relative to the sum of its two products (Shewchuk 1997)."""
 ONLY_ENDS_MEET = "FF*F*****"
-"""DE-9IM pattern of two lines that have no point in common but ends of both."""
+"""DE-9IM pattern of two lines whose only common points are ends of both."""
 
 RIM, REPEATED = 1, 2
-"""Kinds of edges: of one face; of two faces on the same side."""
+"""Kinds of edges: an edge of one face; an edge of two faces on the same side."""
 
 Indices = NDArray[np.int64]
 
 
 Fault = tuple[str, int, str]
-"""Kind, number, and index or place (easting and northing, m) of the first one."""
+"""Kind, number of faults, and index or place (easting and northing, m) of the first fault."""
 
 
 def check(mesh: Mesh) -> None:
@@ -55,8 +55,8 @@ def check(mesh: Mesh) -> None:
 def faults(mesh: Mesh) -> tuple[Fault, ...]:
     """Return the faults of a mesh, one entry per kind; empty if it is a height field triangulated once.
 
-    Each group of checks presupposes the one before: numbers and indices, faces and vertices, overlaps. So
-    only the faults of the first group with faults are returned.
+    Each group of checks requires that the group before has no faults: numbers and indices, faces and
+    vertices, overlaps. So only the faults of the first group with faults are returned.
     """
     for group in (_invalid_numbers, _invalid_parts, _overlaps):
         if found := tuple(group(mesh)):
@@ -109,7 +109,7 @@ def _found(kind: str, at: Bools, parts: NDArray[np.integer], mesh: Mesh) -> Iter
 
 @compiled()
 def _sides(vertices: Floats, faces: NDArray[np.int32]) -> NDArray[np.int8]:
-    """Return 1 for faces that look up, -1 for inverted ones, 0 for those without an area, ``(F,)``."""
+    """Return 1 for faces that face up, -1 for inverted faces, 0 for faces without an area, ``(F,)``."""
     sides = np.zeros(faces.shape[0], np.int8)
     for f in range(faces.shape[0]):
         ax, ay, _ = vertices[faces[f, 0]]
@@ -130,8 +130,8 @@ def _directed(
 ) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
     """Return for each edge of each face its ends, ``(n, 2)``, and `RIM`, `REPEATED` or 0, ``(n,)``.
 
-    The face is on the left. `REPEATED` are edges that another face passes in the same direction, beside the
-    first one of them.
+    The face is on the left. If several faces pass an edge in the same direction, all but the first are
+    `REPEATED`.
     """
     ends, kinds = np.empty((far.size, 2), np.int32), np.zeros(far.size, np.int8)
     for v in range(start.size - 1):
@@ -151,7 +151,7 @@ def _directed(
 
 
 def _repeated(places: Floats) -> Bools:
-    """Return which places, ``(n, 2)``, equal another one, beside one of them."""
+    """Return which places, ``(n, 2)``, equal an earlier place; one of equal places is False."""
     order = np.lexsort((places[:, 0], places[:, 1]))
     result = np.zeros(len(places), np.bool_)
     result[order[1:]] = (places[order[1:]] == places[order[:-1]]).all(axis=1)
@@ -159,7 +159,7 @@ def _repeated(places: Floats) -> Bools:
 
 
 def _crossing(rim: Floats) -> Bools:
-    """Return which edges, ``(n, 2, 2)``, have points in common with others that are not ends of both."""
+    """Return which edges, ``(n, 2, 2)``, share points with other edges that are not ends of both."""
     lines = shapely.linestrings(rim)
     result = np.zeros(len(rim), np.bool_)
     if not shapely.is_simple(shapely.multilinestrings(lines)):
@@ -186,8 +186,8 @@ def _covered(rim: Floats) -> Bools:
 def _windings(rim: Floats, first: Indices, last: Indices) -> Indices:
     """Return the winding number of the rim on the right of each edge's middle, ``(n,)``.
 
-    Edges that a ray to the east crosses upward count 1, downward -1; a ray along an edge is taken as just
-    north of it. Those that can be crossed are ``first`` to ``last`` (exclusive).
+    Edges that a ray to the east crosses upward add 1, downward -1; a ray along an edge is taken as just
+    north of it. The edges that can be crossed are ``first`` to ``last`` (exclusive).
     """
     result = np.zeros(rim.shape[0], np.int64)
     for i in range(rim.shape[0]):

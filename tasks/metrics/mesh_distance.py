@@ -1,6 +1,6 @@
 """Heights of a mesh at cell centres and at nodes, and 3-D distances from points to it.
 
-For these its faces are binned in squares, which are searched ring by ring.
+For 3-D distances the faces are binned in squares, which are searched ring by ring.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Indices = NDArray[np.int32]
 
 FACES_PER_BIN = 4
 TOLERANCE_M = 1e-6
-"""Centres up to this distance outside a triangle count as inside, so none is missed on a shared edge (m)."""
+"""Centres up to this distance (m) outside a triangle are taken as inside, so shared edges lose no centre."""
 
 
 def drape(mesh: Mesh, grid: Grid) -> Floats:
     """Return the mesh's height at every cell centre, ``(H, W)``, m above the mesh's origin.
 
-    NaN where no face lies above or below; where there are several, the first one is used.
+    NaN where no face lies above or below; where several faces lie, the first face is used.
     """
     # Local coordinates in metres east and south of the north-western cell's centre.
     east = mesh.vertices[:, 0] + (mesh.origin[0] - grid.west - grid.cell / 2)
@@ -57,7 +57,7 @@ def _drape(points: Floats, faces: NDArray[np.int32], cell: float, heights: Float
         ax, ay, az = points[faces[f, 0]]
         bx, by, bz = points[faces[f, 1]]
         cx, cy, cz = points[faces[f, 2]]
-        # Twice the area; negative for faces that look up, because the axes point east and south.
+        # Twice the area; negative for faces that face up, because the axes point east and south.
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area == 0.0:
             continue
@@ -87,8 +87,8 @@ def nearest(vertices: Floats, faces: Indices, points: Floats, at_most: Floats) -
     """Return the distance from each point to the nearest point of the mesh, ``(N,)``, m.
 
     - `points` ``(N, 3)``: in the coordinates of the vertices.
-    - `at_most` ``(N,)``: upper bound of each distance (m), such as the vertical distance; infinity if there
-      is none. Faces farther away are not searched.
+    - `at_most` ``(N,)``: upper bound of each distance (m), such as the vertical distance, or infinity. Faces
+      farther away are not searched.
     """
     plan = vertices[faces][:, :, :2]
     low, high = plan.min(axis=1), plan.max(axis=1)

@@ -31,7 +31,7 @@ HILLSHADE = {"type": "hillshade", "azimuth": "315", "angle": "45", "zfactor": "1
 RENDERER = {"band": "1", "opacity": "1", "alphaBand": "-1"}
 """Attributes of QGIS's renderers of rasters."""
 LEVEL = 4
-"""Level of deflate, 1 to 9: above it, heights get 2% smaller in up to twice the time."""
+"""Level of deflate, 1 to 9: higher levels make heights 2% smaller in up to twice the time."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class RasterClass:
 
 @dataclass(frozen=True)
 class Band:
-    """What the cells of a raster mean."""
+    """The meaning of the cells of a raster."""
 
     name: str
     meaning: str
@@ -91,7 +91,7 @@ def encode(values: NDArray[Any], grid: Grid, band: Band, vertical: str | None = 
     values : ndarray, (H, W)
         Heights at the cell centres (m), NaN where unknown; road cells; or the cells' `HeightSource`.
     band : Band
-        What they are: `HEIGHT`, `ROAD` or `HEIGHT_SOURCE`.
+        Their meaning: `HEIGHT`, `ROAD` or `HEIGHT_SOURCE`.
     vertical : str, optional
         Vertical CRS of heights; the file's CRS is then compound.
 
@@ -102,7 +102,7 @@ def encode(values: NDArray[Any], grid: Grid, band: Band, vertical: str | None = 
     """
     if values.shape != grid.shape:
         raise TaskError(f"{band.name} of {values.shape} cells does not fit a grid of {grid.shape}")
-    # A raster of one block is not filled up to a larger one.
+    # A raster of one block is not filled up to a larger block.
     longest = max(grid.shape)
     how = (
         {"overview_resampling": "mode"}
@@ -132,9 +132,9 @@ def encode(values: NDArray[Any], grid: Grid, band: Band, vertical: str | None = 
 
 
 def encode_style(band: Band) -> bytes:
-    """Return the look of a raster of one band in QGIS, which reads it from a file of the same name beside it.
+    """Return the style of a raster of one band for QGIS, which reads it from a file of the same name.
 
-    Classes have their names and colours, of which the raster has the colours alone. Heights are a hillshade.
+    Classes have names and colours; the raster itself has only the colours. Heights are a hillshade.
     """
     style = ET.Element("qgis", {"version": "3.28.0", "styleCategories": "Symbology"})
     pipe = ET.SubElement(style, "pipe")
@@ -162,5 +162,5 @@ def describe(raster: Any, number: int, band: Band) -> None:
     raster.update_tags(number, MEANING=band.meaning)
     if band.classes:
         raster.write_colormap(number, {c.value: (*c.colour, 255) for c in band.classes})
-        # GDAL keeps names of classes in a side-car file, which viewers write anew.
+        # GDAL keeps names of classes in a side-car file, which viewers overwrite.
         raster.update_tags(number, **{f"CLASS_{c.value}": f"{c.name}: {c.meaning}" for c in band.classes})

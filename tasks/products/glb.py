@@ -2,11 +2,11 @@
 
 glTF is Y up and viewers compute in float32. Vertices are therefore relative to the tile's whole-metre origin,
 and the parent node moves the tile to its place in the run. Origin and CRS are in the scene's ``extras``.
-An orthophoto is embedded as one JPEG image that both nodes share. It is shown as it is, without a light
-(``KHR_materials_unlit``): the sun of the flight is in it, and that of a viewer would darken it again.
+An orthophoto is embedded as one JPEG image that both nodes share. It is shown without a light
+(``KHR_materials_unlit``): it already has the sun of the flight, and a viewer's light would darken it again.
 
-The file is put together here: trimesh takes four times as long for the same arrays, most of it to compare
-them with each other, and as long as a complete tile to be imported.
+This module writes the file itself: trimesh takes four times as long for the same arrays, mostly for comparing
+them with each other. Its import takes as long as a complete tile.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ ROAD_SRGB, TERRAIN_SRGB = (58, 58, 64), (196, 190, 174)
 """The same colours as in images: #3a3a40 and #c4beae."""
 
 SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
-"""Linear filters and CLAMP_TO_EDGE, in glTF's codes: a border takes no colour of the opposite one."""
+"""Linear filters and CLAMP_TO_EDGE, in glTF's codes: a border does not mix with the opposite border."""
 UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5123, 5125, 5126
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 UNLIT = "KHR_materials_unlit"
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-"""Twelve of the sixteen figures of a matrix by columns; the place follows."""
+"""The first twelve of the sixteen numbers of a matrix, by columns; the translation follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +56,12 @@ class Texture:
 
 
 def texture(photo: Orthophoto, quality: int) -> Texture:
-    """Return an orthophoto as a JPEG image; pixels without a colour have the mean of the others.
+    """Return an orthophoto as a JPEG image; pixels without a colour have the mean colour.
 
     Parameters
     ----------
     photo : Orthophoto
-        With one known pixel at least.
+        It has at least one known pixel.
     quality : int
         Quality of the JPEG encoder, 1 to 95.
     """
@@ -96,16 +96,16 @@ def encode(
         The image seen from above; by default road and terrain have one colour each. Positions, normals and
         faces do not depend on it.
     normals : ndarray, (V, 3), optional
-        Unit normals of the vertices (`mesh_normals`); by default those of the faces alone.
+        Unit normals of the vertices (`mesh_normals`); by default normals from the faces alone.
     name : str
-        Name of the node of the tile, as its id.
+        Name of the tile's node, such as its id.
 
     Returns
     -------
     bytes
         A node translated by the tile's origin minus the run's, with child nodes ``road`` and ``terrain`` (a
-        class without faces has no node). A deck or tunnel is the child ``road`` of a node ``level 1``, by the
-        number of its level. Axes: x east, y up, z south; metres. Equal inputs give equal bytes.
+        class without faces has no node). A deck or tunnel is the child ``road`` of a node named after its
+        level, such as ``level 1``. Axes: x east, y up, z south; metres. Equal inputs give equal bytes.
     """
     normals = mesh_normals(mesh) if normals is None else normals
     uv = mesh.texture_coordinates(texture.bounds) if texture else None
@@ -145,7 +145,7 @@ def encode_ground(
     Parameters
     ----------
     places, normals : ndarray, (V, 3)
-        The vertices in a frame of their own: east, north and up (m), and their unit normals.
+        The vertices in a local frame: east, north and up (m), and their unit normals.
     uv : ndarray, (V, 2)
         Their places in the image, from west to east and from south to north.
     faces : ndarray, (F, 3)
@@ -153,7 +153,7 @@ def encode_ground(
     image : bytes
         The image seen from above, JPEG.
     photo : bool
-        Whether the image is made of photos, which are shown without a light.
+        Whether the image is made from photos, which are shown without a light.
     """
     file = _File()
     material = _material("ground", (), file.add_image(image), photo)
@@ -176,7 +176,7 @@ def _georeference(mesh: Mesh, run_origin: tuple[float, float, float]) -> dict[st
 
 
 def _material(name: str, colour: tuple[int, ...], texture: int | None, unlit: bool) -> dict[str, Any]:
-    """Return the look of a part: an image, or a colour in linear light, 0 to 255."""
+    """Return the material of a part: an image, or a colour in linear light, 0 to 255."""
     look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.95}
     if texture is None:
         look["baseColorFactor"] = [value / 255 for value in colour]
@@ -216,7 +216,7 @@ class _File:
     ) -> int:
         """Add a mesh, named like its material; return the index of its node.
 
-        - `places`, `normals` ``(V, 3)``: of its vertices, in east, north and up.
+        - `places`, `normals` ``(V, 3)``: places and normals of its vertices, in east, north and up.
         - `uv` ``(V, 2)``: places in the image, from west to east and from south to north.
         """
         attributes = {
@@ -238,7 +238,7 @@ class _File:
         )
 
     def encoded(self, root: int, extras: dict[str, object] | None = None) -> bytes:
-        """Return the file whose scene has one root node; ``extras`` is what else the scene tells."""
+        """Return the file whose scene has one root node; ``extras`` are further data of the scene."""
         scene = {"nodes": [root]} | ({"extras": extras} if extras else {})
         head = {"asset": {"version": "2.0", "generator": "FlexRoad"}, "scene": 0, "scenes": [scene]}
         tree = head | self.tree | {"buffers": [{"byteLength": self.size}]}
@@ -262,7 +262,7 @@ class _File:
 
     def _add_indices(self, faces: NDArray[np.int32], count: int) -> int:
         """Add the corners of faces, indices into ``count`` vertices; return the index of the accessor."""
-        # The largest number of a type has another meaning in graphics.
+        # The largest number of a type has a special meaning in graphics.
         short = count < 2**16
         view = self._add_view(faces.astype("<u2" if short else "<u4").tobytes(), ELEMENT_ARRAY_BUFFER)
         kind = UNSIGNED_SHORT if short else UNSIGNED_INT
@@ -270,7 +270,7 @@ class _File:
         return self.add("accessors", accessor)
 
     def _add_view(self, data: bytes, target: int | None = None) -> int:
-        """Add bytes to the buffer, each piece from a multiple of 4 on; return the index of the view."""
+        """Add bytes to the buffer at a multiple of 4; return the index of the view."""
         view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(data)}
         padding = bytes(-len(data) % 4)
         self.pieces += [data, padding]

@@ -1,7 +1,7 @@
 """The fitted surface (the paper's parameters Theta) as NumPy archive, usable without the run.
 
-NumPy reads it. `decode` returns the `NurbsSurface`; `tasks.spline.surface.exact` converts that to the form
-that CAD programs read.
+NumPy reads it. `decode` returns the `NurbsSurface`; `tasks.spline.surface.exact` converts the surface to the
+form that CAD programs read.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ def encode(surface: NurbsSurface) -> bytes:
     A `SteppedSurface` has four more: ``steps``, ``south_north`` and ``west_east`` (float32), and ``cells``,
     their grid (west, north and cell size in m, columns, rows).
 
-    A `LevelledSurface`, version 3, has ``levels``, the numbers of its other levels, and for each of them, as
-    level 1, ``A_1`` (its coefficients) and the shapes of its `Level` as WKB (m): ``areas_1``,
+    A `LevelledSurface`, version 3, has ``levels``, the numbers of its other levels. Each of them, such as
+    level 1, has ``A_1`` (its coefficients) and the shapes of its `Level` as WKB (m): ``areas_1``,
     ``abutments_1``, ``approach_1`` and ``passing_1``.
 
     ``z(u, v) = datum + A(u, v) / W(u, v)``, with u and v affine over ``bounds`` (west, south, east, north;
-    m), from the knot with the number ``degree`` to the one as far from the end. Coefficients are (row, col)
-    with row 0 in the south. No pickled objects; float64.
+    m), from the knot with the number ``degree`` to the knot with the same distance from the end. Coefficients
+    are (row, col) with row 0 in the south. No pickled objects; float64.
     """
     stepped: dict[str, NDArray[np.generic]] = {}
     if isinstance(surface, SteppedSurface):

@@ -1,8 +1,8 @@
 """The paper's final mesh as binary PLY, with class and height source per face.
 
 Coordinates are absolute and float64. trimesh and VTK write float32 vertices, whose resolution is 0.5 m at a
-northing of 5.6 million; therefore the file is written here. VTK also reads them as float32. Vertices have
-normals, and class and height source, too: CloudCompare takes scalars of vertices alone.
+northing of 5.6 million; therefore this module writes the file itself. VTK also reads them as float32.
+Vertices have normals, class and height source, too, because CloudCompare reads only scalars of vertices.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ LEVEL = "property char level\n"
 def encode(mesh: Mesh, height_source: NDArray[np.uint8], normals: Floats | None = None) -> bytes:
     """Return a mesh as PLY with the `HeightSource` of each face, ``(F,)``.
 
-    Vertices are (easting, northing, height) in metres. A vertex is road if one of its faces is, and has the
-    highest code of height source of its faces: the least certain one. A mesh with levels has the
-    property ``level`` of vertices and faces. Header comments give the CRS and, as
-    ``origin``, the tile's whole-metre origin, which programs that compute in float32 can subtract.
+    Vertices are (easting, northing, height) in metres. A vertex is road if one of its faces is road. It has
+    the highest code of height source of its faces: the least certain source. A mesh with levels has the
+    property ``level`` of vertices and faces. Header comments have the CRS and, as ``origin``, the tile's
+    whole-metre origin, which programs that compute in float32 can subtract.
 
     Parameters
     ----------
     normals : ndarray, (V, 3), optional
-        Unit normals of the vertices (`mesh_normals`); by default those of the faces alone.
+        Unit normals of the vertices (`mesh_normals`); by default normals from the faces alone.
     """
     header = HEADER.format(
-        crs=" ".join(mesh.crs.split()),  # WKT may hold line breaks, which would end the comment
+        crs=" ".join(mesh.crs.split()),  # WKT may have line breaks, which would end the comment
         origin=" ".join(f"{v:.15g}" for v in mesh.origin),
         ground=GROUND,
         road=ROAD,
@@ -88,5 +88,5 @@ def encode(mesh: Mesh, height_source: NDArray[np.uint8], normals: Floats | None 
     if mesh.level is not None:
         faces["level"] = mesh.level
         vertices["level"][mesh.faces] = mesh.level[:, None]
-    # PLY headers are ASCII; names in WKT need not be.
+    # PLY headers are ASCII, but names in WKT may have other characters.
     return header.encode("ascii", "backslashreplace") + vertices.tobytes() + faces.tobytes()

@@ -1,8 +1,8 @@
-"""Assess a tile's surface without ground truth: figures, flags and a map of its support.
+"""Assess a tile's surface without ground truth: figures, flags and a map of its height sources.
 
-All figures are over the raw segmented mask, where the surface is used as road. The error estimate follows
-from what the surface leaves of the heights that it was fitted to (`quality.estimate`); tiles with the largest
-one should be checked first. A local fault appears as a patch of road that is far from both DSM and DTM.
+All figures are over the raw segmented mask, where the surface is used as road. The error estimate is computed
+from the residuals of the fit (`quality.estimate`); tiles with the largest estimate should be checked first. A
+local fault appears as a patch of road that is far from both DSM and DTM.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ LIMITS = {
     "spike": 0.2,  # 1/m; a speed hump has less
     "edge-step": 0.15,  # m; higher than a kerb
     "loose": 0.5,  # m
-    "off-dtm": 0.1,  # shares of the road from here on
+    "off-dtm": 0.1,  # from here on: shares of the road
     "inferred": 0.05,
     "dropped": 0.5,
     "weights": 0.25,  # share of the NURBS weights
 }
 """Threshold of each flag. The flag is raised if its figure is larger."""
 NO_ROAD = "no-road"
-"""The flag of a tile without road: its mask has none, or the filter dropped all of it. With an empty mask it
-is the only flag."""
+"""The flag of a tile without road: its mask is empty, or the filter dropped the complete road. With an empty
+mask it is the only flag."""
 BELOW, NO_RISE, NO_ABUTMENT = "below", "no-rise", "no-abutment"
 STRUCTURE_FLAGS = (BELOW, NO_RISE, NO_ABUTMENT)
 """Flags of decks and tunnels, which their tile has as well."""
@@ -74,7 +74,7 @@ MOST_CROSSED = 0.01
 LEAST_RISE_M = 0.3
 """Least median clearance without a flag (m)."""
 FROM_ABUTMENTS_M = 2.0
-"""Nearer to an abutment both levels have nearly the same height (m)."""
+"""Within this distance of an abutment (m) both levels have nearly the same height."""
 
 
 class Options(base.Options):
@@ -87,8 +87,8 @@ class Options(base.Options):
         0.0,
         ge=0,
         le=0.5,
-        description="share of the road's squares of 5 m that a second fit does without, to check the error "
-        "estimate on them; 0: no second fit",
+        description="share of the road's squares of 5 m that a second fit leaves out, to check the error "
+        "estimate there; 0: no second fit",
     )
 
 
@@ -100,7 +100,7 @@ def assess(
     options: Options,
     refit: Refit | None = None,
 ) -> Quality:
-    """Assess a surface by the data it was fitted to.
+    """Assess a surface by the data to which it was fitted.
 
     Parameters
     ----------
@@ -113,14 +113,14 @@ def assess(
     options : Options
         Tolerance, and the share of the road that is withheld.
     refit : callable, optional
-        Fits other data of the tile as the surface was fitted; needed if a share is withheld.
+        Fits other data of the tile in the same way as the surface; needed if a share is withheld.
 
     Returns
     -------
     Quality
         Figures over the road cells of the core; NaN where the tile or the surface has no such data. With
-        levels, those of level 0, and of each other one on its decks or tunnels, without a second fit; flags
-        of decks and tunnels are those of level 0, too.
+        levels, they are figures of level 0, and of each other level on its decks or tunnels, without a second
+        fit. Flags of decks and tunnels are also flags of level 0.
     """
     own = _assess(data, road, clusters, surface, options, refit)
     others = []
@@ -131,7 +131,7 @@ def assess(
         seen, there = level_data(data, clusters, number), level_road(road, number)
         quality = _assess(seen, there, of_level, surface.at(number), options)
         found, flags = structures(road, surface, number)
-        # Away from its decks a level has no figures: it is no road that was lost.
+        # A level without decks on the tile gets no flags: no road is lost there.
         own_flags = (*quality.flags, *flags) if found else ()
         height_source = _hidden(quality.height_source) if number < 0 else quality.height_source
         others.append(
@@ -200,13 +200,13 @@ def structures(road: RoadMask, surface: Surface, number: int) -> tuple[Structure
         return None, ()
     lines = shapely.get_parts(level.abutments)
     x, y = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True)).T
-    # Of two tiles that share a border, one has the abutments on it.
+    # Abutments on a border belong to only one of the two tiles.
     abutments = int(np.count_nonzero((west <= x) & (x < east) & (south <= y) & (y < north)))
     window = road.grid.window(road.core)
     rows, cols = np.nonzero(level_road(road, number).mask[window] & ~road.outside[window])
     x, y = road.core.eastings[cols], road.core.northings[rows]
     rise = np.sign(number) * (surface.at(number).height(x, y) - surface.height(x, y))
-    # Without abutments the distance is NaN.
+    # The distance is NaN without abutments.
     inner = rise[~(shapely.distance(level.abutments, shapely.points(x, y)) < FROM_ABUTMENTS_M)]
     found = Structures(
         float(area),
@@ -229,8 +229,8 @@ def cell_errors(
 ) -> tuple[Floats, NDArray[np.uint8]]:
     """Return the estimated error (m) and the `HeightSource` of each cell of the core, ``(H, W)``.
 
-    They are those of a level, or of level 0 if the tile does not have it. The estimate is NaN beyond the
-    survey, and beyond decks and tunnels.
+    If the tile does not have the level, level 0 is used. The estimate is NaN beyond the survey, and beyond
+    decks and tunnels.
     """
     own = [own for own in clusters.levels if own.number == number and number in surface.numbers]
     if own:
@@ -242,7 +242,7 @@ def cell_errors(
 
 
 def _hidden(classes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the height source in tunnels, of which no height is measured."""
+    """Return the height source in tunnels, where no height is measured."""
     return np.where(classes == HeightSource.NONE, classes, np.uint8(HeightSource.INFERRED))
 
 

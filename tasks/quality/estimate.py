@@ -1,9 +1,9 @@
-"""Estimated error of a surface, cell by cell: what it leaves of the heights that it was fitted to.
+"""Estimated error of a surface, cell by cell, from the residuals of its fit.
 
-Noise of single cells averages out in a smooth surface. What remains is the misfit of larger pieces of ground,
-so residuals are first averaged over squares; where a surface misses the heights around a place, it also
-misses those that nobody measured. The two constants were chosen on squares of 5 m that were withheld from DSM
-and DTM of eight places, so that 90% of the squares are within the interval (docs/quality.md).
+Noise of single cells averages out in a smooth surface. The misfit of larger pieces of ground remains, so
+residuals are first averaged over squares. If a surface misses the heights around a place, it also misses
+heights there that were not measured. The two constants were chosen on squares of 5 m that were withheld from
+DSM and DTM of eight places: 90% of the squares are within the interval (docs/quality.md).
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, Surface,
 SQUARE_M, AROUND_M = 5.0, 9.0
 """Sides of the squares over which residuals, and then their absolute values, are averaged (m)."""
 LEAST_M, FACTOR = 0.0075, 1.8
-"""The estimate of a surface without such residuals (m), and its growth with them."""
+"""The estimate of a surface without residuals (m), and its growth with the residuals."""
 INTERVAL = 2.06
-"""Half width of the 90% interval over the mean absolute error, of a normal distribution."""
+"""Half width of the 90% interval over the mean absolute error, for a normal distribution."""
 MIN_SHARE = 0.2
-"""Smallest share of cells with a residual in a square that counts."""
+"""Smallest share of cells with a residual in a square that is used."""
 SCATTER_M = 5.0
-"""Side of the square over which the scatter of the DSM is taken (m); smaller than a tree crown."""
+"""Side of the square over which the scatter of the DSM is computed (m); smaller than a tree crown."""
 CLIMB_M = 3.0
-"""Least width of what is steeper than `CLIMB` (m): objects are wider, and the edge of a deck is narrower."""
+"""Least width of ground steeper than `CLIMB` (m): objects are wider, and the edge of a deck is narrower."""
 
 
 def error_estimate(
@@ -49,18 +49,18 @@ def error_estimate(
 ) -> Floats:
     """Return the estimated mean absolute error of the surface around each cell, ``(H, W)``, m.
 
-    It grows with the residuals of the cells of the same class (road or not) around. Away from any height it
-    grows by the height that a road may gain since the nearest one. On kept cells it
-    is at least the smaller of the DSM's scatter and the distance to the DTM: a tree crown that the filter
-    kept has both, a bridge deck only the second. Without any height it is `DSM_DTM_TOLERANCE_M`.
+    It grows with the residuals of cells of the same class (road or not) around. Away from known heights it
+    grows by the possible rise of a road since the nearest known height. On kept cells it is at least the
+    smaller of the DSM's scatter and the distance to the DTM: a tree crown that the filter kept has both, a
+    bridge deck only the distance. Without any height it is `DSM_DTM_TOLERANCE_M`.
 
-    - `residual`: surface minus the height it was fitted to (m); NaN where none entered the fit.
+    - `residual`: surface minus the fitted height (m); NaN where no height was used.
     - `off_dtm`: surface minus DTM (m).
     - `scatter`: the cells' `scatter` (m).
     - `kept`: road cells that the filter kept.
     - `road`: road cells.
     - `cell`: size of a cell (m).
-    - `only_road`: leave the cells beside the road NaN; that takes half of the time.
+    - `only_road`: leave the cells beside the road NaN, which halves the time.
     """
     estimate = np.full(residual.shape, np.nan)
     for cells in (road,) if only_road else (road, ~road):
@@ -71,8 +71,8 @@ def error_estimate(
 def deviation(off_dsm: Floats, off_dtm: Floats, scatter: Floats, kept: Bools, inferred: Bools) -> Floats:
     """Return the distance of the surface to the nearer of DSM and DTM in each cell, ``(H, W)``, m.
 
-    The DSM counts on kept cells, at least with its `scatter`; the DTM where it supports the surface. It is
-    NaN where neither does.
+    The DSM is used on kept cells, at least with its `scatter`, and the DTM where it supports the surface. The
+    distance is NaN where neither is used.
     """
     by_scan = np.where(kept, np.maximum(np.abs(off_dsm), scatter), np.nan)
     by_dtm = np.where(inferred, np.nan, np.abs(off_dtm))
@@ -82,12 +82,12 @@ def deviation(off_dsm: Floats, off_dtm: Floats, scatter: Floats, kept: Bools, in
 def scatter(dsm: Floats, dtm: Floats, kept: Bools, cell: float) -> Floats:
     """Return the standard deviation of DSM minus DTM on kept cells around each cell, ``(H, W)``, m.
 
-    That of the DSM alone counts where it is smaller: a deck is smooth above a steep bank. It is small on
-    roads and decks and large in tree crowns; 0 where no kept cell is near.
+    The deviation of the DSM alone is used where it is smaller: a deck is smooth above a steep bank. It is
+    small on roads and decks and large in tree crowns; 0 where no kept cell is near.
     """
     valid, size = kept & np.isfinite(dsm - dtm), _width(SCATTER_M, cell)
     share = _share_around(valid, size)
-    # From a height near by: squares of heights above the sea lose digits.
+    # Heights are relative to a height nearby, because squares of heights above the sea lose digits.
     level = float(np.mean(dsm[valid])) if valid.any() else 0.0
     deviations = []
     for heights in (dsm - dtm, dsm - level):
@@ -97,10 +97,10 @@ def scatter(dsm: Floats, dtm: Floats, kept: Bools, cell: float) -> Floats:
 
 
 def climbed(smooth: Floats, dtm: Floats, kept: Bools, cell: float, dsm_dtm_tolerance_m: float) -> Bools:
-    """Return the kept cells where the surface climbs an object, and those that they enclose, ``(H, W)``.
+    """Return the kept cells where the surface climbs an object, and kept cells inside them, ``(H, W)``.
 
-    It is off the DTM there, and steeper than a road, in itself and relative to the DTM: a deck is level above
-    a steep bank, and a street in a hill is as steep as the DTM.
+    The surface is off the DTM there, and steeper than a road, both in itself and relative to the DTM: a deck
+    is level above a steep bank, and a street on a hill is as steep as the DTM.
 
     - `smooth`, `dtm`: heights of the surface without steps, and of the terrain (m).
     - `kept`: road cells that the filter kept.
@@ -118,8 +118,8 @@ def climbed(smooth: Floats, dtm: Floats, kept: Bools, cell: float, dsm_dtm_toler
 def _unexplained(residual: Floats, cells: Bools, cell: float) -> Floats:
     """Return the estimate from the residuals of some cells around each cell, ``(H, W)``, m."""
     valid = cells & np.isfinite(residual)
-    # A cell that is farther off than heights of the same ground is a car or a crown. Larger differences count
-    # little in the loss of the fit, too.
+    # A cell that is farther off than heights of the same ground is a car or a crown. Larger differences have
+    # little weight in the loss of the fit, too.
     same_ground = np.clip(residual, -DSM_DTM_TOLERANCE_M, DSM_DTM_TOLERANCE_M)
     square, around = _width(SQUARE_M, cell), _width(AROUND_M, cell)
     share = _share_around(valid, square)
@@ -143,7 +143,7 @@ def _share_around(valid: Bools, size: int) -> Floats:
 
 
 def _mean_around(values: Floats, valid: Bools, share: Floats, size: int) -> Floats:
-    """Return the mean of the valid values in a square around each cell, given their share of it."""
+    """Return the mean of the valid values in a square around each cell, given their share of the square."""
     total = scipy.ndimage.uniform_filter(np.where(valid, values, 0.0), size)
     return np.asarray(total / np.where(share > 0, share, 1.0))
 
@@ -160,17 +160,17 @@ class Compared:
     on_road: Bools
     """Road cells of the raw mask within the survey."""
     kept: Bools
-    """Those that the filter kept and that have a DSM height."""
+    """Road cells that the filter kept and that have a DSM height."""
     classes: NDArray[np.uint8]
     """The cells' `HeightSource`."""
     height: Floats
     """Height of the surface (m)."""
     smooth: Floats
-    """The same without the steps of the ground beside roads (m)."""
+    """Height of the surface without the steps of the ground beside roads (m)."""
     off_dsm: Floats
-    """Surface minus the heights that it was fitted to on the road, elsewhere minus DSM (m)."""
+    """Surface minus the heights to which it was fitted on the road, elsewhere minus DSM (m)."""
     excess: Floats
-    """DSM minus the heights that the road was fitted to (m)."""
+    """DSM minus the heights to which the road was fitted (m)."""
     off_dtm: Floats
     """Surface minus DTM (m)."""
     deviation: Floats
@@ -180,10 +180,10 @@ class Compared:
     """Estimated error of the surface (m), by `quality.estimate.error_estimate`; at least the distance to the
     DTM on objects that it climbs, and the deviation where that exceeds ``dsm_dtm_tolerance_m``."""
     goes_on: Bools
-    """Cells of level 0 below decks or above tunnels: a road that ends there at an abutment goes on."""
+    """Cells of level 0 below decks or above tunnels: a road that ends there at an abutment continues."""
     lacking: Bools
-    """Inferred road cells, but for those below decks within half the length of a tunnel (`TUNNEL_M`) of road
-    with a height: that a deck hides the street below it is no fault of the data."""
+    """Inferred road cells. Cells below decks near road with a height (half of `TUNNEL_M`) are left out: a
+    deck that hides the street below it is not a fault of the data."""
 
 
 def compare(
@@ -194,7 +194,7 @@ def compare(
     dsm_dtm_tolerance_m: float,
     only_road: bool = False,
 ) -> Compared:
-    """Compare a surface with DSM and DTM cell by cell; with levels, level 0 with what it sees.
+    """Compare a surface with DSM and DTM cell by cell; with levels, level 0 with the heights that it sees.
 
     - `data`, `road`, `clusters`, `surface`: as in `tasks.quality.assess.assess`.
     - `only_road`: leave the estimated error NaN beside the road; that takes less time.
@@ -222,7 +222,7 @@ def compare(
     inferred = classes == HeightSource.INFERRED
     away = deviation(off_dsm, off_dtm, spread, kept, inferred)
     on_object = climbed(smooth, data.dtm[window], kept, data.core.cell, dsm_dtm_tolerance_m)
-    # Within `dsm_dtm_tolerance_m` DSM and DTM show the same ground, and residuals say more.
+    # Within `dsm_dtm_tolerance_m` DSM and DTM show the same ground, and residuals are a better estimate.
     least = np.where(
         on_object, np.abs(off_dtm), np.where(on_road & (away > dsm_dtm_tolerance_m), away, np.nan)
     )

@@ -1,6 +1,6 @@
 """The cells of a tile that raise its flags, and the places to look at first.
 
-The worst error is that of a connected piece of road, not of a single cell.
+The worst error is the error of a connected piece of road, not of a single cell.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from flexroad.tasks.roads.union_find import Roots, find, least_cells, unite
 from flexroad.tasks.types import Bools, Floats
 
 Bits = NDArray[np.uint16]
-"""Flags of cells or points: bit i is that of ``LOCAL_FLAGS[i]``."""
+"""Flags of cells or points: bit i is the flag ``LOCAL_FLAGS[i]``."""
 LOCAL_FLAGS = (
     "error-estimate", "worst-error", "patch", "spike", "edge-step", "loose", "off-dtm", "inferred", "dropped",
 )  # fmt: skip
-"""Flags of `tasks.quality.assess` that have places; the others concern the complete tile."""
+"""Flags of `tasks.quality.assess` that have places; other flags concern the complete tile."""
 UNKNOWN = np.uint16(1 << 15)
-"""Of a tile whose flags are not known: its result is of an earlier version."""
+"""The flag of a tile whose flags are not known, because its result is from an earlier version."""
 PIECE_M2 = 25.0
-"""Area of road that a mean over the tile hides, and that a car or a survey notices (m2)."""
+"""Area of a faulty piece of road (m2): too small for a mean over the tile, but noticeable in use."""
 EVERY_WAY = np.ones((3, 3), bool)
-"""Neighbours of a cell: those at its corners, too."""
+"""Neighbours of a cell, also at its corners."""
 AROUND_M = 10.0
-"""Side of the square over which errors are added up to find where most of them lie (m)."""
+"""Side of the square over which errors are averaged to find the worst place (m)."""
 Place = tuple[float, float]
 """Easting and northing of the centre of a cell (m)."""
 
@@ -72,21 +72,21 @@ def flagged_cells(
 
 
 def flag_names(bits: int) -> tuple[str, ...]:
-    """Return the names of the flags of a cell, or of all cells that a geometry passes; ``unknown`` is one."""
+    """Return the names of the flags of a cell, or of all cells that a geometry passes, also ``unknown``."""
     found = [flag for i, flag in enumerate(LOCAL_FLAGS) if bits >> i & 1]
     return (*found, "unknown") if bits & UNKNOWN else tuple(found)
 
 
 def passed(bits: Bits) -> int:
-    """Return the flags of all cells that a geometry passes, from those of its points."""
+    """Return the flags of all cells that a geometry passes, from the flags of its points."""
     return int(np.bitwise_or.reduce(bits, axis=None, initial=0))
 
 
 def bends(height: Floats, road: Bools, last: Bools | None = None) -> Floats:
     """Return absolute second differences (m) at the middle of three cells, ``(k, H, W)``; NaN elsewhere.
 
-    They run along rows and along columns over three cells of the road. With ``last`` only two of them are
-    road, the third one is of those cells, and they run in all four directions.
+    They run along rows and along columns over three cells of the road. With ``last``, only two cells are road
+    and the third is a cell of ``last``; they then run in all four directions.
     """
     found = np.full((2 if last is None else 4, *height.shape), np.nan)
     end = road if last is None else last
@@ -99,9 +99,9 @@ def bends(height: Floats, road: Bools, last: Bools | None = None) -> Floats:
 
 
 def edge_steps(cells: Compared) -> Floats:
-    """Return how far the cell beside the road lies off the line of the last two on it, ``(4, H, W)``, m.
+    """Return how far the cell beside the road lies off the line of the last two road cells, ``(4, H, W)``, m.
 
-    It is given at the last one. At an abutment there is none: the road goes on as a deck or in a tunnel.
+    The value is at the last road cell. At abutments it is NaN: the road continues as a deck or in a tunnel.
     """
     return bends(cells.smooth, cells.on_road, ~(cells.on_road | cells.goes_on))
 
@@ -114,10 +114,10 @@ def _pieces(cells: Bools, area_m2: float, cell: float) -> Bools:
 
 
 def worst_piece(estimate: Floats, road: Bools, grid: Grid) -> tuple[float, Place]:
-    """Return the largest value (m) that the estimates of `PIECE_M2` of connected road reach, or NaN.
+    """Return the largest value (m) that the estimates of `PIECE_M2` of connected road reach, and its place.
 
-    And the cell with the largest estimate in that piece. Of a tile whose largest connected road is smaller
-    than `PIECE_M2` the piece is that road.
+    The place is the cell with the largest estimate in that piece. If all connected roads are smaller than
+    `PIECE_M2`, the largest of them is the piece. Without road, the values are NaN.
 
     - `estimate`: estimated error (m), finite on the road.
     - `road`: road cells.
@@ -129,7 +129,7 @@ def worst_piece(estimate: Floats, road: Bools, grid: Grid) -> tuple[float, Place
     least = min(least_cells(PIECE_M2, grid.cell), float(np.bincount(parts[road]).max()))
     members = np.flatnonzero(road)
     values = estimate.ravel()[members]
-    # Equal estimates in the order of cells, so that the place does not depend on how they are sorted.
+    # Equal estimates stay in the order of cells, so that the place does not depend on the sort.
     order = members[np.argsort(-values, kind="stable")]
     last = _last_of_piece(order, np.full(road.size, -1, np.int32), road.shape[1], least)
     value = float(estimate.ravel()[last])
@@ -165,7 +165,7 @@ def places(cells: Compared, grid: Grid, dsm_dtm_tolerance_m: float) -> dict[str,
 
     - `cells`: the surface beside DSM and DTM, in the cells of ``grid``.
     - result: easting and northing (m) by flag, whether it is raised or not. Flags without a place are absent:
-      those of the complete tile (``weights``, ``no-road``) and those of which the tile has no cell.
+      flags of the complete tile (``weights``, ``no-road``) and flags without a cell on the tile.
     """
     road = cells.on_road
     scores = {

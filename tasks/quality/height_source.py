@@ -28,7 +28,7 @@ class HeightSource(IntEnum):
     DTM = 2
     """An object hides the ground, and the height comes from the DTM."""
     INFERRED = 3
-    """No height entered the fit; the surface is extrapolated from the cells around."""
+    """The fit had no height; the surface is extrapolated from the cells around."""
 
 
 def height_source(
@@ -55,7 +55,7 @@ def of_faces(
 
     Faces at the limit of the survey, and at the outline of a deck, are inferred where the cell lies beyond.
 
-    - `classes`: those of the cells of level 0.
+    - `classes`: the height sources of the cells of level 0.
     - `others`: number and quality of the other levels.
     """
     cells = road.core.cells(*(middles(mesh.vertices, mesh.faces) + mesh.origin[:2]).T)
@@ -69,7 +69,7 @@ def of_faces(
 def top_height_source(quality: Quality, top: NDArray[np.int8]) -> NDArray[np.uint8]:
     """Return the `HeightSource` of the highest level in each cell of the core, ``(H, W)``.
 
-    - `quality`: that of level 0, with the other levels.
+    - `quality`: the quality of level 0, with the other levels.
     - `top` ``(H, W)``: number of the highest level in each cell.
     """
     classes = quality.height_source.copy()

@@ -1,4 +1,4 @@
-"""Check the error estimate: squares of road are withheld, and a fit without them is compared with them.
+"""Check the error estimate: withhold squares of road, fit without them, and compare the fit with them.
 
 The intervals of `quality.estimate` should cover 90% of the squares, summed over many tiles.
 """
@@ -21,12 +21,12 @@ from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.types import Bools, RoadClusters, RoadMask, Surface, TileData
 
 INSET_M = 15.0
-"""Distance of the squares from the tile's border (m): heights there also shape the fixed border."""
+"""Distance of the squares from the tile's border (m): heights nearer to it also affect the fixed border."""
 MIN_CELLS = 5
-"""Smallest number of kept road cells of a square; the mean of fewer is noise."""
+"""Smallest number of kept road cells of a square; the mean of fewer cells is noise."""
 
 Refit = Callable[[TileData, RoadClusters], Surface]
-"""Fits data of the tile as its surface was fitted."""
+"""Fits data of the tile in the same way as its surface."""
 
 
 def holdout(
@@ -57,7 +57,7 @@ def holdout(
     try:
         surface = refit(rest, clusters)
     except TaskError:
-        # Too few heights are left for a second fit; the tile has its surface all the same.
+        # Too few heights are left for a second fit; the surface of the tile is not affected.
         return _figures(0.0, np.nan, np.nan)
     cells = compare(rest, road, clusters, surface, dsm_dtm_tolerance_m, only_road=True)
     off = cells.height - ground_to_fit(with_road_heights(seen, clusters), clusters, window)
@@ -74,10 +74,10 @@ def _figures(squares: float, error_m: float, covered: float) -> dict[str, float]
 
 
 def withheld_squares(kept: Bools, core: Grid, share: float) -> NDArray[np.int64]:
-    """Return the number of the withheld square in each cell of the core, ``(H, W)``; -1 in all others.
+    """Return the number of the withheld square in each cell of the core, ``(H, W)``; else -1.
 
-    Squares lie at multiples of their side in easting and northing. Which ones are withheld follows from their
-    position alone, so it does not depend on how land is cut into tiles.
+    Squares lie at multiples of their side in easting and northing. The choice of withheld squares depends
+    only on their position, not on how land is cut into tiles.
     """
     west, south, east, north = core.bounds
     x, y = np.meshgrid(core.eastings, core.northings)

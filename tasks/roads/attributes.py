@@ -17,7 +17,7 @@ from flexroad.tasks import options as base
 from flexroad.tasks.types import Bools, Floats
 
 NO = ("", "no", "false", "f", "n", "0", "0.0", "nan", "<na>", "none")
-"""Values that mean no, or no value, in lower case."""
+"""Values that mean "no" or "unknown", in lower case."""
 
 CLASS_WIDTH_M = {
     "motorway": 12.0,
@@ -47,7 +47,7 @@ CLASS_WIDTH_M = {
     "s1780": 6.0,
 }
 """Width of carriageways (m) by class: of OSM, after the German guidelines (RAL 2012: RQ 31 per direction,
-RQ 11; RASt 06); OSM maps each direction of a dual carriageway separately. Of TIGER (MTFCC) they are assumed:
+RQ 11; RASt 06); OSM maps each direction of a dual carriageway separately. For TIGER (MTFCC) they are assumed:
 lanes of 12 ft with shoulders on primary and secondary roads, streets with parking on one side."""
 
 FOOT_M, INCH_M = 0.3048, 0.0254
@@ -63,11 +63,11 @@ FEET_INCHES = re.compile(rf"(\d+)\s*(?:'|ft|feet)\s*({NUMBER})\s*(?:\"|in|inch|i
 PRIMES = str.maketrans({"’": "'", "′": "'", "”": '"', "″": '"', ",": "."})
 MOST_LANES = 16
 WIDEST_M = 1000.0
-"""Numbers from here on are codes for "unknown", as 9998."""
+"""Numbers from here on are codes for "unknown", such as 9998."""
 LANE_WIDTH_M, SHOULDER_M = 3.25, 0.25
 """Width of a lane, and of the shoulder on either side (m): a road of two lanes is 7 m wide."""
 MIN_WIDTH_M, MAX_WIDTH_M = 2.0, 40.0
-"""Narrower and wider lines get these widths (m): other values are errors of the data."""
+"""Smallest and largest width of lines (m): values outside are errors of the data and are replaced."""
 WIDTH_CLASS_COLUMNS = ("brv", "breiteDesVerkehrsweges")
 """Columns with a width in classes of 3 m, with shoulders; used without width and lanes."""
 CLASS_STEP_M, LOWEST_CLASS_M = 3.0, 6.0
@@ -90,7 +90,7 @@ LEVEL_COLUMNS = (*OSM_TAGS, *NUMBER_COLUMNS, *STRUCTURE_COLUMNS)
 HIGHEST_LEVEL = 5
 """Levels are numbers from minus to plus this."""
 UNKNOWN_LEVEL = 1000
-"""Numbers from here on are codes for "unknown", as 999998 in swissTLM3D."""
+"""Numbers from here on are codes for "unknown", such as 999998 in swissTLM3D."""
 LEVEL_NUMBER = re.compile(r"[+-]?\d+(?:[.,]0*)?")
 AT_GROUND = ("gué ou radier",)
 """Values of number columns, in lower case, that mean a road on the ground: fords in BD TOPO."""
@@ -118,7 +118,7 @@ UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue"})
 
 
 class Options(base.Options):
-    """Source of a line's width: its width attribute, else lanes, else a class of widths, else its class."""
+    """How the width of a line is found; the first that exists: width, number of lanes, width class, class."""
 
     width_columns: tuple[str, ...] = Field(
         ("width:carriageway", "width", "width_m", "est_width", "brf", "breiteDerFahrbahn"),
@@ -130,9 +130,9 @@ class Options(base.Options):
     )
     width_unit: Literal["m", "ft"] = Field("m", description="unit of widths without one")
     class_width_m: dict[str, float] = Field(
-        CLASS_WIDTH_M, description="width by class (m); entries replace those of the built-in table"
+        CLASS_WIDTH_M, description="width by class (m); entries replace entries of the built-in table"
     )
-    default_width_m: float = Field(6.0, gt=0, le=100, description="width of lines without any of these (m)")
+    default_width_m: float = Field(6.0, gt=0, le=100, description="width of lines without a known width (m)")
 
     @field_validator("class_width_m")
     @classmethod
@@ -143,13 +143,13 @@ class Options(base.Options):
 
 
 def has_value(value: Any) -> bool:
-    """Return whether a table has a value there."""
+    """Return whether a value of a table is not missing."""
     # pandas has several values for "missing".
     return value is not None and str(value).strip().lower() not in ("", "nan", "<na>", "none")
 
 
 def is_yes(table: Any, column: str) -> Bools:
-    """Return the rows whose value in a column is not one of `NO`, ``(n,)``; none if the column is missing."""
+    """Return the rows whose value in a column is not in `NO`, ``(n,)``; no rows if the column is missing."""
     if column not in table:
         return np.zeros(len(table), bool)
     return np.array([str(value).strip().lower() not in NO for value in table[column]], bool)
@@ -173,7 +173,7 @@ def metres(text: str, bare_m: float = 1.0) -> float:
 def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[str, ...]]:
     """Return the width of every row (m), ``(n,)``, and notes on missing or unreadable widths.
 
-    - `table`: its columns may hold widths and numbers of lanes; names in lower case.
+    - `table`: its columns may have widths and numbers of lanes; names in lower case.
     - `classes`: class of each row.
     """
     bare_m = FOOT_M if options.width_unit == "ft" else 1.0
@@ -214,7 +214,7 @@ def lanes(table: Any, options: Options) -> Floats:
 
 
 def _numbers(table: Any, columns: tuple[str, ...], lowest: float, highest: float) -> Floats:
-    """Return the first number within limits of each row, ``(n,)``; NaN where no column has one."""
+    """Return the first number within limits of each row, ``(n,)``; NaN without such a number."""
     numbers = np.full(len(table), np.nan)
     for column in map(str.lower, columns):
         for i, text in enumerate(table.get(column, ())):
@@ -227,8 +227,8 @@ def _numbers(table: Any, columns: tuple[str, ...], lowest: float, highest: float
 def level_numbers(table: Any) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     """Return the level of every row, ``(n,)``, and a note per column with values that cannot be read.
 
-    A row takes the first of these that it has: OSM's ``bridge`` or ``tunnel``, with the number in ``layer``;
-    a number in one of `NUMBER_COLUMNS`; a word in one of `STRUCTURE_COLUMNS`. Without any it is on level 0.
+    The first that a row has is used: OSM's ``bridge`` or ``tunnel``, with the number in ``layer``; a number
+    in one of `NUMBER_COLUMNS`; a word in one of `STRUCTURE_COLUMNS`. Otherwise the level is 0.
 
     - `table`: its columns are named in lower case.
     """
@@ -253,10 +253,10 @@ def level_numbers(table: Any) -> tuple[NDArray[np.int64], tuple[str, ...]]:
 
 
 def _osm(table: Any) -> list[int | None]:
-    """Return the level of every row that OSM's tags name, and None for the others.
+    """Return the level of every row by OSM's tags, None for rows without these tags.
 
-    ``layer`` orders features only where they cross, so it counts on bridges and in tunnels alone. What lies
-    below a bridge may have a layer below 0: the bridge is still a deck.
+    ``layer`` orders features only where they cross, so it is used only on bridges and in tunnels. A bridge
+    below another bridge may have a layer below 0: it is still a deck.
     """
     bridge, tunnel, covered = (is_yes(table, tag) for tag in ("bridge", "tunnel", "covered"))
     levels: list[int | None] = [None] * len(table)
@@ -270,7 +270,7 @@ def _osm(table: Any) -> list[int | None]:
 
 
 def _level(text: str) -> int | None:
-    """Return a level from a text in lower case; None if it is not one."""
+    """Return a level from a text in lower case; None if the text is not a level."""
     if text in AT_GROUND:
         return 0
     number = float(text.replace(",", ".")) if LEVEL_NUMBER.fullmatch(text) else np.nan
@@ -279,6 +279,6 @@ def _level(text: str) -> int | None:
 
 def _structure(text: str) -> int | None:
     """Return the level of a word or code, perhaps the last part of an address; None if it is unknown."""
-    # A column of numbers with gaps is one of floats: 1800.0.
+    # A column of numbers with gaps is read as floats: 1800.0.
     word = re.split("[/#]", text)[-1].removesuffix(".0").translate(UMLAUTS)
     return STRUCTURE_LEVEL.get(word)

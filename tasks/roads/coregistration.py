@@ -1,16 +1,16 @@
 """Estimate the horizontal shift of an orthophoto against the heights.
 
 Matching edges is not enough: in a photo a tree is a dark patch with its shadow on one side, so it appears
-shifted away from the sun. Instead, the photo's brightness and greenness are explained by least squares from
-four layers computed from the DSM: height above ground, roughness (leaves), illumination by the sun, and cast
-shadow. This is done for sun positions all around the sky and for shifts up to `REACH_M`; the result is the
-sun and the shift that explain the largest share of the variance, to about half a cell. Only detail finer than
-`DETAIL_M` is used.
+shifted away from the sun. Instead, the photo's brightness and greenness are explained by least squares. The
+explaining layers are computed from the DSM: height above ground, roughness (leaves), illumination by the sun,
+and cast shadow. This is done for sun positions all around the sky and for shifts up to `REACH_M`. The result
+is the sun and the shift that explain the largest share of the variance, to about half a cell. Only detail
+finer than `DETAIL_M` is used.
 
-Tiles of one flight have the same sun and usually the same shift, so several tiles give a better estimate than
-one. The result is a mean: in photos that are not true orthophotos roofs and crowns lean outwards, cars have
-moved, and trees have grown; a flat field gives no information. `Shift.confidence` measures how clear the best
-shift is.
+Tiles of one flight have the same sun and usually the same shift, so several tiles give a better estimate. The
+result is a mean: in photos that are not true orthophotos, roofs and crowns lean outwards, cars have moved,
+and trees have grown. A flat field gives no information. `Shift.confidence` measures how clear the best shift
+is.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ Sun = tuple[float, float]
 REACH_M = 5.0
 """Largest shift searched, east and north (m)."""
 FINEST_M, MAX_CELLS = 1.0, 320
-"""Smallest working cell (m), and largest width and height of the working grid; of a larger tile the middle
-is used."""
+"""Smallest working cell (m), and largest width and height of the working grid: only the middle of a larger
+tile is used."""
 STRIDE = 3
 """Every third cell is compared: neighbouring cells are correlated."""
 DETAIL_M = 4.0
 """Standard deviation of the Gaussian whose smooth part is subtracted (m)."""
 APART_M = 2.0
-"""Smallest distance of a second peak from the best one (m)."""
+"""Smallest distance of a second peak from the best peak (m)."""
 CLEAR = 0.3
-"""Smallest confidence at which a shift is taken for one. Photos of other places reach 0.25 over five
-synthetic tiles; a tile's own photo has 0.28 to 0.6."""
+"""Smallest confidence of an accepted shift. Photos of other places reach 0.25 over five synthetic tiles; a
+tile's own photo has 0.28 to 0.6."""
 SMALLEST_M = 1.0
-"""Smaller shifts (m), and those below half a cell of the heights, give no warning."""
+"""Shifts smaller than this (m), or than half a cell of the heights, give no warning."""
 
 AROUND = tuple((float(azimuth), float(rise)) for azimuth in range(0, 360, 30) for rise in (25, 40, 55))
 """Sun positions tried first, 30 degrees apart in azimuth and 15 in height."""
@@ -65,8 +65,8 @@ class Shift:
     east_m: float
     north_m: float
     confidence: float
-    """1 minus the variance explained by the best shift at least `APART_M` away, as a share of that explained
-    by the best shift; 0 to 1."""
+    """1 minus b / a, 0 to 1: a is the variance explained by the best shift, b by the best shift at least
+    `APART_M` away."""
     sun: Sun
 
     @property
@@ -160,7 +160,7 @@ def shift(pairs: Sequence[Pair], sun: Sun | None = None) -> Shift:
 
 
 def _best(pairs: Sequence[Pair], suns: Sequence[Sun]) -> tuple[Sun, Floats]:
-    """Return the sun that explains most, and the variance it explains for each shift, rows from the north."""
+    """Return the best sun, and the variance that it explains for each shift, rows from the north."""
     n = _reach(pairs[0].cell)
     explained = np.sum([_explained(pair, suns) for pair in pairs], axis=0)
     best = int(np.argmax(explained.max(axis=1)))
@@ -223,7 +223,7 @@ def _working(grid: Grid) -> Grid:
 
 
 def _onto(values: Floats, source: Grid, grid: Grid) -> Floats:
-    """Return the mean of the values under each cell of the grid, ``(H, W)``; NaN where there are none."""
+    """Return the mean of the values under each cell of the grid, ``(H, W)``; NaN without values."""
     means = np.full(grid.shape, np.nan)
     rasterio.warp.reproject(
         values.astype(np.float64),
@@ -259,7 +259,7 @@ def _detail(values: Floats, cell: float) -> Floats:
 
 
 def _expected(values: Floats, valid: Bools, cell: float) -> Singles:
-    """Return the detail of a layer at the compared cells, ``(n,)``: those inside the grid for every shift."""
+    """Return the detail of a layer at the compared cells, ``(n,)``: cells inside the grid for every shift."""
     n = _reach(cell)
     inner = np.where(valid, _detail(values, cell), 0.0)[n:-n, n:-n].ravel()[::STRIDE]
     expected: Singles = (inner - inner.mean()).astype(np.float32)
@@ -267,7 +267,7 @@ def _expected(values: Floats, valid: Bools, cell: float) -> Singles:
 
 
 def _shifted(values: Floats, n: int) -> Singles:
-    """Return the photo's values at the compared cells for every shift, ``(shifts, n)``, less their mean."""
+    """Return the photo's values at the compared cells for every shift, ``(shifts, n)``, minus their mean."""
     rows, cols = values.shape[0] - 2 * n, values.shape[1] - 2 * n
     windows = np.lib.stride_tricks.sliding_window_view(values.astype(np.float32), (rows, cols))
     shifted: Singles = np.stack([window.ravel()[::STRIDE] for line in windows for window in line])

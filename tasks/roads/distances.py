@@ -1,7 +1,7 @@
-"""Distances from cells to the nearest cell of a mask, computed only where they are wanted.
+"""Distances from cells to the nearest cell of a mask, computed only for wanted cells.
 
-A search from a cell goes row by row away from it and ends where no row can be nearer. Gaps in rasters are
-mostly narrow, so it is much faster than a distance transform of the complete raster, and as exact.
+A search from a cell goes row by row away from it, and ends when no further row can be nearer. Gaps in rasters
+are mostly narrow, so it is much faster than a distance transform of the complete raster, and as exact.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ def distances(wanted: Bools, mask: Bools) -> Floats:
 
 
 def filled(values: Floats, wanted: Bools | None = None) -> Floats:
-    """Return a raster with NaN replaced by the nearest value, in the wanted cells only if these are given.
+    """Return a raster with NaN replaced by the nearest value; ``wanted`` limits this to some cells.
 
-    Of several equally near, it is the one farthest to the west, then to the north.
+    If several are equally near, the most western is used, then the most northern.
     """
     missing = np.isnan(values)
     holes = missing if wanted is None else missing & wanted
@@ -39,9 +39,9 @@ def filled(values: Floats, wanted: Bools | None = None) -> Floats:
 
 
 def within(mask: Bools, cell: float, reach_m: float) -> Bools:
-    """Return the cells whose centre lies within ``reach_m`` of that of a cell of the mask, ``(H, W)``."""
+    """Return the cells whose centre lies within ``reach_m`` of the centre of a mask cell, ``(H, W)``."""
     # A quotient like 0.3 / 0.1 is a little below 3.
-    # One layout in memory is enough: every other one is compiled, too.
+    # One layout in memory is used, because the function is compiled for every layout.
     return _within(np.ascontiguousarray(mask), reach_m / cell + 1e-9)
 
 
@@ -50,7 +50,7 @@ def _within(mask: Bools, reach: float) -> Bools:
     rows, cols = mask.shape
     aside, near, most = columns_aside(mask), np.zeros((rows, cols), np.bool_), min(int(reach), rows - 1)
     for down in range(-most, most + 1):
-        # A row without a cell of the mask is further away than any column, not than any reach.
+        # In a row without a mask cell, `aside` is larger than any column, but not larger than any reach.
         wide = min(int(math.sqrt(reach**2 - down**2)), cols - 1)
         for r in range(max(down, 0), min(rows + down, rows)):
             for c in range(cols):
@@ -83,10 +83,10 @@ def columns_aside(mask: Bools) -> NDArray[np.int32]:
 
 @compiled()
 def _nearest(cells: NDArray[np.intp], aside: NDArray[np.int32]) -> tuple[Floats, NDArray[np.intp]]:
-    """Return the squared distance from each cell to the nearest one of the mask, and that one's flat index.
+    """Return the squared distance from each cell to the nearest mask cell, and that cell's flat index.
 
-    Where there is none, they are inf and the cell itself. Of several equally near, the first by column and
-    then by row counts.
+    Without a mask cell, they are inf and the cell itself. If several are equally near, the first by column
+    and then by row is used.
     """
     rows, cols = aside.shape
     squares, found = np.full(len(cells), np.inf), cells.copy()
@@ -107,7 +107,7 @@ def _nearest(cells: NDArray[np.intp], aside: NDArray[np.int32]) -> tuple[Floats,
 
 @compiled()
 def columns_of(mask: Bools) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-    """Return the columns of the cells of a mask, row by row, and where those of each cell begin.
+    """Return the columns of the mask cells, row by row, and the number of mask cells before each cell.
 
     The columns of row ``r`` from ``c`` up to ``d`` are ``columns[before[r * W + c] : before[r * W + d]]``.
 

@@ -14,9 +14,9 @@ DSM_DTM_TOLERANCE_M = 0.3
 NEAR_M = 5.0
 """Standard deviation of the Gaussian weights of the kept cells around a gap (m)."""
 REACH_M = 3 * NEAR_M
-"""Farther than this from any kept cell the DTM is not checked (m)."""
+"""Largest distance from a kept cell at which the DTM is checked (m)."""
 CREST_M = 100.0
-"""Smallest radius of crests and sags expected where a road is hidden (m)."""
+"""Smallest expected radius of crests and sags of a hidden road (m)."""
 THIN_M2 = 0.2
 """Cells whose variance in some direction is below this (m2) lie on a line and define no plane."""
 
@@ -28,9 +28,9 @@ EVERYWHERE: Slices = (slice(None), slice(None))
 def invalid_dtm(data: TileData, road: RoadMask, kept: Bools, near: Slices = EVERYWHERE) -> Bools:
     """Return the road cells dropped by the filter whose DTM does not continue the road, ``(H, W)``.
 
-    The expected height is that of the plane through the kept cells around. The DTM may differ from it by
-    `DSM_DTM_TOLERANCE_M`, plus the scatter of those cells, plus the rise of a crest over the distance to the
-    nearest of them. Farther than `REACH_M` from all kept cells the DTM is taken as valid.
+    The expected height is the height of the plane through the kept cells around. The DTM may differ from it
+    by `DSM_DTM_TOLERANCE_M`, plus the scatter of these cells, plus the rise of a crest over the distance to
+    the nearest of them. Farther than `REACH_M` from all kept cells the DTM is taken as valid.
 
     - `data`: DSM and DTM, m.
     - `kept`: the filtered mask.
@@ -61,7 +61,7 @@ def valid_dtm(data: TileData, clusters: RoadClusters, window: Slices = EVERYWHER
 
 
 def ground_to_fit(data: TileData, clusters: RoadClusters, window: Slices = EVERYWHERE) -> Floats:
-    """Return the heights to fit in a window, m: the DSM's on the road, the valid DTM's elsewhere."""
+    """Return the heights to fit in a window, m: the DSM on the road, the valid DTM elsewhere."""
     return np.where(clusters.labels[window] > 0, data.dsm[window], valid_dtm(data, clusters, window))
 
 
@@ -71,19 +71,19 @@ def extrapolated_plane(
     """Extrapolate the plane through the given cells around each wanted cell.
 
     Moving least squares with Gaussian weights over the given cells up to `REACH_M` away in rows and columns.
-    Height and scatter are NaN where there are none, or all of them lie on a line.
+    Height and scatter are NaN where no cell is given, or all given cells lie on a line.
 
     - `heights`: heights (m).
     - `valid`: cells whose heights are used; at least one.
     - `wanted`: cells at which the plane is evaluated; n in number.
     - `cell`: size of a cell (m).
     - `height`, `scatter`, `away`: height of the plane, scatter of the given cells around it, and distance to
-      the nearest of them (m), which is inf where there are none. In row-major order of the wanted cells.
+      the nearest given cell (m), or inf. In row-major order of the wanted cells.
     """
     datum, n = float(heights[valid].mean()), int(REACH_M / cell)
     bell = np.exp(-0.5 * (np.arange(-n, n + 1) * cell / NEAR_M) ** 2)
     cells = np.argwhere(wanted)
-    # Cells in one column, one below the other, have most of their rows in common.
+    # Neighbouring cells of one column share most of their rows.
     order = np.argsort(cells[:, 1], kind="stable")
     sums, nearest = _sums(heights, valid, cells, order, bell, cell, datum)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -111,8 +111,8 @@ def _sums(
 ) -> tuple[Floats, Floats]:
     """Return weighted sums over the valid cells around each cell, and the squared distance to the nearest.
 
-    The sums are those of 1, r, c, rr, rc, cc, z, rz, cz and zz, ``(n, 10)``, with offsets r and c (m) and
-    heights z above the datum (m). The distances are in cells, ``(n,)``.
+    The sums are over 1, r, c, rr, rc, cc, z, rz, cz and zz, ``(n, 10)``, with offsets r and c (m) and heights
+    z above the datum (m). The distances are in cells, ``(n,)``.
     """
     reach = len(bell) // 2
     sums, nearest = np.zeros((len(cells), 10)), np.full(len(cells), np.inf)

@@ -1,4 +1,4 @@
-"""Flat patches of a road: squares of cells that a plane fits, as no plane fits a car, a crown or a facade."""
+"""Flat patches of a road: squares of cells that fit a plane. Cars, crowns and facades do not fit a plane."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ CLIMB = 0.15
 
 Patches = tuple[Bools, Floats, int, Bools]
 """Centres of flat patches, ``(H, W)``; the slope of the street along rows and columns there, ``(H, W, 2)``, m
-per cell, 0 elsewhere; the number of cells from a centre to the edge of its patch; and the centres of the
-patches that were left out because they climb an object, ``(H, W)``."""
+per cell, 0 elsewhere; the number of cells from a centre to the edge of its patch; and the centres of patches
+that were left out because they climb an object, ``(H, W)``."""
 
 
 def flat_cells(heights: Floats, points: Bools, cell: float, roughness_m: float, bend: float) -> Bools:
-    """Return the cells in flat patches, ``(H, W)``; the parameters are as of `flat_patches`."""
+    """Return the cells in flat patches, ``(H, W)``; the parameters are as in `flat_patches`."""
     centres, _, reach, _ = flat_patches(heights, points, cell, roughness_m, bend)
     return np.asarray(scipy.ndimage.binary_dilation(centres, np.ones((2 * reach + 1,) * 2)))
 
@@ -42,10 +42,10 @@ def flat_patches(
 ) -> Patches:
     """Find the flat patches.
 
-    A patch is flat if the residuals to its least-squares plane have a root mean square (over the degrees of
-    freedom) of at most ``roughness_m``, and if its slope differs from the street's by at most ``bend``; the
-    street's slope is the mean over the patches nearby. The second condition excludes patches across a step: a
-    plane tilted up to the roof of a car has small residuals.
+    A patch is flat under two conditions. The residuals to its least-squares plane have a root mean square
+    (over the degrees of freedom) of at most ``roughness_m``. Its slope differs from the street's by at most
+    ``bend``; the street's slope is the mean over the patches nearby. The second condition excludes patches
+    across a step: a plane tilted up to the roof of a car has small residuals.
 
     - `heights`: surface model (m).
     - `points`: cells that may belong to a patch; a patch has no other cells.
@@ -53,8 +53,8 @@ def flat_patches(
     - `roughness_m`: largest root mean square of a patch's residuals (m).
     - `bend`: largest difference of slope (m per m).
     - `ground`: terrain model (m), NaN where unknown. A patch with a cell more than ``off_m`` above or below
-      it is left out if its slope, and its slope relative to the terrain's, exceed `CLIMB`: it climbs an
-      object.
+      the terrain climbs an object if its slope, both in itself and relative to the terrain, exceeds `CLIMB`.
+      It is left out.
     - `off_m`: height difference to the ground (m).
     """
     reach = max(1, math.floor((PATCH_M / cell - 1) / 2 + 1e-9))
@@ -103,7 +103,7 @@ def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple
 def _climbs(
     slopes: Floats, smooth: Bools, heights: Floats, ground: Floats, reach: int, off: float, largest: float
 ) -> Bools:
-    """Return the smooth patches with a cell off the ground that are steep, in themselves and relative to it.
+    """Return the smooth patches off the ground that are steep, in themselves and relative to the ground.
 
     A flat deck is steep relative to the bank below it, and a street in a hill is steep in itself.
     """
@@ -121,21 +121,21 @@ def _climbs(
                     under = ground[r + i, c + j]
                     away = away or abs(heights[r + i, c + j] - under) > off
                     down, across = down - i * under / spread, across - j * under / spread
-            # False where the ground is unknown.
+            # The comparison is False where the ground is unknown.
             climbs[r, c] = away and down * down + across * across > largest
     return climbs
 
 
 @compiled()
 def _along_street(slopes: Floats, smooth: Bools, around: int, largest: float) -> Bools:
-    """Return the smooth patches with the street's slope, ``(H, W)``; write that slope over theirs.
+    """Return the smooth patches with the street's slope, ``(H, W)``; replace their slope by the street's.
 
     The street's slope is the mean of the smooth patches ``around`` a patch. The square of the difference to
     it is at most ``largest``.
     """
     rows, cols = smooth.shape
     side, centres = 2 * around + 1, smooth.copy()
-    # The sums of 1 and both slopes over columns, of the rows around the one whose sums over rows follow.
+    # Sums of 1 and of both slopes over columns, for the rows around the current row.
     beside = np.zeros((side, cols, 3))
     for last in range(rows + around):
         sums = beside[last % side]

@@ -37,7 +37,7 @@ Cleanup = Literal["none", "pieces", "corridor"]
 def clean(mask: Bools, data: TileData, cleanup: Cleanup) -> Bools:
     """Return the cleaned mask, ``(H, W)``; cells beyond the survey are never added.
 
-    Gaps are closed before areas are measured, so that a road in fragments counts as one piece.
+    Gaps are closed before areas are measured, so that a road in fragments is one piece.
     """
     if cleanup == "none":
         return mask
@@ -80,7 +80,7 @@ def drop(mask: Bools, cell: float, area_m2: float) -> Bools:
 
 
 def _pieces(mask: Bools, cell: float, connectivity: int) -> tuple[NDArray[np.int32], Any, Bools]:
-    """Return each cell's piece (0: not in the mask), the pieces' areas (m2), and which touch no grid edge."""
+    """Return each cell's piece (0: no piece), the areas of pieces (m2), and which touch no grid edge."""
     count, pieces, stats, _ = cv2.connectedComponentsWithStats(_bytes(mask), connectivity=connectivity)
     inner = np.ones(count, bool)
     for edge in (pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]):

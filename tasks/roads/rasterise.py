@@ -1,4 +1,4 @@
-"""Rasterise the roads of a vector file: areas as they are, centre lines buffered to their width.
+"""Rasterise the roads of a vector file: areas directly, centre lines buffered to their width.
 
 Lines have flat ends; where ends of lines meet, a disc closes the wedge between them.
 """
@@ -24,9 +24,9 @@ from flexroad.tasks.types import Bools, Floats, Source, TileData
 rasterio = lazy("rasterio")
 
 CLASS_TAGS = ("highway", "area:highway")
-"""OSM's tags of a road's class: in tables with such a column, features without a value are not roads."""
+"""OSM's tags of a road's class: in tables with these columns, features without a value are not roads."""
 HIDDEN_TAGS = ("tunnel", "covered")
-"""Tags of roads under something, whose heights are not in the DSM."""
+"""Tags of covered roads, whose heights are not in the DSM."""
 BRIDGE, AREA = "bridge", "area"
 FARTHEST_M = 75.0
 """Distance from the grid up to which roads are read if they have levels (m)."""
@@ -38,7 +38,7 @@ class Options(attributes.Options):
     """Selection of road features, and the width of lines."""
 
     layer: str | None = Field(
-        None, description="layer of a file with several; of the OSM format, lines and areas are both used"
+        None, description="layer of a file with several; for the OSM format, lines and areas are both used"
     )
     where: str | None = Field(None, description="SQL condition that selects features: class = 'road'")
     class_columns: tuple[str, ...] = Field(
@@ -64,7 +64,7 @@ class Options(attributes.Options):
             *("s1710", "s1720", "s1810", "s1820", "s1830", "fp", "vp", "voetpad", "voetpad op trap"),
             *("fietspad", "ruiterpad", "voetgangersgebied", "spoorbaan", "baan voor vliegverkeer"),
         ),
-        description="classes that are not carriageways, or planned or removed ones",
+        description="classes of planned or removed roads, and classes that are not carriageways",
     )
     tunnels: bool = Field(False, description="keep roads in tunnels, passages and under roofs")
 
@@ -79,11 +79,11 @@ class Roads:
     areas: NDArray[np.object_]
     """Polygons in the tile's CRS, ``(n,)``."""
     shapes: NDArray[np.object_]
-    """The polygons or lines that they were made of, ``(n,)``; None for discs between lines."""
+    """The polygons or lines from which they were made, ``(n,)``; None for discs between lines."""
     bridge: Bools
     """Which of them are on bridges, ``(n,)``."""
     level: NDArray[np.int64]
-    """Their levels, ``(n,)``; 0 if these are not read."""
+    """Their levels, ``(n,)``; 0 if levels are not read."""
     notes: tuple[str, ...] = ()
 
 
@@ -107,15 +107,15 @@ def roads(source: Source | None, grid: Grid, options: Options, levels: bool = Fa
     """Return the roads on and around a grid, as polygons.
 
     - `source`: the tile's layer ``roads``.
-    - `grid`: the area to read; roads that touch it are returned whole.
-    - `levels`: whether to read levels. Roads below level 0 are then kept, whatever `Options.tunnels` says.
+    - `grid`: the area to read; roads that touch it are returned completely.
+    - `levels`: whether to read levels. Roads below level 0 are then kept, even without `Options.tunnels`.
     """
     if source is None:
         raise LayerMissing(
             "no roads layer in the catalog: give a vector file with --roads to `flexroad catalog` "
             "or `flexroad prepare`"
         )
-    # Both portals of a tunnel that reaches the grid are seen.
+    # The area is large enough for both portals of a tunnel that reaches the grid.
     reach = max(attributes.MAX_WIDTH_M / 2, FARTHEST_M if levels else 0.0)
     west, south, east, north = grid.bounds
     bounds = (west - reach, south - reach, east + reach, north + reach)
@@ -171,9 +171,9 @@ def _from_table(table: Any, options: Options, levels: bool) -> Roads:
 def selected(
     table: Any, options: Options, levels: bool
 ) -> tuple[Any, NDArray[np.object_], NDArray[np.int64], tuple[str, ...]]:
-    """Return the rows of a table that are roads, the class of each, in lower case or empty, and its level.
+    """Return the road rows of a table, their classes in lower case or empty, their levels, and notes.
 
-    And notes on levels that cannot be read. With levels, tunnels are not left out as hidden.
+    The notes are on levels that cannot be read. With levels, tunnels are not left out as hidden.
     """
     numbers, notes = np.zeros(len(table), np.int64), tuple[str, ...]()
     if levels:
@@ -215,11 +215,11 @@ def _closed(parts: NDArray[np.object_], area: Bools) -> NDArray[np.object_]:
 def _joints(
     lines: NDArray[np.object_], half: Floats, bridge: Bools, level: NDArray[np.int64]
 ) -> tuple[NDArray[np.object_], Bools, NDArray[np.int64]]:
-    """Return discs where ends of lines meet, ``(n,)``, which have only bridges around them, and their levels.
+    """Return discs where ends of lines meet, ``(n,)``, whether only bridges meet there, and their levels.
 
-    The radius of a disc is the second largest half width of the lines that end there, so that a wide road
-    that continues as a narrow one does not bulge beyond the narrow one's width. Where lines of several levels
-    meet there is none: it would be a street below the deck.
+    The radius of a disc is the second largest half width of the lines that end there. So a wide road that
+    continues as a narrow road does not bulge beyond the narrow width. Where lines of several levels meet,
+    there is no disc: it would be a street below the deck.
     """
     if not len(lines):
         return np.empty(0, object), np.zeros(0, bool), np.empty(0, np.int64)

@@ -1,6 +1,6 @@
-"""The heights that a fit gives to roads: the DSM without the bias of the highest point.
+"""The heights to which roads are fitted: the DSM without the bias of the highest point.
 
-A DSM has the highest point of each cell, which scanner noise lifts above the road. A catalog made of points
+A DSM has the highest point of each cell, which scanner noise lifts above the road. A catalog made from points
 has the layer ``road_height`` instead. With rasters alone, the lift is estimated where the road is open
 ground: there DSM and DTM are two heights of the same surface, and the DTM is a mean of points.
 """
@@ -20,16 +20,16 @@ OPEN_M = 0.15
 STEP_M = 25.0
 """Distance of the places at which the offset is estimated (m), on multiples of it in easting and northing."""
 REACH_M = 37.5
-"""Cells up to this far from a place in easting and northing count (m)."""
+"""Cells up to this far from a place in easting and northing are used (m)."""
 MIN_CELLS = 50
-"""With fewer open cells around, a place has the offset of all ground."""
+"""Smallest number of open cells around a place; with fewer, it has the offset of all ground."""
 
 
 def with_road_heights(data: TileData, clusters: RoadClusters) -> TileData:
-    """Return the data with the heights that the road is fitted to as DSM of the filtered road cells.
+    """Return the data with the heights to which the road is fitted as DSM of the filtered road cells.
 
-    They are the layer ``road_height``, the DSM minus its `dsm_offset` or the DSM itself, as `load` was asked;
-    where the layer has no height, the DSM's.
+    They are the layer ``road_height``, the DSM minus its `dsm_offset`, or the DSM itself, by the options of
+    `load`. Where the layer has no height, the DSM is used.
     """
     heights = ground_heights(data, clusters)
     if heights is data:
@@ -38,7 +38,7 @@ def with_road_heights(data: TileData, clusters: RoadClusters) -> TileData:
 
 
 def ground_heights(data: TileData, clusters: RoadClusters) -> TileData:
-    """Return the data with such heights as DSM of all cells: the ground beside a road has the same bias."""
+    """Return the data with these heights as DSM of all cells: the ground beside a road has the same bias."""
     if data.road_height is not None:
         heights = np.where(np.isfinite(data.road_height), data.road_height, data.dsm)
     elif data.offset_dsm:

@@ -1,9 +1,9 @@
-"""Routes: centre lines of roads, chained where a road continues and cut where a format could not follow it.
+"""Routes: centre lines of roads, chained where a road continues and cut where export formats need it.
 
 At a node, where ends of lines meet, the two ends that form the straightest continuation belong to one route.
-No route turns sharply, crosses itself, changes its number of lanes or is longer than a limit. Lines join at
-their ends alone: a line that ends on the middle of another one ends there, and lines that cross without a
-common end, as on bridges, stay apart.
+No route turns sharply, crosses itself, changes its number of lanes or is longer than a limit. Lines join only
+at their ends. So a route ends where its line ends on the middle of another line. Lines that cross without
+a common end, such as on bridges, stay apart.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ End = tuple[int, bool]
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
-    """The centre line of a carriageway with what is known of its lanes."""
+    """The centre line of a carriageway, with its width, lanes, direction and level."""
 
     points: Floats
     """``(n, 2)``: x and y (m)."""
@@ -58,13 +58,13 @@ class CentreLine:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A chain of centre lines, each beginning where the one before ends."""
+    """A chain of centre lines; each begins at the end of the line before."""
 
     parts: tuple[CentreLine, ...]
 
     @property
     def points(self) -> Floats:
-        """The points of all parts, ``(n, 2)``, without repeated ones."""
+        """The points of all parts, ``(n, 2)``, without repeated points."""
         points = np.concatenate([part.points for part in self.parts])
         apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > SAME_M
         apart[-1:] = True  # the last point stays: another route may begin there
@@ -74,13 +74,13 @@ class Route:
 def routes(
     lines: Sequence[CentreLine], max_turn_deg: float = 45.0, max_length_m: float = 5000.0
 ) -> list[Route]:
-    """Return the routes that lines form; each line, or each piece of a line with sharp turns, is in one.
+    """Return the routes of lines; each line, or each piece of a line with sharp turns, is in one route.
 
-    The result does not depend on the direction in which lines of two-way roads were drawn, but for its own
-    direction, which is that of the first line of a route.
+    A route has the direction of its first line. Apart from that, the result does not depend on the direction
+    in which lines of two-way roads were drawn.
 
     - `max_turn_deg`: largest turn within a route (degrees), below 90.
-    - `max_length_m`: longest route (m); longer ones are divided.
+    - `max_length_m`: longest route (m); longer routes are divided.
     """
     pieces = [
         part
@@ -169,7 +169,7 @@ def _joins(lines: Sequence[CentreLine], a: End, b: End) -> bool:
 
 
 def _chain(first: int, follows: dict[End, End]) -> Iterator[tuple[int, bool]]:
-    """Return the lines of a chain in order, each with whether it is passed in its own direction."""
+    """Return the lines of a chain in order, each with whether the route has the line's own direction."""
     start, seen = (first, False), {first}
     while start in follows and follows[start][0] not in seen:
         index, last = follows[start]
@@ -187,7 +187,7 @@ def _chain(first: int, follows: dict[End, End]) -> Iterator[tuple[int, bool]]:
 
 
 def _simple(chain: Sequence[CentreLine], max_length_m: float) -> Iterator[Route]:
-    """Cut a chain before each line that would cross or touch the route so far, or make it too long."""
+    """Cut a chain before each line that would cross or touch the route up to there, or make it too long."""
     parts: list[CentreLine] = []
     length_m = 0.0
     for part in chain:

@@ -1,6 +1,6 @@
 """Clusters of cells as a union-find forest.
 
-A cluster is a tree whose root is its first cell in row-major order, so the result does not depend on the
+A cluster is a tree whose root is its first cell in row-major order. So the result does not depend on the
 order of the merges.
 """
 
@@ -13,7 +13,7 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools
 
 Roots = NDArray[np.int32]
-"""Flat index of each cell's parent, ``(H * W,)``; a root is its own parent; -1 if the cell is no member."""
+"""Flat index of each cell's parent, ``(H * W,)``; a root is its own parent; -1 for cells without cluster."""
 
 
 def init(members: Bools) -> Roots:
@@ -26,7 +26,7 @@ def forward_offsets(radius: float) -> NDArray[np.int64]:
     """Return the (row, col) steps of up to ``radius`` cells that go forward in row-major order, ``(n, 2)``.
 
     A radius of 1.5 gives the 8-neighbourhood A(i, j). The other half of the disc would give the same pairs of
-    cells again. Short steps come first, so that fewer sets are left for the long ones.
+    cells again. Short steps come first, so that fewer sets are left for long steps.
     """
     reach = int(radius + 1e-9)
     row, col = np.mgrid[0 : reach + 1, -reach : reach + 1].reshape(2, -1)
@@ -64,7 +64,7 @@ def compress(roots: Roots) -> Roots:
 
 @compiled()
 def largest_of(roots: Roots) -> int:
-    """Return the root of the largest cluster of a compressed forest, of equal ones the first; 0 if none."""
+    """Return the root of the largest cluster of a compressed forest; the first of equal ones; 0 if empty."""
     sizes, largest = np.zeros(roots.size, np.int32), 0
     for root in roots:
         if root >= 0:
@@ -87,7 +87,7 @@ def members_of(roots: NDArray[np.int32], cells: int) -> tuple[NDArray[np.intp], 
 
 @compiled()
 def _numbered(roots: NDArray[np.int32], cells: int) -> tuple[NDArray[np.intp], int]:
-    """Return the number of each cell's cluster, in ascending order of roots, and that of clusters."""
+    """Return the number of each cell's cluster, in ascending order of roots, and the number of clusters."""
     number = np.zeros(cells, np.int32)
     for root in roots:
         number[root] = 1
@@ -105,7 +105,7 @@ def _numbered(roots: NDArray[np.int32], cells: int) -> tuple[NDArray[np.intp], i
 def clean(points: Bools, roots: Roots, least: float, keep: int | None) -> NDArray[np.int32]:
     """Label the ``keep`` largest of the clusters of at least ``least`` cells (`cleanClusters`).
 
-    Of clusters of equal size the one whose first cell comes first is kept.
+    Of clusters of equal size, the cluster with the earlier first cell is kept.
     """
     # Roots ascend like first cells, so both ranks below break ties by first cell.
     member, sizes = members_of(roots[points], roots.size)
@@ -120,5 +120,5 @@ def clean(points: Bools, roots: Roots, least: float, keep: int | None) -> NDArra
 
 def least_cells(area_m2: float, cell: float) -> float:
     """Return the number of cells in an area."""
-    # Without the tolerance, rounding errors of the cell size would count: 5000 cells of 0.1 m are 50 m2.
+    # The tolerance removes rounding errors of the cell size: 5000 cells of 0.1 m are 50 m2.
     return area_m2 / cell**2 * (1 - 1e-9)

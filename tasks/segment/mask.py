@@ -23,7 +23,7 @@ class Options(options.Options):
 def segment(data: TileData, options: Options) -> RoadMask:
     """Return the road cells of the catalog's mask layer.
 
-    A tile that no mask reaches has no road cell, like the cells that a mask leaves out; a note says so.
+    A tile that no mask reaches has no road cell; a note says so.
     """
     mask = np.zeros(data.grid.shape, np.bool_) if data.road_mask is None else data.road_mask
     note = None

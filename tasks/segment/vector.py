@@ -14,7 +14,7 @@ from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 2
 LEVELS_VERSION = 2
-"""Raised instead if the results of any stage change with `Options.levels` alone."""
+"""A version that is raised instead of `VERSION` if results of any stage change only with `Options.levels`."""
 READS = ("roads",)
 NEEDS = ("roads",)
 
@@ -42,7 +42,7 @@ class Options(rasterise.Options):
 
 
 def segment(data: TileData, options: Options) -> RoadMask:
-    """Return the cells whose centre lies on a road of the catalog's vectors, with those on bridges flagged.
+    """Return the cells whose centre lies on a road of the catalog's vectors, and mark cells on bridges.
 
     A tile that no file reaches has no road cell; a note says so.
 

@@ -1,7 +1,7 @@
 """Adam within bounds, with early stopping (the paper's "Implementation Details").
 
-Kingma and Ba, "Adam: a method for stochastic optimization", 2015, Algorithm 1, and a projection on the
-bounds after each step. torch's Adam and autograd do the same on a GPU, and are the oracle of the gradient.
+Kingma and Ba, "Adam: a method for stochastic optimization", 2015, Algorithm 1, and a projection on the bounds
+after each step. torch's Adam and autograd do the same on a GPU, and tests check the gradient with them.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
 
 
 STOP_TOLERANCE, STOP_WINDOW = 1e-4, 20
-"""The steps end early when the loss changes by at most this share over so many of them."""
+"""The fit stops early if the loss changes by at most this share over this number of steps."""
 
 
 def _has_finished(losses: Sequence[float], iterations: int) -> bool:
-    """Return whether to stop, from the losses at the start and after each step so far."""
+    """Return whether to stop, from the losses at the start and after each previous step."""
     steps = len(losses) - 1
     if steps >= iterations or steps < STOP_WINDOW:
         return steps >= iterations
@@ -44,9 +44,9 @@ def minimise(
     objective: Callable[[Floats], tuple[float, Floats]], start: Floats, limit: Floats, rate: float,
     iterations: int, last: bool = False,
 ) -> tuple[Floats, list[float]]:  # fmt: skip
-    """Take Adam steps from ``start`` and return the variables with the lowest loss of all steps, or the last.
+    """Take Adam steps from ``start``; return the variables of the step with the lowest loss, or of the last.
 
-    The length of a step does not fall with the gradient, so the last step need not be the best: from a start
+    The length of a step does not fall with the gradient, so the last step may not be the best: from a start
     that fits exactly, every step raises the loss.
 
     - `objective`: returns the loss and its gradient at the variables.
@@ -83,8 +83,8 @@ def _step(
 ) -> None:  # fmt: skip
     """Take one step in place, all arrays ``(n,)``.
 
-    - `rate`: learning rate over the share of the mean that is known after so many steps.
-    - `known`: the same share of the variance.
+    - `rate`: learning rate, divided by Adam's bias correction of the mean.
+    - `known`: Adam's bias correction of the variance.
     """
     for i in range(variables.size):
         mean[i] += (1 - BETA_1) * (gradient[i] - mean[i])
@@ -100,7 +100,7 @@ def _step(
 def torch_loss(
     objective: Objective, shape: tuple[int, int], device: str
 ) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return the loss (m) of float64 tensors ``(2, m, n)`` on a device, z and rho: the same as of arrays."""
+    """Return a function: z and rho, float64 tensors ``(2, m, n)`` on a device, to the same loss (m)."""
     m, n = shape
     basis_u = _tensor(dense(objective.start_u, objective.along_u.T, n), device)
     basis_v = _tensor(dense(objective.start_v, objective.along_v, m), device)
@@ -120,7 +120,7 @@ def _tensor(array: Floats, device: str) -> torch.Tensor:
 
 
 def _range_term(z: torch.Tensor) -> torch.Tensor:
-    """Return the regulariser over ``lambda_reg``, as `tasks.spline.objective.range_term`."""
+    """Return the regulariser divided by ``lambda_reg``, as `tasks.spline.objective.range_term`."""
     rows, cols = z.shape
 
     def neighbours(outside: float) -> torch.Tensor:

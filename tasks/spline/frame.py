@@ -1,11 +1,11 @@
-"""What tiles share along their borders: control points, where the border is road, and vertices of meshes.
+"""Shared parts of tiles along their borders: control points, classes of cells, and vertices of meshes.
 
-Every part is computed from the ground around it alone, so that neighbouring tiles hold equal parts. Together
+Every part is computed only from the ground around it, so that neighbouring tiles have equal parts. Together
 the parts of one tile are its frame: it fixes the surface and the mesh along the tile's edges.
 
 Vertices lie at whole multiples of the spacing from the western or southern end of an edge, and are fine where
-the edge is road. Both tiles read that from the same `Edge`, evaluate the same control points, and round the
-heights to the same multiple of `VERTEX_GRAIN_M`.
+the edge is road. Both tiles read the same `Edge`, evaluate the same control points, and round the heights to
+the same multiple of `VERTEX_GRAIN_M`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from flexroad.tasks.types import Bools, Floats, HeightAt
 GRAIN_M = 2.0**-20
 """Control heights of a frame are multiples of this (m), so that rounding errors of a CPU do not remain."""
 VERTEX_GRAIN_M = 2.0**-12
-"""Heights on the border are multiples of this (m): relative to a whole-metre datum they are exact in the
+"""Heights on the border are multiples of this (m). Relative to a whole-metre datum they are exact in the
 float32 of GLB files."""
 SAME_M = 0.02
 """Ends of lines within this distance of a vertex on the border end in it (m)."""
@@ -40,10 +40,10 @@ class Corner:
     outside: Bools
     """Whether the four cells around it lie beyond the survey, ``(2, 2)``; row 0 in the north."""
     levels: tuple[tuple[int, Corner], ...] = ()
-    """Number and corner of each other level near it; its own control points are those of level 0."""
+    """Number and corner of each other level near it; the corner itself belongs to level 0."""
 
     def at(self, number: int) -> Corner:
-        """Return the corner of a level, that of level 0 if it has none."""
+        """Return the corner of a level, or of level 0 if the level has none."""
         return dict(self.levels).get(number, self)
 
 
@@ -52,16 +52,16 @@ class Edge:
     """The control points that act on an edge but on none of its corners, and the classes along it."""
 
     control: Floats
-    """Control heights, ``(q, n - p)`` of an edge to the east and ``(m - q, p)`` of one to the north, m; row 0
-    in the south. NaN if there is no ground to fit."""
+    """Control heights, m: ``(q, n - p)`` for an edge to the east, ``(m - q, p)`` for an edge to the north;
+    row 0 in the south. NaN if there is no ground to fit."""
     road: Bools
     """Whether the cells along the edge are road by the raw mask, from west to east or south to north: the
     cells to the south or east of it."""
     kept: Bools
-    """The same by the filtered mask."""
+    """Whether these cells are road by the filtered mask."""
     outside: Bools
-    """Whether the cells along the edge lie beyond the survey, ``(2, cells)``: those in the north or west of
-    it, and those in the south or east. The cells at its ends are as its corners say, for both edges there."""
+    """Whether the cells along the edge lie beyond the survey, ``(2, cells)``: cells in the north or west of
+    it, and cells in the south or east. The corners decide on the cells at its ends, for both edges there."""
 
     crossings: Floats
     """Where the outline of roads from vectors crosses the edge, ``(n,)``: ascending, m from the start. Empty
@@ -73,16 +73,15 @@ class Edge:
     """Distance of the nearer of the two cells to the nearest road cell of the raw mask, ``(cells,)``, m; with
     ``steps``."""
     levels: tuple[tuple[int, Edge], ...] = ()
-    """Number and edge of each other level near it; its own control points, classes and steps are those of
-    level 0. Crossings of a level are those of the outline of its decks; those on abutments are also among the
-    crossings of level 0."""
+    """Number and edge of each other level near it; the edge itself belongs to level 0. Crossings of a level
+    are crossings of the outline of its decks; crossings on abutments are also crossings of level 0."""
 
     def at(self, number: int) -> Edge:
-        """Return the edge of a level, that of level 0 if it has none."""
+        """Return the edge of a level, or of level 0 if the level has none."""
         return dict(self.levels).get(number, self)
 
     def steps_beyond(self, distance_m: float, cells: int) -> Floats:
-        """Return the steps, ``(cells,)``, m: 0 within a distance of road cells, and if there are none."""
+        """Return the steps, ``(cells,)``, m: 0 within a distance of road cells, and without steps."""
         if self.steps is None or self.road_m is None:
             return np.zeros(cells)
         return np.where(self.road_m <= distance_m, 0.0, self.steps)
@@ -94,7 +93,7 @@ class Edge:
 
     @property
     def limits(self) -> NDArray[np.intp]:
-        """Numbers of cells from the start of the edge at which the mesh of one of its tiles ends."""
+        """Positions (in cells from the start of the edge) at which the mesh of one of its tiles ends."""
         changes = (self.outside[:, 1:] != self.outside[:, :-1]).any(axis=0)
         return np.flatnonzero(changes) + 1
 
@@ -113,7 +112,7 @@ class Frame:
     east: Edge
 
     def at(self, number: int) -> Frame:
-        """Return the frame of a level: its corners and edges, or those of level 0 where it has none."""
+        """Return the frame of a level: its corners and edges, or level 0 where the level has none."""
         return Frame(*(getattr(self, field.name).at(number) for field in fields(self)))
 
     def control(self, shape: tuple[int, int]) -> Floats:
@@ -138,9 +137,9 @@ class Frame:
         return np.stack(south_north), np.stack(west_east)
 
     def outside(self, cells: Bools) -> Bools:
-        """Return the cells of the tile beyond the survey, ``(H, W)``; those along the edges are as these say.
+        """Return the cells of the tile beyond the survey, ``(H, W)``; edges decide on the cells along them.
 
-        A void can be closed in the ground around the tile, and open in that around an edge.
+        A void can be closed in the ground around the tile, but open in the ground around an edge.
         """
         result = cells.copy()
         result[0], result[-1] = self.north.outside[1], self.south.outside[0]
@@ -148,7 +147,7 @@ class Frame:
         return result
 
     def road(self, cells: Bools, raw: bool) -> Bools:
-        """Return the road cells of the tile, ``(H, W)``; those along the edges are as these say.
+        """Return the road cells of the tile, ``(H, W)``; edges decide on the cells along them.
 
         The outline of the road then crosses an edge at the same places in both of its tiles.
         """
@@ -169,7 +168,7 @@ def rounded(heights: np.ndarray) -> Floats:
 def border_heights(height: HeightAt, easting: Floats, northing: Floats) -> Floats:
     """Return the heights of vertices on the border (m).
 
-    They are evaluated point by point: the last digits of a matrix product depend on the other points.
+    Heights are evaluated point by point, because last digits of a matrix product depend on the other points.
     """
     return np.asarray(np.round(height(easting, northing) / VERTEX_GRAIN_M) * VERTEX_GRAIN_M)
 
@@ -183,22 +182,22 @@ def border_points(
     raw: bool,
     apart_m: float,
 ) -> Floats:
-    """Return the vertices on the border of a tile, ``(n, 2)``; corners are in it twice.
+    """Return the vertices on the border of a tile, ``(n, 2)``; corners are included twice.
 
-    Among them are the places where the meshes of the tile or its neighbour end with the survey, and where the
-    outline of a road crosses the border.
+    They include the places where the mesh of the tile or its neighbour ends with the survey, and crossings
+    of road outlines with the border.
 
-    - `frame`: tells where the border is road.
+    - `frame`: has the road cells along the border.
     - `local`: west, south, east and north of the tile (m).
     - `cell`: cell size (m).
     - `fine`, `coarse`: distances of possible vertices from the start of an edge, along easting and along
       northing (m): on the road and elsewhere. Both have the edge's two ends.
-    - `raw`: whether the raw road mask counts, with its outlines, instead of the filtered one.
+    - `raw`: whether the raw road mask is used, with its outlines, instead of the filtered mask.
     - `apart_m`: other vertices are left out within this distance of such a place (m).
     """
     sides = []
     for edge, axis, at in _edges(frame, local):
-        # As everywhere, a vertex between two cells belongs to the eastern or southern one.
+        # As everywhere, a vertex between two cells belongs to the eastern or southern cell.
         nudge = NUDGE * cell * (1 if axis == 0 else -1)
         road = edge.road if raw else edge.kept
         on_road, elsewhere = (_at(road, (t[axis] + nudge) / cell) for t in (fine, coarse))
@@ -236,10 +235,10 @@ def on_border(points: Floats, local: Bounds) -> Bools:
 
 
 def joined(points: Floats, faces: NDArray[np.int32], frame: Frame, local: Bounds, cell: float) -> Bools:
-    """Return the faces along those parts of the border that lie within the survey, ``(F,)``.
+    """Return the faces along the parts of the border that lie within the survey, ``(F,)``.
 
-    They are part of the mesh although the tile alone may count the ground there as outside: the neighbour's
-    face on the other side is there as well.
+    They are part of the mesh, because the neighbour has a face on the other side. The tile alone might take
+    the ground there as outside.
     """
     result = np.zeros(len(faces), np.bool_)
     for edge, axis, at in _edges(frame, local):

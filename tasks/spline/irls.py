@@ -4,11 +4,11 @@ With unit weights the surface is linear in its control heights and the loss is c
 every absolute difference by a quadratic function, solves the normal equations, and searches the line to their
 solution for the lowest loss (Huber and Ronchetti, "Robust Statistics", section 7.8).
 
-Under Huber's function, the later steps of a narrow spline with a small tolerance are nearly those of Newton's
+Under Huber's function, the later steps of a narrow spline with a small tolerance are nearly steps of Newton's
 method, see `OUTLIERS`.
 
 The normal equations of wide splines are solved from step to step more precisely
-(`tasks.spline.normal_equations`): the error of a step is corrected by the next ones, which are shorter.
+(`tasks.spline.normal_equations`): the error of a step is corrected by the next steps, which are shorter.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from flexroad.tasks.spline.surface import Starts
 from flexroad.tasks.types import Bools, Floats
 
 FINAL_M, INITIAL_M = 0.003, 0.03
-"""Smaller differences get the weight of this value (m): in the last steps under L1, and in the first step."""
+"""Smaller differences get the weight of this value (m), in the last steps under L1 and in the first step."""
 COOLING = 0.6
 """Factor by which that value falls from step to step."""
 MAX_STEP, SLOPE_TOLERANCE = 3.0, 1e-4
-"""Longest step, as a multiple of the step to the quadratic model's minimum, and largest slope of the loss at
-its end, as a share of that at its start."""
+"""Longest step, as a multiple of the step to the quadratic model's minimum. Largest slope of the loss at its
+end, as a share of the slope at its start."""
 SETTLED, OUTLIERS = 2, 0.1
 """After this many steps, differences above `huber_m` have this share of their weight in the quadratic model.
 Huber's function has no curvature there, so the model is closer to it, and fewer steps are needed."""
 PRECISE = 1e-6
-"""Largest tolerance with which this is done: with a larger one the steps end on the way to the minimum."""
+"""Largest tolerance with which this is done: with a larger tolerance the steps end before the minimum."""
 SHORT = 0.5
-"""A step shorter than this multiple of the step to the model's minimum shows that the share is too small."""
+"""A step shorter than this multiple of the step to the model's minimum means that the share is too small."""
 LOOSE, TIGHT = 5e-4, 1e-5
-"""Tolerances of the normal equations (`Multigrid.solve`): in the first step, and the smallest."""
+"""Tolerances of the normal equations (`Multigrid.solve`): of the first step, and the smallest."""
 MAX_EVALUATIONS = 40
 """Largest number of evaluations between two points of a line; it takes 0 to 5."""
 STEP_TOLERANCE = 1e-6
@@ -65,7 +65,7 @@ class HuberObjective:
     bending: Floats
     """Second derivatives of the bending energy (`tasks.spline.stencil.bending_energy`)."""
     huber_m: float
-    """Smaller differences d count as ``d^2 / (2 huber_m)``, others as ``|d| - huber_m / 2``; 0 is L1."""
+    """The loss of smaller differences d is ``d^2 / (2 huber_m)``, else ``|d| - huber_m / 2``; 0 is L1."""
 
     @cached_property
     def multigrid(self) -> Multigrid | None:
@@ -109,7 +109,7 @@ class HuberObjective:
 
         - `bend` ``(n, width)``: gradient of the bending energy.
         - `residuals` ``(H, W)``: surface minus targets (m).
-        - `floor_m`: smaller differences get the weight of this one (m).
+        - `floor_m`: smaller differences get the weight of this difference (m).
         - `share`: share of the weight of larger differences that enters the matrix.
         - `tolerance`, `refresh`: see `Multigrid.solve`.
         """

@@ -1,8 +1,8 @@
 """The surfaces of a tile with several levels: the ground, and decks above or tunnels below it.
 
 Each level has a spline over the complete tile. Near an abutment, the ground has the surface of the level that
-begins there, so that both are one spline across it. Its own spline, with control points metres apart, cannot
-follow the end of an embankment.
+begins there, so that one spline crosses the abutment. The ground's own spline, with control points metres
+apart, cannot follow the end of an embankment.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import BLEND_M, Floats, Level, LevelSpline, Surface
 
 GRADIENT_M = 0.01
-"""Distance over which the slope of the weight of a level is taken (m)."""
+"""Distance over which the slope of the weight of a level is computed (m)."""
 STEEPEST = 1.6 / BLEND_M
-"""More than the largest slope of the weight where it is smooth (1/m)."""
+"""Slopes of the weight above this are jumps (1/m): where the weight is smooth, its slope is smaller."""
 
 
 @dataclass(frozen=True, eq=False)
 class LevelledSurface(SteppedSurface):
-    """The surfaces of all levels of a tile; height, normal and steps are those of level 0.
+    """The surfaces of all levels of a tile; its height, normal and steps belong to level 0.
 
-    ``A`` are the control heights of level 0 alone. Within approaches its height is not that of this spline.
+    ``A`` are the control heights of level 0 alone. Within approaches its height differs from this spline.
     """
 
     levels: tuple[LevelSpline, ...] = ()
@@ -47,7 +47,7 @@ class LevelledSurface(SteppedSurface):
         )
 
     def at(self, number: int) -> NurbsSurface:
-        """Return the surface of a level. Those of others than 0 are roads only where the level `covers`."""
+        """Return the surface of a level; levels other than 0 have a road only where the level `covers`."""
         if number == 0:
             return self
         control = next(own.A for own in self.levels if own.level.number == number)
@@ -91,7 +91,7 @@ class LevelledSurface(SteppedSurface):
         return by_easting, by_northing
 
     def _joined(self, heights: Floats, easting: Floats, northing: Floats) -> Floats:
-        """Return heights of the spline of level 0 (m) with those of the other levels near their abutments."""
+        """Return heights of the spline of level 0 (m), blended with the other levels near their abutments."""
         east, north = np.broadcast_arrays(np.asarray(easting, float), np.asarray(northing, float))
         result = np.array(heights)
         for own in self.levels:
@@ -130,7 +130,7 @@ class HighestSurface(Surface):
         northing: Floats,
         of: Callable[[NurbsSurface, Floats, Floats], Floats],
     ) -> Floats:
-        """Return values of level 0 at points, with those of higher levels on these."""
+        """Return values of level 0 at points; on higher levels the values of these levels."""
         east, north = np.broadcast_arrays(easting, northing)
         numbers, result = self.every.top(east, north), np.array(values)
         for number in np.unique(numbers[numbers > 0]).tolist():

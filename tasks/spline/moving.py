@@ -1,8 +1,8 @@
-"""NURBS surfaces whose plan moves with the weights: the paper's S(u, v) in space (Eq. nurbs), as it stands.
+"""NURBS surfaces whose plan moves with the weights: the paper's S(u, v) in space (Eq. nurbs), unchanged.
 
-Control points have fixed places in plan. With weights that differ, the point S(u, v) is not at the place that
-belongs to (u, v): x and y are rational splines like the height. The fit compares heights with the rasters at
-(u, v), as the paper's R^S does, and takes no notice of the place of S(u, v). The mesh has its vertices there.
+Control points have fixed places in plan. If weights differ, the point S(u, v) is not at the place of (u, v):
+x and y are rational splines like the height. The fit compares heights with the rasters at (u, v), like the
+paper's R^S, and ignores the place of S(u, v). The mesh has its vertices at S(u, v).
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats, Surface
 
 DECIMALS = 6
-"""Decimals of a metre that places are rounded to: what lies on the tile's edge stays exactly on it."""
+"""Decimals (of a metre) to which places are rounded: points on the tile's edge stay exactly on it."""
 
 
 @dataclass(frozen=True, eq=False)
 class MovingNurbs(Surface):
-    """A NURBS in space, where places stand for their parameters (u, v).
+    """A NURBS in space; its arguments are places that mean parameters (u, v).
 
-    `height` at a place is that of S(u, v), where u and v are affine in the place: a value of the paper's R^S,
-    not the height of the surface above the place. `moved` says where S(u, v) is in plan.
+    `height` at a place is the height of S(u, v), where u and v are affine in the place. It is a value of the
+    paper's R^S, not the height of the surface above the place. `moved` returns the place of S(u, v) in plan.
     """
 
     crs: str
@@ -46,9 +46,9 @@ class MovingNurbs(Surface):
     Y: Floats
     """Weight times northing of the control points from the origin, ``(m, n)``, m."""
     datum: float
-    """Height that heights in ``A`` are relative to (m)."""
+    """Datum of the heights in ``A`` (m)."""
     origin: tuple[float, float]
-    """Whole-metre (easting, northing) that ``X`` and ``Y`` are relative to."""
+    """Origin of ``X`` and ``Y``: whole-metre (easting, northing)."""
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return the heights (m) of S at the parameters of scattered places."""
@@ -76,7 +76,7 @@ class MovingNurbs(Surface):
 
 
 def moving(surface: NurbsSurface, uniform: bool = False) -> MovingNurbs:
-    """Return a surface with the same control heights and weights whose control points stay where they are.
+    """Return a surface with the same control heights and weights and fixed control points in plan.
 
     - `uniform`: whether the control points have equal distances in plan; else they are at the Greville
       abscissae, where S(u, v) with unit weights is at the place of (u, v).
@@ -94,14 +94,14 @@ def moving(surface: NurbsSurface, uniform: bool = False) -> MovingNurbs:
 
 
 Weights = tuple[float, Callable[[Floats], Floats], Callable[[Floats], Floats]]
-"""Weights without bounds by the variables of the fit: the variable of weight 1, the weights, their slopes."""
+"""Unbounded weights as functions of the fit's variables: the variable of weight 1, weights, slopes."""
 WEIGHTS: dict[str, Weights] = {
     "softplus": (
         math.log(math.e - 1), lambda s: np.logaddexp(0.0, s), lambda s: np.exp(-np.logaddexp(0.0, -s)),
     ),
     "unbounded": (1.0, np.asarray, np.ones_like),
 }  # fmt: skip
-"""By the names of the option ``weights``."""
+"""`Weights` by the value of the option ``weights``."""
 
 
 def loss_by_variables(objective: Objective, weights: Weights) -> Callable[[Floats], tuple[float, Floats]]:

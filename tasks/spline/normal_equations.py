@@ -1,18 +1,18 @@
 """Solve the normal equations of a tensor-product spline.
 
 The border of a tile is a long strip. If its control points are numbered across it, the matrix has few
-diagonals beside the main one, and `solve_banded` factorises this band. Others are solved by `Multigrid`,
-conjugate gradients with a multigrid cycle.
+diagonals beside the main diagonal, and `solve_banded` factorises this band. Other matrices are solved by
+`Multigrid`: conjugate gradients with a multigrid cycle.
 
-Where there are cells with a height, the matrix is well conditioned and a few Gauss-Seidel sweeps would do. In
-a void only the bending energy is left, a differential equation of fourth order over many control points,
-which sweeps alone solve slowly. So a cycle has coarser splines with every other knot, down to a few control
-points (Briggs, Henson and McCormick, "A multigrid tutorial", chapters 3 and 10). One sweep solves the
-equations of one line of control points after the other. The cycle is symmetric, down from the first line and
-back from the last, and therefore a preconditioner for conjugate gradients whatever the stiffnesses are.
+Where cells have a height, the matrix is well conditioned, and a few Gauss-Seidel sweeps would be enough. In a
+void only the bending energy is left: a differential equation of fourth order over many control points, which
+sweeps alone solve slowly. So a cycle has coarser splines with every other knot, down to a few control points
+(Briggs, Henson and McCormick, "A multigrid tutorial", chapters 3 and 10). One sweep solves the equations of
+one line of control points after the other. The cycle is symmetric, down from the first line and back from the
+last. Therefore it is a preconditioner for conjugate gradients for all stiffnesses.
 
-A function of the coarser spline is a sum of p + 2 functions of the finer one: function J is made of those
-from ``2 J - p`` to ``2 J + 1``, as far as they exist, along both axes.
+A function of the coarser spline is a sum of p + 2 functions of the finer spline: function J is made from the
+functions ``2 J - p`` to ``2 J + 1``, if they exist, along both axes.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ from flexroad.tasks.spline.stencil import (
 from flexroad.tasks.types import Bools, Floats
 
 WIDEST = 64
-"""Largest number of diagonals on one side of the main one: above, `Multigrid` is faster."""
+"""Largest number of diagonals on one side of the main diagonal: above it, `Multigrid` is faster."""
 RIDGE = 1e-9
-"""Share of the diagonal's mean that is added to it: undetermined control points then keep their height."""
+"""Share of the diagonal's mean that is added to it, so that undetermined control points keep their height."""
 
 COARSEST = 8
 """Splines with at most this many control points along an axis are not made coarser."""
 COARSEST_SWEEPS = 4
-"""Pairs of sweeps over the coarsest control points, which are then all but solved."""
+"""Pairs of sweeps over the coarsest control points, which then are nearly exact."""
 MAX_ITERATIONS = 300
 """Largest number of iterations for one system; it takes 3 to 20."""
 
 SMALLEST_M = 2e-5
-"""Changes of control heights below this (m) are not followed up."""
+"""Smallest change of control heights for a further iteration (m)."""
 
 Levels = NDArray[np.int64]
-"""Number of lines, their width, and the start of the level's lines and stencil in the buffers, per level."""
+"""For each level: number of lines, their width, and the start of its lines and stencil in the buffers."""
 
 
 def _undetermined(point: int) -> TaskError:
-    """Return the error that says which control point, counted from 1, the equations do not determine."""
+    """Return the error for a control point, counted from 1, that the equations do not determine."""
     return TaskError(
         f"control point {point} of the surface is undetermined; use fewer control points (a larger "
         "fit.spacing_m), or raise fit.bending_m3"
@@ -67,18 +67,18 @@ def _undetermined(point: int) -> TaskError:
 
 
 def is_narrow(shape: tuple[int, ...], degree: int) -> bool:
-    """Return whether a spline of so many control points is narrow enough for `solve_banded`."""
+    """Return whether a spline with this many control points is narrow enough for `solve_banded`."""
     return degree * (min(shape) + 1) <= WIDEST
 
 
 def solve_banded(stencil: Floats, right: Floats, held: Bools) -> Floats:
-    """Return the solution, exact up to rounding; the parameters are as of `Multigrid`."""
+    """Return the solution, exact up to rounding; the parameters are as in `Multigrid`."""
     (m, n), p = held.shape, stencil.shape[1] - 1
     free = (~held).astype(np.float64)
     band = np.zeros((m * n, p * (min(m, n) + 1) + 1))
     ridge = RIDGE * float(stencil[:, 0, 0, p : p + m].mean()) + 1e-300
     _to_band(stencil, free, ridge, band)
-    # Numbered from the south for a strip to the east, and from the west for one to the north.
+    # Points are numbered from the south in a strip to the east, and from the west in a strip to the north.
     order: Literal["C", "F"] = "F" if m <= n else "C"
     values = (from_lines(right, m, p) * free).ravel(order)
     factor, failed = scipy.linalg.lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
@@ -90,7 +90,7 @@ def solve_banded(stencil: Floats, right: Floats, held: Bools) -> Floats:
 
 @compiled(error_model="numpy")
 def _to_band(stencil: Floats, free: Floats, ridge: float, band: Floats) -> None:
-    """Write the main diagonal and those below it of the matrix, by columns, ``(points, diagonals)``.
+    """Write the main diagonal and the diagonals below it, by columns, ``(points, diagonals)``.
 
     Held points have the equation 0 = 0.
     """
@@ -115,7 +115,7 @@ def _to_band(stencil: Floats, free: Floats, ridge: float, band: Floats) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Multigrid:
-    """Splines over the same ground, each with every other knot of the one before."""
+    """Splines over the same ground; each has every other knot of the spline before."""
 
     degree: int
     held: Bools
@@ -128,8 +128,8 @@ class Multigrid:
         - `right` ``(n, width)``: the right-hand side.
         - `tolerance`: stop when an iteration changes no control height by more than this share of the
           largest.
-        - `refresh`: whether to compute the coarser matrices and not to use those of an earlier one that is
-          similar.
+        - `refresh`: whether to compute the coarser matrices, instead of using the coarser matrices of an
+          earlier, similar matrix.
         """
         stencils, bands, vectors, free = self._buffers
         stencils[: stencil.size] = stencil.ravel()
@@ -162,7 +162,7 @@ class Multigrid:
 
     @cached_property
     def _weights(self) -> Floats:
-        """A function of the coarser spline in functions of the finer one."""
+        """Factors of a function of the coarser spline in functions of the finer spline."""
         p = self.degree
         return np.array([comb(p + 1, k) / 2.0**p for k in range(p + 2)])
 
@@ -180,7 +180,7 @@ class Multigrid:
         return stencils, np.zeros((size, p + 1)), np.zeros((4, size)), free
 
     def _coarse_free(self, fine: Floats) -> Floats:
-        """Return 1 for functions of the coarser spline made of free functions alone, else 0."""
+        """Return 1 for functions of the coarser spline made only of free functions, else 0."""
         p = self.degree
         for axis in (0, 1):
             free = np.moveaxis(fine, axis, 0)
@@ -239,8 +239,9 @@ def _prepare(
 def _factor(stencil: Floats, free: Floats, band: Floats, lags: Lags) -> int:
     """Write the Cholesky factors of the equations of each line, ``(n, width, p + 1)``, to ``band``.
 
-    Element 0 is the inverse of the squared diagonal, the others are those of a factor with a unit diagonal.
-    Held points have the equation 0 = 0. The result is the number of a point with a pivot of at most 0, or 0.
+    Element 0 is the inverse of the squared diagonal. The other elements belong to a factor with a unit
+    diagonal. Held points have the equation 0 = 0. The result is the number of a point with a pivot of at most
+    0, or 0.
     """
     p = len(lags) - 1
     n, width = free.shape
@@ -266,7 +267,7 @@ def _factor(stencil: Floats, free: Floats, band: Floats, lags: Lags) -> int:
 def _solve_line(band: Floats, free: Floats, right: Floats, out: Floats, lags: Lags) -> None:
     """Write the solution of one line's equations to ``out``; ``right`` is overwritten."""
     p, width = len(lags) - 1, len(out)
-    # The last solutions are a tuple, which stays in registers: the next point waits for the one before it.
+    # The last solutions are a tuple, which stays in registers, because each point waits for the point before.
     last = lags[1:]
     for i in range(p, width - p):
         total = right[i] * free[i]
@@ -289,7 +290,7 @@ def _solve_line(band: Floats, free: Floats, right: Floats, out: Floats, lags: La
 def _sweep_down(
     stencil: Floats, band: Floats, free: Floats, right: Floats, x: Floats, whole: bool, lags: Lags
 ) -> None:
-    """Solve one line after the other from the first; ``whole`` is false if ``x`` is 0 before."""
+    """Solve one line after the other from the first; ``whole`` is False if ``x`` is 0 at the start."""
     work = np.zeros(x.shape[1])
     for j in range(len(x)):
         for i in range(len(work)):
@@ -326,7 +327,7 @@ def _cycle(
         y[:] = 0.0
         _sweep_down(stencil, band, is_free, b, y, False, lags)
         if level < last:
-            # After the sweep only what later lines contribute is left of the residual.
+            # After the sweep, the residual has only the contributions of later lines.
             for j in range(len(y)):
                 r[j] = 0.0
                 add_upper(stencil, y, j, -1.0, r[j], lags)
@@ -407,7 +408,7 @@ def _conjugate_gradients(
 
 @compiled(error_model="numpy", fused=True)
 def coarsen(fine: Floats, weights: Floats, coarse: Floats, lags: Lags) -> None:
-    """Write the matrix of the coarser spline, whose functions are sums of the finer one's, to ``coarse``."""
+    """Write the matrix of the coarser spline, whose functions are sums of finer functions, to ``coarse``."""
     p = len(lags) - 1
     n, width = fine.shape[0], fine.shape[3]
     half = np.zeros((len(lags), width))
@@ -437,7 +438,7 @@ def _coarsen_lines(half: Floats, weights: Floats, coarse: Floats, lags: Lags) ->
                 weight = weights[a] * weights[b]
                 ahead = 2 * K + b - a
                 apart = abs(ahead)
-                # Function i of a line is at i + p in it; the zeros at its ends stand for those beyond.
+                # Function i of a line is at i + p; the zeros at its ends replace functions beyond the ends.
                 for at in range(p, coarse.shape[1] - p):
                     low = 2 * (at - p) + a + min(ahead, 0)
                     if low >= p and low + apart < end:
@@ -449,7 +450,7 @@ def restrict(fine: Floats, weights: Floats, free: Floats, coarse: Floats, lags: 
     """Write the sums of ``fine`` over the functions of the coarser spline to ``coarse``."""
     p = len(lags) - 1
     n, width = fine.shape
-    # One longer, because the last function of the coarser line may reach over the end of the finer line.
+    # The line is longer by 1, as the last function of the coarser line may reach beyond the finer line.
     line = np.zeros(width + 1)
     for J in range(len(coarse)):
         line[:] = 0.0
@@ -471,7 +472,7 @@ def add_coarse(coarse: Floats, weights: Floats, free: Floats, fine: Floats, lags
     """Add the coarser spline ``coarse`` to ``fine``."""
     p = len(lags) - 1
     n, width = fine.shape
-    # The coarser line's functions may reach over the end of the finer line.
+    # The functions of the coarser line may reach beyond the end of the finer line.
     line = np.zeros(2 * coarse.shape[1] + p + 2)
     for J in range(len(coarse)):
         line[:] = 0.0

@@ -109,9 +109,9 @@ def _data_terms(
 ) -> float:  # fmt: skip
     """Return the road and terrain terms and add their gradient by A and W to ``by_a`` and ``by_w``.
 
-    The sums are separable: along u once per control row, then along v once per cell; the gradient is computed
+    The sums are separable: along u once per control row, then along v once per cell. The gradient is computed
     in the reverse order. Inner loops run over consecutive numbers, so that the compiler can use vector
-    instructions; ``taps`` are the indices of the functions along v, whose number it then knows.
+    instructions. ``taps`` are the indices of the functions along v: the compiler then knows their number.
     """
     rows, cols = target.shape
     a_u, w_u = _along_u(a, start_u, along_u), _along_u(w, start_u, along_u)
@@ -159,7 +159,7 @@ def _along_u(coefficients: Floats, start_u: Starts, along_u: Floats) -> Floats:
 
 @compiled()
 def _back_along_u(gradient: Floats, start_u: Starts, along_u: Floats, points: int) -> Floats:
-    """Return the gradient by the coefficients of `_along_u`, ``(m, points)``, from that by its result."""
+    """Return the gradient by the coefficients of `_along_u`, ``(m, points)``, from the gradient by sums."""
     columns = np.ascontiguousarray(gradient.T)
     out = np.zeros((points, columns.shape[1]))
     for c in range(start_u.size):

@@ -1,8 +1,8 @@
-"""The splines of a tile, the lattice of knots that tiles share, and the heights that a fit starts from.
+"""The splines of a tile, the lattice of knots that tiles share, and the start heights of a fit.
 
-Tiles of one size T have n intervals of T / n along each axis, so that every edge of a tile is a line of
+Tiles of one size T have n intervals of T / n along each axis. So every edge of a tile is a line of
 knots. A basis function of degree p has a support of p + 1 intervals. At a line exactly p functions are not
-zero, and what lies on either side of them has disjoint supports.
+zero. Other functions on its two sides have disjoint supports.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Lattice:
         return max(1, int(distance_m / u_m + 1e-9)), max(1, int(distance_m / v_m + 1e-9))
 
     def lines_over(self, distance_m: float) -> tuple[int, int]:
-        """Return the number of intervals that reach up to a distance or beyond it; at least 1."""
+        """Return the smallest number of intervals that are at least as long as a distance; at least 1."""
         u_m, v_m = self.unit_m
         return max(1, math.ceil(distance_m / u_m - 1e-9)), max(1, math.ceil(distance_m / v_m - 1e-9))
 
@@ -98,7 +98,7 @@ class Lattice:
         - `window`: (row, col) slices of the raster.
         """
         (width, height), (n, m) = self.cells, self.intervals
-        # Multiplied before the division, so that equal positions have equal parameters.
+        # The product is computed before the division, so that equal positions have equal parameters.
         along_u = (np.arange(shape[1]) - start[1] + 0.5) * n / width
         along_v = (start[0] - np.arange(shape[0]) - 0.5) * m / height
         cols, rows = _between(along_u, u), _between(along_v, v)
@@ -135,7 +135,7 @@ def clamped_space(grid: Grid, degree: int, points: tuple[int, int]) -> Space:
     """Return the splines over a grid's hull, with clamped uniform knots and parameters from 0 to 1."""
     if min(grid.shape) < 2:
         raise TaskError(f"a surface needs at least 2 x 2 cells, not {grid.width} x {grid.height}")
-    # Checked before arrays are allocated: a spacing in the wrong unit would need more memory than there is.
+    # This is checked before arrays are allocated: a spacing in the wrong unit would need too much memory.
     _check_enough(grid.width * grid.height, f"{grid.width} x {grid.height} cells", points)
     n, m = points
     west, south, east, north = grid.hull
@@ -182,11 +182,10 @@ def _check_enough(cells: int, name: str, points: tuple[int, int]) -> None:
 def start_heights(
     dsm: Floats, dtm: Floats, road: Bools, space: Space, terrain: bool = True
 ) -> tuple[Floats, float]:
-    """Return the control heights to start from, ``(m, n)`` with row 0 in the south, and their mean (m).
+    """Return the start heights of control points, ``(m, n)`` with row 0 in the south, and their mean (m).
 
-    With DTM support they are the DTM at the Greville abscissae, else the least-squares plane through the
-    road: the start may not depend on the DTM then. Without a road it is the plane through the DTM, since
-    there is nothing else.
+    With DTM support they are the DTM at the Greville abscissae. Otherwise they must not depend on the DTM,
+    and are the least-squares plane through the road. Without a road, only the plane through the DTM is left.
     """
     u, v = greville(space.knots_u, space.degree[0]), greville(space.knots_v, space.degree[1])
     cols = (u - space.u[0]) * ((len(space.u) - 1) / (space.u[-1] - space.u[0]))
@@ -210,8 +209,8 @@ def start_heights(
 def least_squares_plane(easting: Floats, northing: Floats, height: Floats) -> tuple[float, float, float]:
     """Return (c, a, b) of ``z = c + a * easting + b * northing`` with the least squared vertical error.
 
-    Points that do not span a plane (one point, points on a line) give the plane through them that is level in
-    the undetermined direction. Coordinates should be local, so that c keeps its digits.
+    If the points do not span a plane (one point, points on a line), the plane is level in the undetermined
+    direction. Coordinates should be local, so that c keeps its digits.
     """
     e, n, z = easting.mean(), northing.mean(), height.mean()
     (a, b), *_ = np.linalg.lstsq(np.column_stack([easting - e, northing - n]), height - z, rcond=1e-9)

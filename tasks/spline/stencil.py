@@ -1,14 +1,14 @@
 """The matrix of a tensor-product spline's quadratic form, kept as a stencil.
 
 Two basis functions overlap only if their indices differ by at most the degree p along both axes. The matrix
-is a sum over cells of products along u times products along v, so an element depends on the unordered pair
+is a sum over cells of products along u times products along v. So an element depends on the unordered pair
 of indices along each axis: ``(p + 1)^2`` numbers per control point are enough. ``S[j, l, k, i]`` is the
 element of functions j and j + l along u, and i and i + k along v.
 
-Control points are stored transposed, ``(n, width)``: one line per function along u, and in it the functions
-along v between ``p`` zeros on the left and at least as many on the right. Loops run along a line, so that
-the compiler can use vector instructions. Functions get the degree as a tuple of p + 1 zeros, ``lags``: its
-length is known when they are compiled, and short loops over it are unrolled.
+Control points are stored transposed, ``(n, width)``: a line for each function along u. A line has the
+functions along v between ``p`` zeros on the left and at least as many on the right. Loops run along a line,
+so that the compiler can use vector instructions. Functions get the degree as a tuple of p + 1 zeros,
+``lags``: its length is known at compile time, and short loops over it are unrolled.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Derivatives = tuple[Starts, tuple[Floats, Floats, Floats]]
 their first and second derivatives, ``(N, p + 1)`` each."""
 Lags = tuple[float, ...]
 VECTOR = 16
-"""Lines are a multiple of this long, besides the zeros at their ends, so that no loop has a remainder."""
+"""The length of lines without the zeros at their ends is a multiple of this: no loop has a remainder."""
 
 
 def line_width(points: int, degree: int) -> int:
@@ -69,7 +69,7 @@ def at_cells(
 def add_from_cells(
     cells: Floats, start_u: Starts, along_u: Floats, start_v: Starts, along_v: Floats, out: Floats
 ) -> None:
-    """Add the sums over the cells ``(H, W)`` times each basis function to ``out``, ``(n, width)``.
+    """Add the sums of the cells ``(H, W)`` times each basis function to ``out``, ``(n, width)``.
 
     It is the transpose of `at_cells`.
     """
@@ -92,7 +92,7 @@ def gram(
 
     - `weight` ``(H, W)``: weight of each cell.
     - `start_u`, `start_v` ``(W,)``: first basis function at each column and at each row.
-    - `along_u`, `along_v` ``(W, p + 1)``: basis functions there, or derivatives of them.
+    - `along_u`, `along_v` ``(W, p + 1)``: basis functions there, or their derivatives.
     - `stencil` ``(n, p + 1, p + 1, width)``: changed in place.
     """
     rows, cols = weight.shape
@@ -125,7 +125,7 @@ def _add_times(factor: float, values: Floats, out: Floats) -> None:
 
 @compiled(error_model="numpy", fused=True)
 def _store(sums: Floats, first: int, by_col: Floats) -> None:
-    """Add the sums of the rows in one span to those of each column, and set them to 0."""
+    """Add the sums of the rows in one span to the sums of each column, and set them to 0."""
     lags = sums.shape[0]
     for c in range(sums.shape[2]):
         for k in range(lags):
@@ -137,7 +137,8 @@ def _store(sums: Floats, first: int, by_col: Floats) -> None:
 @compiled(error_model="numpy", fused=True)
 def add_block(block: Floats, line: Floats, sign: float, out: Floats, lags: Lags) -> None:
     """Add ``sign`` times a stencil's part between two lines, ``(p + 1, width)``, times a line to ``out``."""
-    # Unsigned indices: numba lets signed ones count from the end, which no vector instruction can.
+    # Indices are unsigned: signed indices may count from the end in numba, which prevents vector
+    # instructions.
     p = np.uint64(len(lags) - 1)
     for i in range(p, np.uint64(len(line)) - p):
         total = block[np.uint64(0), i] * line[i]
@@ -148,14 +149,14 @@ def add_block(block: Floats, line: Floats, sign: float, out: Floats, lags: Lags)
 
 @compiled(error_model="numpy", fused=True)
 def add_lower(stencil: Floats, x: Floats, j: int, sign: float, out: Floats, lags: Lags) -> None:
-    """Add ``sign`` times what the lines before line j contribute to it to ``out``."""
+    """Add ``sign`` times the contribution of the lines before line j to ``out``."""
     for l in range(1, min(len(lags), j + 1)):  # noqa: E741
         add_block(stencil[j - l, l], x[j - l], sign, out, lags)
 
 
 @compiled(error_model="numpy", fused=True)
 def add_upper(stencil: Floats, x: Floats, j: int, sign: float, out: Floats, lags: Lags) -> None:
-    """Add ``sign`` times what the lines after line j contribute to it to ``out``."""
+    """Add ``sign`` times the contribution of the lines after line j to ``out``."""
     for l in range(1, min(len(lags), len(x) - j)):  # noqa: E741
         add_block(stencil[j, l], x[j + l], sign, out, lags)
 
@@ -173,8 +174,8 @@ def multiply(stencil: Floats, x: Floats, out: Floats, lags: Lags) -> None:
 def bending_energy(stiffness: Floats, space: Space) -> Floats:
     """Return the second derivatives of the bending energy by the control heights, as a stencil.
 
-    The energy is that of a thin plate of the surface's shape: ``E = sum over cells of stiffness *
-    (z_xx^2 + 2 z_xy^2 + z_yy^2)`` with derivatives per metre, so that it does not depend on the number of
+    It is the energy of a thin plate with the surface's shape: ``E = sum over cells of stiffness *
+    (z_xx^2 + 2 z_xy^2 + z_yy^2)``. Derivatives are per metre, so that it does not depend on the number of
     control points; it is 0 for planes. For control heights z it is ``z^T S z / 2``, with the gradient
     ``S z``.
 

@@ -2,7 +2,7 @@
 
 The spline is the road's surface, continued beside it. A cell beside the road has a step: the height of the
 ground there above the spline, by DSM or DTM. So both sides of a kerb have their own height, and the road
-stays smooth. On an edge between two tiles, both take the steps from the same `Edge`.
+stays smooth. On an edge between two tiles, both tiles use the steps of the same `Edge`.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ SAME_M = 0.25
 OPEN_M = 0.2
 """A DSM within this of the DTM (m) shows the ground, too."""
 ROUNDED = 0.1
-"""Share of the rise of the DTM across three cells by which it may be more, at a wall."""
+"""Share of the rise of the DTM across three cells that is added to this tolerance, for walls."""
 ALIKE_M = 0.1
 """Standard deviation of the weights of neighbouring cells by the difference of their steps (m)."""
 WALL_M = 0.5
-"""Where the DTM rises by this from cell to cell (m), the DSM is preferred to it, too. Where objects hide the
+"""Least rise of the DTM from cell to cell (m) at which the DSM is preferred, too. Where objects hide the
 ground, the DTM is preferred to smaller steps."""
 KERB_M = 2.0
-"""Distance from the road up to which the DSM is preferred (m): a DTM is smoothed there, across a kerb or a
-wall. Farther away the DTM is nearer to the ground than a DSM with grass and shrubs."""
+"""Distance from the road up to which the DSM is preferred (m): the DTM is smoothed there, across a kerb or a
+wall. Farther away the DTM is more accurate than a DSM with grass and shrubs."""
 ROUNDING_M = 1e-6
-"""Points this near to the border of a tile are on it (m)."""
+"""Points within this distance of the border of a tile are on it (m)."""
 HELD = 1e-9
-"""Weight of 0 in each cell without a value: parts that no known value touches become 0."""
+"""Weight of the value 0 in each cell without a value, so that parts that touch no known value become 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class SteppedSurface(NurbsSurface):
     """A spline, and the steps of cells above it; the slope and the normal are the spline's.
 
-    The border of a tile has steps of its own, which its neighbours have, too. In its corners the height is
-    the spline's. A surface over several tiles of one size also has the steps of the borders between them.
+    The border of a tile has its own steps, which its neighbours have, too. At its corners the steps are 0. A
+    surface over several tiles of one size also has the steps of the borders between them.
     """
 
     steps: NDArray[np.float32]
@@ -57,11 +57,11 @@ class SteppedSurface(NurbsSurface):
     cells: Grid
     """The cells of the steps."""
     south_north: NDArray[np.float32]
-    """Steps on the borders of tiles from the southern to the northern one, ``(rows of tiles + 1, W)``, m,
+    """Steps on the borders of tiles from the southern to the northern border, ``(rows of tiles + 1, W)``, m,
     from west to east."""
     west_east: NDArray[np.float32]
-    """Steps on those from the western to the eastern one, ``(columns of tiles + 1, H)``, m, from north
-    to south."""
+    """Steps on the borders from the western to the eastern border, ``(columns of tiles + 1, H)``, m, from
+    north to south."""
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in their broadcast shape."""
@@ -91,7 +91,7 @@ class SteppedSurface(NurbsSurface):
     def step(self, easting: Floats, northing: Floats) -> Floats:
         """Return the steps (m) at points, in their broadcast shape; 0 in corners and beyond the tile."""
         (west, south, east, north), cells = self.cells.exact_bounds, self.cells
-        # Two tiles count from edges that differ by rounding, and must find the same cell along their border.
+        # Edges of two tiles may differ by rounding, but both must find the same cell along their border.
         nudge = ROUNDING_M
         row, col = cells.cells(np.asarray(easting) + nudge, np.asarray(northing) - nudge)
         row_of, on_row, across_rows = _borders(northing, np.linspace(south, north, len(self.south_north)))
@@ -105,14 +105,14 @@ class SteppedSurface(NurbsSurface):
 
 
 def without_steps(surface: Surface) -> Surface:
-    """Return the spline of a surface with steps; others are returned as they are."""
+    """Return the spline of a surface with steps; other surfaces are returned unchanged."""
     if not isinstance(surface, SteppedSurface):
         return surface
     return NurbsSurface(**{field.name: getattr(surface, field.name) for field in fields(NurbsSurface)})
 
 
 def _borders(values: Floats, borders: Floats) -> tuple[NDArray[np.intp], Bools, Bools]:
-    """Return the nearest border of each value, whether it is on it, and whether it is between two."""
+    """Return the nearest border of each value, and whether the value is on a border, or between two."""
     nearest = np.searchsorted((borders[:-1] + borders[1:]) / 2, values)
     on = np.abs(values - borders[nearest]) <= ROUNDING_M
     return nearest, on, ~on & (values > borders[0]) & (values < borders[-1])
@@ -121,9 +121,9 @@ def _borders(values: Floats, borders: Floats) -> tuple[NDArray[np.intp], Bools, 
 def with_steps(
     data: TileData, clusters: RoadClusters, surface: NurbsSurface, frame: Frame | None
 ) -> NurbsSurface:
-    """Return a tile's surface with the steps of the cells beside its streets, if the filter gives such cells.
+    """Return a tile's surface with steps in the cells beside streets that the filter gives.
 
-    Without a frame there are no steps on the border. A surface that can have steps must have none yet.
+    Without a frame there are no steps on the border. The given surface must not have steps yet.
     """
     if clusters.beside is None:
         return surface
@@ -146,9 +146,9 @@ def _cell_steps(
 ) -> NDArray[np.float32]:
     """Return the steps of the cells beside streets, ``(H, W)``, m, on the tile's core.
 
-    A cell has the height of its DSM if that shows the ground, averaged with the neighbours whose steps are
-    alike, so that edges remain. Behind an object it has the height of the wall around, if there is one; else
-    that of its DTM, or, without DTM, a step between those around.
+    If the DSM of a cell shows the ground, its height is averaged with neighbours whose steps are alike, so
+    that edges remain. Behind an object a cell has the height of the wall around, if there is a wall, else of
+    its DTM. Without a DTM its step lies between the steps around.
     """
     core, window = data.core, data.grid.window(data.core)
     cells, dtm, dsm = beside[window], data.dtm[window], ground_heights(data, clusters).dsm[window]
@@ -158,7 +158,7 @@ def _cell_steps(
     dsm, dtm = np.where(cells & preferred, dsm, np.nan), np.where(cells, dtm, np.nan)
     spline = surface.lattice(core.eastings, core.northings)
     rise, smoothed = dsm - spline, dtm - spline
-    # The DTM is smoothed: beside a wall it has not reached the full height of the ground above or below it.
+    # The DTM is smoothed: beside a wall it does not reach the full height of the ground above or below.
     low, high = _around_dtm(dtm)
     reach = OPEN_M + ROUNDED * np.maximum(high - low, 0.0)
     away = np.minimum(np.abs(dsm - low), np.abs(dsm - high))
@@ -174,10 +174,10 @@ def _cell_steps(
 
 
 def _alike(around: Floats, own: Floats) -> Floats:
-    """Return the means of steps and of the steps around that are alike, ``(n,)``, m.
+    """Return the means of steps with similar steps around, ``(n,)``, m.
 
     - `around` ``(n, 9)``: steps of the cell and its neighbours; NaN where the DSM does not show them.
-    - `own` ``(n,)``: those of the cell.
+    - `own` ``(n,)``: the step of the cell.
     """
     weights = np.where(np.isfinite(around), np.exp(-0.5 * ((around - own[:, None]) / ALIKE_M) ** 2), 0.0)
     return np.asarray((weights * np.nan_to_num(around)).sum(axis=1) / weights.sum(axis=1))
@@ -199,7 +199,7 @@ def _around(values: Floats, cells: Bools) -> Floats:
 def _walls(around: Floats, smoothed: Floats) -> Floats:
     """Return the steps of hidden cells, ``(n,)``, m: the median of the known steps around, or 0.
 
-    A smoothed step is half as high at the wall as behind it, so that the DTM tells the side of the wall.
+    A smoothed step is half as high at the wall as behind it, so that the DTM shows the side of the wall.
 
     - `around` ``(n, 9)``: steps of the cell and its neighbours; NaN where hidden.
     - `smoothed` ``(n,)``: the DTM above the spline.
@@ -211,15 +211,15 @@ def _walls(around: Floats, smoothed: Floats) -> Floats:
 
 
 def between(values: Floats, cells: Bools) -> Floats:
-    """Return values with those that are NaN filled: each is the mean of its neighbours among the cells.
+    """Return values with NaN filled: each filled value is the mean of its neighbours among the cells.
 
     - `values` ``(H, W)``: NaN only in the given cells.
-    - `cells` ``(H, W)``: the other cells count as insulated: their values have no effect.
+    - `cells` ``(H, W)``: values of other cells have no effect.
     """
     unknown = cells & np.isnan(values)
     if not unknown.any():
         return values
-    # With a rim of other cells, every cell has four neighbours.
+    # With a rim around the array, every cell has four neighbours.
     given, cells, unknown = np.pad(values, 1), np.pad(cells, 1), np.pad(unknown, 1)
     row, col = np.nonzero(unknown)
     number = np.full(given.shape, -1)
@@ -252,15 +252,15 @@ def border_steps(
 ) -> dict[str, Floats]:
     """Return ``steps`` and ``road_m`` of an `Edge`; empty if the filter gives no cells beside streets.
 
-    A step is the mean of those of the two cells beside the edge, so that the ground goes on across it. It is
-    0 where one of the two has none: the edge of a road is not moved.
+    A step is the mean step of the two cells beside the edge, so that the ground continues across it. It is 0
+    where one of the two cells has no step: the edge of a road is not moved.
 
     - `data`, `road`, `clusters`: the cells around the edge, their road mask and the filtered road.
     - `spline`: the spline around the edge; NaN if there is no ground.
     """
     if clusters.beside is None or np.isnan(spline.A).any():
         return {}
-    # As much ground as decides on the steps of the cells beside the edge.
+    # This is the ground on which the steps of the cells beside the edge depend.
     window, strip = border.strip(math.ceil(KERB_M / data.grid.cell) + 1)
     grid, heights = strip.grid, ground_heights(data, clusters)
     part = TileData(data.tile_id, grid, grid, heights.dsm[window], heights.dtm[window])

@@ -1,10 +1,9 @@
 """NURBS surfaces over a tile (the paper's step C, section "Surface Fitting", Eqs. nurbs and cox_de_boor).
 
-The surface is a graph: easting is affine in u, northing in v, and the height is the rational spline
-``z(u, v) = datum + A(u, v) / W(u, v)`` with the coefficients ``A = weight * (height - datum)`` and
-``W = weight``. Coefficient arrays are ``(m, n)``: row i belongs to the i-th basis function along v, so
-**row 0 is in the south** (rasters have row 0 in the north), column j to the j-th along u, from west to
-east.
+The surface is a graph: easting is affine in u, northing in v, and the height is the rational spline ``z(u, v)
+= datum + A(u, v) / W(u, v)`` with the coefficients ``A = weight * (height - datum)`` and ``W = weight``.
+Coefficient arrays are ``(m, n)``. Row i belongs to the i-th basis function along v, so **row 0 is in the
+south** (rasters have row 0 in the north). Column j belongs to the j-th function along u, from west to east.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ SplineOf = Callable[..., Floats]
 """The spline of coefficients at given places; with ``du=1`` or ``dv=1`` its first derivative along u or v."""
 
 KEPT = 16
-"""Number of axes whose basis functions are kept: tiles, corners and edges have few different ones."""
+"""Number of axes whose basis functions are kept: tiles, corners and edges have few different axes."""
 
 MAX_LOG_WEIGHT = math.log(10)
 """Bound on abs(ln w). Unbounded weights became negative on real streets, which gives the surface poles."""
 
 
 def clamped_knots(points: int, degree: int) -> Floats:
-    """Return uniform knots on [0, 1] with ``degree + 1`` equal ones per end, ``(points + degree + 1,)``."""
+    """Return uniform knots on [0, 1] with ``degree + 1`` equal knots per end, ``(points + degree + 1,)``."""
     if not 1 <= degree < points:
         raise ValueError(f"degree {degree} needs at least {degree + 1} control points, not {points}")
     inner = np.linspace(0.0, 1.0, points - degree + 1)
@@ -74,8 +73,8 @@ def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats
     span = np.clip(np.searchsorted(knots, u, side="right") - 1, degree, last)
     values = share = np.ones((len(u), 1))
     for k in range(1, degree + 1):
-        # Each function of degree k - 1 adds a rising part to one of degree k and a falling part to its left
-        # neighbour. Its support contains the span, which is not empty, so the divisor is positive.
+        # Each function of degree k - 1 adds a rising part to a function of degree k, and a falling part to
+        # its left neighbour. Its support contains the span, which is not empty, so the divisor is positive.
         i = span + np.arange(1 - k, 1)
         left, right = knots[i], knots[i + k]
         share = values / (right - left)
@@ -133,9 +132,9 @@ class NurbsSurface(Surface):
     W: Floats
     """Weights, ``(m, n)``, positive; row 0 in the south."""
     datum: float
-    """Height that heights in ``A`` are relative to (m)."""
+    """Datum of the heights in ``A`` (m)."""
     origin: tuple[float, float]
-    """Whole-metre (easting, northing) near the south-west that exported coordinates are relative to."""
+    """Origin of exported coordinates: whole-metre (easting, northing) near the south-west."""
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in their broadcast shape."""
@@ -146,7 +145,7 @@ class NurbsSurface(Surface):
     def lattice(self, eastings: Floats, northings: Floats) -> Floats:
         """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
         if np.isnan(self.A).any():
-            # A surface over tiles of which one is missing: in sums over all points NaN would be everywhere.
+            # A surface over several tiles may lack a tile: sums over all points would then be NaN everywhere.
             return NurbsSurface.height(self, np.asarray(eastings), np.asarray(northings)[:, None])
         u, v = self._parameters(eastings, northings)
         inside_u, inside_v = self._clipped(u, v)
@@ -161,7 +160,7 @@ class NurbsSurface(Surface):
     def slope(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
         """Return the derivatives of the height by easting and by northing (m/m) at scattered points.
 
-        Beyond the domain, those of the nearest domain point.
+        Beyond the domain, the derivatives at the nearest domain point are returned.
         """
         shape, (u, v) = self._scattered(easting, northing)
         _, by_u, by_v = self._taylor(self._at_points(*self._clipped(u, v)))
@@ -198,7 +197,7 @@ class NurbsSurface(Surface):
     def _parameters(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
         west, south, east, north = self.bounds
         (low_u, high_u), (low_v, high_v) = self._domain
-        # Multiplied before the division: the edges of a tile are then exactly on their knots.
+        # The product is computed before the division: the edges of a tile are then exactly on their knots.
         u = low_u + (np.asarray(easting) - west) * (high_u - low_u) / (east - west)
         return u, low_v + (np.asarray(northing) - south) * (high_v - low_v) / (north - south)
 
@@ -253,7 +252,7 @@ def _contract(
 
 @dataclass(frozen=True, eq=False)
 class ExactNurbs:
-    """The same surface as a NURBS with control points in space, the form that other programs read."""
+    """A surface as a NURBS with control points in space, the form that other programs read."""
 
     degree: tuple[int, int]
     """Degree along u (easting) and v (northing)."""
@@ -262,7 +261,7 @@ class ExactNurbs:
     points: Floats
     """Control points, ``(m', n', 4)``: x, y (m from `origin`), z (height, m), weight; row 0 in the south."""
     origin: tuple[float, float]
-    """Whole-metre (easting, northing) that x and y are relative to."""
+    """Origin of x and y: whole-metre (easting, northing)."""
 
 
 def exact(surface: NurbsSurface) -> ExactNurbs:

@@ -1,7 +1,12 @@
+"""Parts of meshes by class and level, and normals at their vertices."""
+
 from dataclasses import replace
 
 import numpy as np
+import trimesh
 
+from flexroad.tasks.meshing.normals import vertex_normals
+from flexroad.tasks.meshing.triangulate import delaunay
 from flexroad.tasks.sample import with_levels
 from flexroad.tasks.types import Mesh
 
@@ -14,9 +19,6 @@ def test_part_has_the_same_triangles_and_only_their_vertices():
     used, corners = MESH.part(MESH.road)
     np.testing.assert_array_equal(used, [0, 2, 3])
     np.testing.assert_array_equal(VERTICES[used][corners], VERTICES[FACES[MESH.road]])
-
-
-def test_part_without_faces_is_empty():
     used, corners = MESH.part(np.zeros(3, bool))
     assert (used.shape, corners.shape) == ((0,), (0, 3))
 
@@ -37,9 +39,21 @@ def test_meshes_of_levels_as_one_can_be_taken_apart():
             own.vertices[own.faces] + own.origin, mesh.vertices[mesh.faces] + mesh.origin
         )
         np.testing.assert_array_equal(own.road, mesh.road)
-
-
-def test_mesh_without_levels_is_that_of_level_0():
+    # A mesh without levels is level 0.
     assert with_levels({0: MESH}) is MESH
     assert MESH.numbers == (0,)
     assert MESH.at(0) is MESH
+
+
+def test_normals_equal_those_of_trimesh():
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0, 10, (300, 3))
+    faces = delaunay(points)
+    truth = trimesh.Trimesh(points, faces, process=False).vertex_normals
+    np.testing.assert_allclose(vertex_normals(points, faces), truth, atol=1e-9)
+
+
+def test_vertex_of_lines_only_looks_up():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 5, 5]])
+    normals = vertex_normals(points, np.array([[0, 1, 2]], np.int32))
+    np.testing.assert_array_equal(normals, np.tile([0.0, 0.0, 1.0], (4, 1)))

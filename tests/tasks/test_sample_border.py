@@ -148,14 +148,6 @@ def test_faces_along_border_inside_survey_are_kept_on_both_sides():
     assert (whole.uses[in_void] == 1).any()
 
 
-def test_border_beyond_survey_ends_mesh():
-    rng = np.random.default_rng(0)
-    tiles = block(rng, 1.0, (100, 100), 0.3, inside=False)
-    first = {(0, 0): tiles[0, 0]}
-    (mesh,) = meshes(first, rng, Options(), lambda easting, northing: easting > WEST + 60)
-    assert mesh.vertices[:, 0].max() < 80
-
-
 SURVEYS = {
     "slanted": lambda x, y: y - SOUTH > 20.3 + 0.45 * (x - WEST),
     "shallow": lambda x, y: y - SOUTH > 98.4 + 0.02 * (x - WEST),

@@ -1,7 +1,7 @@
 """The head on DINOv2 and its file: a linear map and its metadata.
 
-The file is safetensors: the arrays ``weight`` and ``bias``, and `About` as JSON in its metadata. It may come
-from others: sizes are checked before arrays are read, and values before they are used.
+The file is safetensors: the arrays ``weight`` and ``bias``, and `About` as JSON in its metadata. Its source
+may be untrusted: sizes are checked before arrays are read, and values before they are used.
 """
 
 from __future__ import annotations

@@ -37,11 +37,11 @@ OVERLAP = 0.25
 BATCH = 4
 """Windows per batch; more are not faster on a CPU and need more memory."""
 TIE_M = 1e-6
-"""Shift of the cell centres to the south-east: of pixels equally near, every tile takes the same one."""
+"""Shift of the cell centres to the south-east, so that all tiles choose the same of equally near pixels."""
 
 
 class Options(options.Options):
-    """Model and cleanup. The size of the windows and the threshold are those of the head."""
+    """Model and cleanup. The head defines the size of the windows and the threshold."""
 
     method: Literal["dinov2"] = "dinov2"
     model: Path = Field(description="file of the head, made by `flexroad train CATALOG`")
@@ -52,13 +52,13 @@ class Options(options.Options):
     half: bool = Field(False, description="half precision: float16 on a GPU, bfloat16 on the CPU")
     cleanup: Cleanup = Field(
         "pieces",
-        description="pieces: close gaps up to 2 m wide, fill holes up to 10 m2, drop pieces below 25 m2; "
-        "corridor: first drop what is over 5 m from the catalog's roads; none: the mask as predicted",
+        description="pieces: close gaps up to 2 m wide, fill holes up to 10 m2, drop pieces below 25 m2. "
+        "corridor: first drop cells over 5 m from the catalog's roads; none: the mask as predicted",
     )
 
 
 def files(options: Options) -> tuple[Path, ...]:
-    """Return the files that the result depends on besides the tile: the head and a local backbone."""
+    """Return the files besides the tile on which the result depends: the head and a local backbone."""
     folder = Path(options.backbone).expanduser() if options.backbone else None
     local = (
         (folder / "config.json", *sorted(folder.glob("*.safetensors"))) if folder and folder.is_dir() else ()
@@ -69,8 +69,8 @@ def files(options: Options) -> tuple[Path, ...]:
 def segment(data: TileData, options: Options) -> RoadMask:
     """Return the road mask predicted from the orthophoto.
 
-    Windows lie on a lattice fixed to the ground and extend beyond the tile and its halo where the photo does,
-    so neighbouring tiles agree along their common edge.
+    Windows lie on a lattice fixed to the ground and extend beyond the tile and its halo where the photo does.
+    So neighbouring tiles agree along their common edge.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 Windows lie on a lattice fixed to the ground, not to the tile: neighbouring tiles use the same windows along
 their common edge, and results do not depend on the tiling. The weight of a window falls towards its sides
-as a raised cosine over the overlap, so that the weights of all windows at a pixel sum to one.
+as a raised cosine over the overlap. So the weights of all windows at a pixel sum to one.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Corner = tuple[int, int]
 
 
 def cover(grid: Grid, gsd_m: float, size: int, overlap: int = 0) -> Grid:
-    """Return the pixel grid of all windows that overlap a grid; it consists of whole windows.
+    """Return the pixel grid of all windows that overlap a grid; it consists of complete windows.
 
     - `grid`: the area to cover; the windows extend beyond it by up to ``size`` pixels.
     - `gsd_m`: size of the windows' pixels (m).
-    - `size`, `overlap`: side of a window, and its overlap with the next one (pixels).
+    - `size`, `overlap`: side of a window, and its overlap with the next window (pixels).
     """
     step, side = (size - overlap) * gsd_m, size * gsd_m
     first, last = math.floor((grid.west - side) / step) + 1, math.ceil(grid.east / step) - 1
@@ -39,7 +39,7 @@ def cover(grid: Grid, gsd_m: float, size: int, overlap: int = 0) -> Grid:
 
 
 def corners(shape: tuple[int, int], size: int, overlap: int = 0) -> Iterator[Corner]:
-    """Yield the corners of the windows of an image that consists of whole windows, row by row."""
+    """Yield the corners of the windows of an image that consists of complete windows, row by row."""
     for row in range(0, shape[0] - size + 1, size - overlap):
         for col in range(0, shape[1] - size + 1, size - overlap):
             yield row, col
@@ -64,8 +64,8 @@ def blend(
     """Return the weighted mean of the windows' predictions, ``(h, w)``.
 
     - `predict`: called with ``batch`` windows at a time, the last time with fewer.
-    - `image`: consists of whole windows, see `cover`.
-    - `valid`: pixels with data; windows without any are skipped and count as 0.
+    - `image`: consists of complete windows, see `cover`.
+    - `valid`: pixels with data; windows without data are skipped and have the value 0.
     - `size`, `overlap`: as in `cover` (pixels).
     - `batch`: windows per call of ``predict``.
 

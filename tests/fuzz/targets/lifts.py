@@ -26,23 +26,8 @@ PARAMETRIC = (
 HEADER = '<geoReference><![CDATA[+proj=utm +zone=32]]></geoReference><offset x="1" y="2" z="3" hdg="0"/>'
 
 VALUES = (
-    "nan",
-    "inf",
-    "-1",
-    "0",
-    "1e308",
-    "-1e-300",
-    "",
-    "x",
-    "9" * 400,
-    "&#0;",
-    "&lt;&quot;",
-    "50000",
-    "1e5",
-    "-0.5",
-    "../../a",
-    "true",
-    "arcLength",
+    *"nan inf -1 0 1e308 -1e-300 x 50000 1e5 -0.5 ../../a true arcLength &#0; &lt;&quot;".split(),
+    *("", "9" * 400),
 )
 
 

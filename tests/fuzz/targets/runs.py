@@ -16,13 +16,8 @@ from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tools.results.run import open_run
 from flexroad.tools.synthetic.scenes import write_scenes
+from tests.builders import LIGHT
 
-LIGHT = {
-    "extends": "defaults",
-    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
-    "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
-    "cluster": {"flush": False},
-}
 EXPECTED = "expected"
 NOT_DAMAGED = ("config.yaml", "lock.json", "failures.csv", "log.jsonl", "tiles.geojson")
 """Files that users may edit, that are written by every run, or that only people read."""
@@ -67,7 +62,7 @@ def read(path: Path) -> None:
 
 def _run(root: Path) -> Run:
     catalog = Catalog.read(root / "survey" / "catalog.parquet")
-    run = Run.create(root / "run", compose(LIGHT, "light"), catalog)
+    run = Run.create(root / "run", compose(LIGHT | {"cluster": {"flush": False}}, "light"), catalog)
     counts = run_tiles(run, SerialExecutor(), verify=True)
     assert counts.done == len(catalog.tiles), counts
     return run

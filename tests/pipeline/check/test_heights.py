@@ -48,7 +48,7 @@ def found(tiles):
         (PLANE + 20 * EAST, "the DSM lies 20.0 m above the DTM on 1 of 2 tiles: ellipsoidal heights?"),
         (
             PLANE / 0.3048,
-            "the heights of the DSM are 3.28 times those of the DTM on 2 of 2 tiles: "
+            "the heights of the DSM are 3.28 times the DTM heights on 2 of 2 tiles: "
             "the DSM in feet, the DTM in metres?",
         ),
     ],

@@ -137,29 +137,20 @@ def test_lift_names_features_over_heap(run, flexroad, tmp_path):
     assert [RAISED in row["flags"] for row in rows] == [True, False]
 
 
-@pytest.mark.parametrize("form", ["crg", "xodr", "lines"])
-def test_export_names_roads_over_heap(run, flexroad, tmp_path, form):
-    out = tmp_path / "out"
-    words = ["--roads", lines(tmp_path), "--format", form, "-o", out, "--workers", 1]
+def test_export_and_lift_of_opendrive_name_roads_over_heap(run, flexroad, tmp_path):
+    out, report, forms = tmp_path / "out", tmp_path / "report.csv", ("crg", "xodr", "lines")
+    words = ["--roads", lines(tmp_path), "--format", ",".join(forms), "-o", out, "--workers", 1]
     said = flexroad("export", run, *words).expected(0)
-    assert f"note: {form}: 1 road passes flagged places (1000: " in said.err
-    entry = json.loads((out / "export.json").read_text())["formats"][form]
-    assert list(entry["flagged_roads"]) == ["1000"]
-    if form == "lines":
-        table = geopandas.read_file(next((out / form).glob("*.gpkg")), layer="roads")
-    else:
-        table = pd.read_csv(out / form / "roads.csv", keep_default_na=False)
-    assert [RAISED in names for names in table["flags"]] == [True, False]
-
-
-def test_lifted_opendrive_names_road_over_heap(run, flexroad, tmp_path):
-    out = tmp_path / "out"
-    words = ["--roads", lines(tmp_path), "--format", "xodr", "-o", out, "--workers", 1]
-    flexroad("export", run, *words).expected(0)
-    source, report = next((out / "xodr").glob("*.xodr")), tmp_path / "report.csv"
+    entries = json.loads((out / "export.json").read_text())["formats"]
+    for form in forms:
+        assert f"note: {form}: 1 road passes flagged places (1000: " in said.err
+        assert list(entries[form]["flagged_roads"]) == ["1000"]
+    (source,), (package,) = (out / "xodr").glob("*.xodr"), (out / "lines").glob("*.gpkg")
     flexroad("lift", source, run, "-o", tmp_path / "x.xodr", "--report", report).expected(0)
-    rows = list(csv.DictReader(report.open()))
-    assert [RAISED in row["flags"] for row in rows] == [True, False]
+    tables = [out / "crg" / "roads.csv", out / "xodr" / "roads.csv", report]
+    columns = [pd.read_csv(table, keep_default_na=False)["flags"] for table in tables]
+    for names in (*columns, geopandas.read_file(package, layer="roads")["flags"]):
+        assert [RAISED in name for name in names] == [True, False]
 
 
 def test_flags_of_tile_with_changed_sources_are_the_last_ones_or_unknown(run, flexroad):

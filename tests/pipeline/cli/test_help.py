@@ -44,7 +44,7 @@ ARGUMENTS = {"RUN", "CATALOG", "FOLDER", PACKED, "ROOT", "FILE", "INPUT", "NAME|
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_help_has_the_same_words_for_values_in_all_commands(words):
+def test_help_says_what_each_option_takes_with_the_same_words(words, monkeypatch):
     for param in COMMANDS[words].params:
         if param.param_type_name == "argument":
             assert param.metavar in ARGUMENTS, param.name
@@ -56,10 +56,6 @@ def test_help_has_the_same_words_for_values_in_all_commands(words):
         else:
             # A flag has no value, and a choice lists its values.
             assert param.is_flag or "|" in param.display_type_rich(None), param.name
-
-
-@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_help_says_what_each_option_takes(words, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     command = COMMANDS[words]
     page = command.get_help(command.make_context(words[-1], [], resilient_parsing=True))
@@ -122,3 +118,20 @@ def test_option_with_other_value_names_the_valid_ones(flexroad, words, message):
     said = flexroad(*words.split()).expected(2)
     assert f"Invalid value for '{words.split()[-2]}'" in said.err
     assert message in said.err
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("run --tile a b --out x", {"tile": ["a", "b"], "out": Path("x")}),
+        # Of tiles west of a CRS's origin the ids begin with a minus.
+        ("run --tile -500_250 -750_-250 0_-250", {"tile": ["-500_250", "-750_-250", "0_-250"]}),
+        ("catalog rasters root --road-value 1 -3 -o c", {"road_value": [1, -3], "root": Path("root")}),
+        ("rerun --tile a RUN", {"tile": ["a"], "path": Path("RUN")}),
+    ],
+)
+def test_repeatable_option_takes_several_values(words, expected):
+    split = tuple(words.split())
+    name = next(name for name in COMMANDS if split[: len(name)] == name)
+    context = COMMANDS[name].make_context(name[-1], [*split[len(name) :]], resilient_parsing=True)
+    assert {key: context.params[key] for key in expected} == expected

@@ -4,7 +4,6 @@ import shlex
 
 import numpy as np
 import pytest
-import yaml
 from rasterio.warp import transform
 from shapely import box
 
@@ -80,14 +79,8 @@ def test_catalog_of_feet_and_another_zone_runs_with_reproject(rasters, flexroad,
     feet = np.full((100, 100), 300, np.float32)
     write(rasters / "us" / "dsm.tif", feet, 985_000, 200_000, cell=3, crs="EPSG:2263", unit="foot_us")
     west, north = transform("EPSG:2263", "EPSG:32618", [985_000], [200_000])
-    write(
-        rasters / "us" / "dtm.tif",
-        np.full((160, 160), 91.44, np.float32),
-        west[0] - 30,
-        north[0] + 30,
-        crs="EPSG:32618",
-        unit="m",
-    )
+    place = {"west": west[0] - 30, "north": north[0] + 30, "crs": "EPSG:32618", "unit": "m"}
+    write(rasters / "us" / "dtm.tif", np.full((160, 160), 91.44, np.float32), **place)
     west, north = transform("EPSG:2263", "EPSG:4269", [985_000], [200_000])
     road = (abs(np.arange(100) - 50) < 10).astype(np.uint8)[:, None].repeat(100, 1)
     write(rasters / "us" / "mask.tif", road, west[0], north[0], cell=1e-5, crs="EPSG:4269")
@@ -106,21 +99,6 @@ def test_catalog_without_roads_says_what_a_run_lacks(rasters, flexroad, tmp_path
     line = made(flexroad, rasters, "bare.parquet")
     assert line.startswith("before a run: production: no tile of the catalog has a road mask")
     assert "--roads for vectors" in line
-
-
-def test_catalog_with_own_layout_next_line_names_it(rasters, flexroad, tmp_path, quick_config):
-    layers = {"dsm": "{tile}.tif", "dtm": "ground/{tile}.tif", "road_mask": "masks/{tile}.tif"}
-    layout = tmp_path / "my layout.yaml"
-    layout.write_text(
-        yaml.safe_dump(yaml.safe_load(quick_config.read_text()) | {"dataset": {"layers": layers}})
-    )
-    for name, folder in (("dtm", "ground"), ("mask", "masks")):
-        (rasters / folder).mkdir()
-        (rasters / f"{name}.tif").rename(rasters / folder / "dsm.tif")
-    said = flexroad("catalog", "dsc3d", rasters, "-o", "c.parquet", "--layout", layout).expected(0)
-    arguments = shlex.split(said.out.splitlines()[-1].removeprefix("next: flexroad "))
-    assert arguments[:3] == ["run", "--config", str(layout)]
-    assert "1 tile: 1 done" in flexroad(*arguments, "--executor", "serial").expected(0).out
 
 
 def test_next_line_after_scenes_with_decks_uses_their_levels(flexroad, tmp_path, monkeypatch):

@@ -1,45 +1,32 @@
-"""Nightly operation: repeated runs, exit codes of failures, clean."""
+"""Commands on runs: output and exit codes, repeated runs, refused runs, clean."""
 
 import errno
 import json
-import os
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
+import rasterio
 import yaml
 
-from flexroad.catalog import Catalog, Layer
+from flexroad.catalog import Catalog
 from flexroad.catalog.storage import paths
-from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.run import record
 from flexroad.pipeline.run.finished import surface_and_road
-from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.store.records import dump_checked, load_checked
-from tests.command_line import same_signals
+from flexroad.pipeline.run.sampler import RunSampler
+from flexroad.pipeline.store.tables import read_metrics
+from tests.builders import LIGHT
+from tests.command_line import call, process
 
 QUICK = "extends: defaults\nfit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}\n"
 
 
-@pytest.fixture
-def flexroad(monkeypatch, capfd):
-    """Run a command line; check its exit code, return standard output and standard error."""
-
-    def call(*words, expect: int = 0) -> str:
-        monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
-        code = 0
-        try:
-            with same_signals():
-                main()
-        except SystemExit as exit_:
-            code = exit_.code or 0
-        out, err = capfd.readouterr()
-        assert code == expect, out + err
-        return out + err
-
-    return call
+def flexroad(*words, expect: int = 0) -> str:
+    """Return the output of a command, with its lines on standard error."""
+    said = call(*words).expected(expect)
+    return said.out + said.err
 
 
 @pytest.fixture
@@ -50,64 +37,21 @@ def nightly(survey, tmp_path) -> list:
     return ["run", "--config", config, "--catalog", survey, "--out", tmp_path / "run", "--executor", "serial"]
 
 
-def test_run_repeated_counts_new_changed_and_vanished(flexroad, nightly, survey, tmp_path):
-    whole = Catalog.read(survey)
-    Catalog(whole.tiles[:3]).write(survey)
-    said = flexroad(*nightly)
-    assert "3 tiles: 3 done (0 cached), 0 failed, 0 pending; 3 new, 0 changed, 0 vanished; " in said
-    Catalog(whole.tiles[1:]).write(survey)
-    os.utime(whole.tiles[1].paths(whole.tiles[1].layer("dsm"))[0], (1, 1))
-    said = flexroad(*nightly)
-    assert "3 tiles: 3 done (1 cached), 0 failed, 0 pending; 1 new, 1 changed, 1 vanished; " in said
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert (summary["exit_code"], summary["new"], summary["cached"]) == (0, 1, 1)
-    # Same size, but not the checksum in item.json.
-    product = next((tmp_path / "run" / "tiles" / whole.tiles[2].id).glob("*.glb"))
-    data = bytearray(product.read_bytes())
-    data[-1] ^= 1
-    product.write_bytes(data)
-    assert "3 done (3 cached)" in flexroad(*nightly)
-    assert "3 done (2 cached)" in flexroad(*nightly, "--verify")
-    states = json.loads((tmp_path / "run" / "tiles.geojson").read_text())["features"]
-    assert [state["properties"]["state"] for state in states] == ["cached", "done", "cached"]
-
-
-def test_run_with_failed_tile_ends_with_1_and_shows_it_on_the_map(flexroad, nightly, survey, tmp_path):
+def test_run_with_failed_tile_ends_with_1_and_shows_it_on_the_map(nightly, survey, tmp_path):
     tiles = Catalog.read(survey).tiles[:2]
     Catalog(tiles).write(survey)
-    tiles[1].paths(tiles[1].layer("dtm"))[0].unlink()
+    path, *_ = tiles[1].paths(tiles[1].layer("dtm"))
+    path.unlink()
     said = flexroad(*nightly, expect=1)
+    assert f"failed {tiles[1].id}: load: TaskError: " in said
     assert "2 tiles: 1 done (0 cached), 1 failed" in said
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["exit_code"], summary["failed"], summary["interrupted"]) == (1, 1, False)
-    assert summary["failures"][0]["tile_id"] == tiles[1].id
+    (failure,) = json.loads(flexroad("status", tmp_path / "run", "--json"))["failures"]
+    assert [failure[name] for name in ("tile_id", "stage", "file")] == [tiles[1].id, "load", str(path)]
     flexroad("status", tmp_path / "run", "--geojson", tmp_path / "map.geojson")
     states = json.loads((tmp_path / "map.geojson").read_text())["features"]
     assert [state["properties"]["state"] for state in states] == ["done", "failed"]
-
-
-def test_status_with_pipe_as_output_is_refused(flexroad, nightly, survey, tmp_path):
-    Catalog(Catalog.read(survey).tiles[:1]).write(survey)
-    flexroad(*nightly)
-    pipe = tmp_path / "map.geojson"
-    os.mkfifo(pipe)
-    said = flexroad("status", tmp_path / "run", "--geojson", pipe, expect=2)
-    assert f"is a device, pipe or socket and is not replaced: '{pipe}'" in said
-    assert pipe.is_fifo()
-
-
-def test_run_that_cannot_start_ends_with_2_and_one_line(flexroad, nightly, survey, tmp_path):
-    said = flexroad(*nightly, "--store", survey, expect=2)
-    assert said.startswith("error: cannot write the run")
-    assert "choose another --out or --store" in said
-    assert said.count("\n") == 1
-    # There is no summary of this run.
-    assert not (tmp_path / "run").exists()
-    (tmp_path / "run").mkdir()
-    with run_lock(tmp_path / "run"):
-        assert f"is in use by pid {os.getpid()}" in flexroad(*nightly, expect=2)
-    assert "No such option" in flexroad(*nightly, "--wrokers", 2, expect=2)
-    assert "is no run" in flexroad("rerun", tmp_path / "nowhere", expect=2)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +70,7 @@ def test_run_that_cannot_start_ends_with_2_and_one_line(flexroad, nightly, surve
         (["--wrokers", "2"], "No such option"),
     ],
 )
-def test_refused_run_leaves_folders_as_they_were(flexroad, nightly, survey, tmp_path, words, message):
+def test_refused_run_leaves_folders_as_they_were(nightly, survey, tmp_path, words, message):
     paths = {"CATALOG": survey, "ROADLESS": survey.with_name("roadless.parquet")}
     roadless = [
         replace(tile, layers=tuple(layer for layer in tile.layers if "road" not in layer.name))
@@ -148,7 +92,7 @@ def test_refused_run_leaves_folders_as_they_were(flexroad, nightly, survey, tmp_
     assert not (tmp_path / "new").exists()
 
 
-def test_run_into_folder_with_other_files_changes_nothing(flexroad, nightly, survey):
+def test_run_into_folder_with_other_files_changes_nothing(nightly, survey):
     before = paths.listing(survey.parent)
     message = (
         f"{survey.parent} has files that are not of a run, such as catalog.parquet; choose an empty or new"
@@ -159,7 +103,7 @@ def test_run_into_folder_with_other_files_changes_nothing(flexroad, nightly, sur
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "catalog.parquet"])
-def test_run_whose_creation_failed_goes_on(flexroad, nightly, tmp_path, monkeypatch, name):
+def test_run_whose_creation_failed_goes_on(nightly, tmp_path, monkeypatch, name):
     out, write_file = tmp_path / "run", record.write
 
     def fails(where, *args, **options):
@@ -176,46 +120,12 @@ def test_run_whose_creation_failed_goes_on(flexroad, nightly, tmp_path, monkeypa
     assert "4 done" in flexroad(*nightly)
 
 
-def test_run_into_empty_disk_is_accepted(flexroad, nightly, tmp_path):
-    (tmp_path / "run" / "lost+found").mkdir(parents=True)
-    (tmp_path / "run" / ".DS_Store").write_bytes(b"x")
-    assert "4 done" in flexroad(*nightly)
-
-
-def test_run_interrupted_ends_with_130_and_one_line(flexroad, nightly, monkeypatch):
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("flexroad.pipeline.run.api.run_tiles", interrupted)
-    said = flexroad(*nightly, expect=130)
-    assert said.endswith("interrupted; the same command goes on from here\n")
-
-
-def test_run_source_outside_catalog_folder_needs_allow(flexroad, nightly, survey, tmp_path):
-    tile = Catalog.read(survey).tiles[0]
-    (tmp_path / "dtm").mkdir()
-    shutil.move(tile.paths(tile.layer("dtm"))[0], tmp_path / "dtm" / "a.tif")
-    moved = Layer("dtm", (str(tmp_path / "dtm" / "a.tif"),))
-    layers = tuple(moved if layer.name == "dtm" else layer for layer in tile.layers)
-    Catalog((replace(tile, layers=layers),)).write(survey)
-    said = flexroad(*nightly, expect=2)
-    option = f"--allow {tmp_path / 'dtm'}"
-    assert option in said
-    flexroad(*option.split(), *nightly)
-    flexroad("rerun", tmp_path / "run", "--executor", "serial")
-    path = tmp_path / "run" / "run.json"
-    record = load_checked(path.read_bytes())
-    record["allowed"] = [str(tmp_path / "other")]
-    path.write_bytes(dump_checked(record))
-    assert f"--allow {tmp_path}\n" in flexroad("rerun", tmp_path / "run", "--executor", "serial", expect=2)
-
-
 def test_allow_after_the_command_names_its_place(flexroad, tmp_path):
-    said = flexroad("catalog", "check", tmp_path / "c.json", "--allow", tmp_path, expect=2)
-    assert "--allow stands before the command: flexroad --allow FOLDER COMMAND" in said
+    said = flexroad("catalog", "check", tmp_path / "c.json", "--allow", tmp_path).expected(2)
+    assert "--allow stands before the command: flexroad --allow FOLDER COMMAND" in said.err
 
 
-def test_clean_dry_run_lists_files_that_clean_deletes(flexroad, nightly, survey, tmp_path):
+def test_clean_dry_run_lists_files_that_clean_deletes(nightly, survey, tmp_path):
     tiles = Catalog.read(survey).tiles
     Catalog(tiles[:2]).write(survey)
     flexroad(*nightly)
@@ -234,16 +144,7 @@ def test_clean_dry_run_lists_files_that_clean_deletes(flexroad, nightly, survey,
     assert "1 done (1 cached)" in flexroad(*nightly)
 
 
-def test_status_of_locked_run_shows_owner(flexroad, nightly, survey, tmp_path):
-    Catalog(Catalog.read(survey).tiles[:1]).write(survey)
-    flexroad(*nightly)
-    assert json.loads(flexroad("status", tmp_path / "run", "--json"))["at_work"] is None
-    with run_lock(tmp_path / "run"):
-        assert json.loads(flexroad("status", tmp_path / "run", "--json"))["at_work"]["pid"] == os.getpid()
-        assert f"pid {os.getpid()} on" in flexroad("status", tmp_path / "run")
-
-
-def test_run_with_setting_records_it_for_rerun(flexroad, nightly, tmp_path):
+def test_run_with_setting_records_it_for_rerun(nightly, tmp_path):
     assert "fit.iteration: unknown key; did you mean iterations?" in flexroad(
         *nightly, "--set", "fit.iteration=4", "--dry-run", expect=2
     )
@@ -254,7 +155,7 @@ def test_run_with_setting_records_it_for_rerun(flexroad, nightly, tmp_path):
     assert "--set fit.iterations=4" in flexroad("report", tmp_path / "run")
 
 
-def test_query_after_edit_of_configuration_answers_from_the_last_finished_state(flexroad, nightly, tmp_path):
+def test_query_after_edit_of_configuration_answers_from_the_last_finished_state(nightly, tmp_path):
     flexroad(*nightly)
     run, points = tmp_path / "run", tmp_path / "points.csv"
     points.write_text("easting,northing\n500010,5600010\n500011,5600070\n")
@@ -276,7 +177,7 @@ def test_query_after_edit_of_configuration_answers_from_the_last_finished_state(
     assert "1 point lies on no finished tile" in flexroad("query", run, "--points", points)
 
 
-def test_rerun_from_export_only_writes_the_products_again(flexroad, nightly, tmp_path):
+def test_rerun_from_export_only_writes_the_products_again(nightly, tmp_path):
     one = ["--tile", "499980_5599980"]
     assert "starting: 1 tile\n" in flexroad(*nightly, *one)
     run = tmp_path / "run"
@@ -290,3 +191,81 @@ def test_rerun_from_export_only_writes_the_products_again(flexroad, nightly, tmp
     stages = [event["stage"] for event in last if event.get("tile") == one[1] and event.get("computed")]
     assert stages.count("export") == 2
     assert stages.count("fit") == 1
+
+
+@pytest.mark.slow
+def test_run_with_worker_processes_equals_serial_run(light_run, made_survey, tmp_path):
+    config, out = tmp_path / "light.yaml", tmp_path / "run"
+    config.write_text(yaml.safe_dump(LIGHT, sort_keys=False))
+    words = ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out]
+    said = process("run", *words, "--executor", "dask", "--workers", 2).expected(0)
+    assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said.out
+    tables = [read_metrics(run).drop(columns="seconds") for run in (light_run.path, out)]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+
+
+def test_surface_of_rgt_has_the_heights_of_the_dsm(light_run):
+    tile = light_run.catalog.tiles[1]
+    with rasterio.open(tile.paths(tile.layer("dsm"))[0]) as raster:
+        dsm = raster.read(1)
+    surface = RunSampler.open(light_run.path, "rgt")
+    answer = surface.at(tile.grid.eastings[[5, 40]], tile.grid.northings[[7, 50]])
+    assert answer.height == pytest.approx([dsm[7, 5], dsm[50, 40]], abs=1e-5)
+
+
+@pytest.mark.slow
+def test_report_is_written_in_every_format_and_needs_no_network(own_run):
+    for form in ("md", "csv", "html"):
+        said = call("report", own_run.path, "--format", form).expected(0)
+        text = (own_run.path / f"report.{form}").read_text()
+        assert "flexroad" in text
+        assert form == "html" or said.out.strip() == text.strip()
+    assert text.count("data:image/webp;base64,") >= 4 * 6
+    assert "http" not in text.split("<body>")[1].split("Configuration")[0]
+
+
+def test_dry_run_prints_a_line_per_tile_and_writes_nothing(made_survey, tmp_path):
+    catalog = Catalog.read(made_survey / "catalog.parquet")
+    words = ["run", "--config", "paper", "--catalog", made_survey / "catalog.parquet"]
+    words += ["--out", tmp_path / "r", "--dry-run"]
+    said = flexroad(*words).splitlines()
+    assert not (tmp_path / "r").exists()
+    assert said[:5] == [*(f"{tile.id}: new" for tile in catalog.tiles), "4 tiles: 4 new"]
+    assert "12 to do" in said[-2]
+    assert said[-1] == "expected exit code: 0"
+    graph = flexroad(*words, "--verbose")
+    assert graph.count("fit ") == 4 * 3 + 1
+    assert "(plane, rgt, flexroad)" in graph
+    one, two = catalog.tiles[0].id, catalog.tiles[3].id
+    west, south, east, north = catalog.tiles[3].grid.bounds
+    assert flexroad(*words, "--tile", one, two).splitlines()[:2] == [f"{one}: new", f"{two}: new"]
+    inside = flexroad(*words, "--bbox", west + 1, south + 1, east - 1, north - 1)
+    assert inside.splitlines()[:2] == [f"{two}: new", "1 tile: 1 new"]
+
+
+def test_run_of_some_tiles_keeps_the_other_tiles_of_the_run(nightly, survey, tmp_path):
+    one, two = (Catalog.read(survey).tiles[number].id for number in (3, 1))
+    assert "1 tile: 1 done (0 cached)" in flexroad(*nightly, "--tile", one)
+    assert "2 tiles: 2 done (0 cached)" in flexroad(*nightly, "--tile", two)
+    assert read_metrics(tmp_path / "run").tile_id.tolist() == [two, one]
+    assert "4 tiles: 4 done (2 cached)" in flexroad(*nightly)
+
+
+def test_catalog_show_lists_layers_and_count(made_survey):
+    said = flexroad("catalog", "show", made_survey / "catalog.parquet")
+    assert said.splitlines()[-1] == "4 tiles, EPSG:25832"
+    assert "dsm(4) dtm(4) road_mask(4) reference(4) reference_road(4)" in said
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        (f"rounds={'9' * 5000}", "rounds: not readable as YAML: line 1, column 1: a number of more than"),
+        ("rounds=[", "rounds: not readable as YAML"),
+        ("rounds", "'rounds': give KEY=VALUE, like --set epochs=100"),
+    ],
+)
+def test_train_setting_that_cannot_be_read_gives_one_line(setting, message):
+    words = ["train", "none.json", "--labels", "mask", "-o", "x.safetensors", "--set", setting]
+    (line,) = call(*words).expected(2).errors
+    assert f"--set {message}" in line

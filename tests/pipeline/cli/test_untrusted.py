@@ -1,12 +1,20 @@
-"""Commands that read a catalog or a run from anyone ask for nothing outside its folder."""
+"""Catalogs and runs from anyone: nothing outside their folder is read, no control character is printed."""
 
+import io
 import json
 import shutil
+from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import flexroad as library
 from flexroad.catalog import Catalog, CatalogError
+from flexroad.pipeline.cli.stdio import echo, echo_document
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run.progress import ProgressDisplay
+
+CLI = Path(__file__).parents[3] / "pipeline" / "cli"
 
 
 @pytest.fixture
@@ -79,3 +87,31 @@ def test_run_from_another_user_needs_allow(flexroad, survey, quick_config, tmp_p
     allowed = library.open_run(run, allow=[survey.parent])
     assert allowed.tile(tile.id).dsm.notnull().any()
     assert allowed.height(tile.grid.west + 9, tile.grid.south + 9) > 0
+
+
+def test_echo_escapes_control_characters(capsys):
+    echo("failed \x1b[2Ja\r\n\u202eb", err=True)
+    echo_document("one\x1b\ntwo\n")
+    said = capsys.readouterr()
+    assert said.err == "failed \\x1b[2Ja\\r\\n\\u202eb\n"
+    assert said.out == "one\\x1b\ntwo\n"
+
+
+def test_commands_print_with_echo_only():
+    """The streams' module is the one place where characters are escaped."""
+    others = [path for path in CLI.glob("*.py") if path.name != "stdio.py"]
+    assert not [path for path in others if any(word in path.read_text() for word in ("typer.echo", "print("))]
+
+
+def test_error_line_is_escaped(flexroad, monkeypatch):
+    def fail():
+        raise ConfigError("a\x1b[2Jb\nc")
+
+    monkeypatch.setattr("flexroad.pipeline.cli.main.app", fail)
+    assert flexroad("run").expected(2).err == "error: a\\x1b[2Jb\nerror: c\n"
+
+
+def test_progress_lines_are_escaped():
+    out = io.StringIO()
+    ProgressDisplay(1, Console(file=out)).say("failed a\x1b[2J\n[bold]b")
+    assert out.getvalue() == "failed a\\x1b[2J\\n[bold]b\n"

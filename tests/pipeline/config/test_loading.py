@@ -198,7 +198,7 @@ def test_extends_reads_no_file_but_yaml_and_shows_nothing_of_it(tmp_path):
         "shadow": "is not a YAML file; its name must end in .yaml or .yml",
         str(tmp_path / "shadow"): "is not a YAML file",
         "link.yaml": "is not a YAML file",
-        "other.yaml": "other.yaml: line 2: the key is none of a configuration",
+        "other.yaml": "other.yaml: line 2: the key is unknown in a configuration",
         "text.yaml": "text.yaml: expected a mapping of stages to options, but it is a text",
         "pipe.yaml": "is not a regular file",
         "missing.yaml": "neither a file nor a shipped name",

@@ -29,7 +29,7 @@ class Parallel:
             yield function(job)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def two_cores(monkeypatch):
     monkeypatch.setattr("flexroad.pipeline.execute.executor.workers_of", lambda asked: asked or 2)
 
@@ -54,42 +54,30 @@ def run(function, number, workers=2, job_s=None, **of_jobs):
     return list(results), parallel.jobs, lines
 
 
-@pytest.mark.usefixtures("two_cores")
-def test_few_short_jobs_run_without_workers(monkeypatch):
-    results, on_workers, lines = run(made_clock(monkeypatch, 0.1), 48)
-    assert results == [2 * number for number in range(48)]
-    assert on_workers == []
-    assert lines == ["no worker processes yet: 48 tiles, the first ones show whether workers pay"]
+BREAK_EVEN_S = 2 * MARGIN * START_S / (48 - ENOUGH - 1)
 
 
-@pytest.mark.usefixtures("two_cores")
-def test_long_jobs_run_on_workers_from_the_fourth_on(monkeypatch):
-    """The first loads libraries, the longest of two measured ones does not count."""
-    results, on_workers, lines = run(made_clock(monkeypatch, 2.0), 48)
+@pytest.mark.parametrize(
+    ("job_s", "expected"),
+    [
+        pytest.param([0.1], [], id="short jobs"),
+        # The first loads libraries, the longest of two measured ones does not count.
+        pytest.param([2.0], range(3, 48), id="long jobs"),
+        pytest.param([5.0] * 10 + [0.01], range(3, 48), id="later jobs are quick"),
+        # Jobs a little above break-even wait for a reliable mean.
+        pytest.param([1.2 * BREAK_EVEN_S], range(1 + ENOUGH, 48), id="break-even"),
+        # A job that compiles or waits for a library says nothing about the others.
+        *(pytest.param([0.1] * n + [50.0] + [0.1] * (6 - n), [], id=f"job {n} is slow") for n in range(6)),
+    ],
+)
+def test_jobs_run_on_workers_as_soon_as_these_pay(monkeypatch, job_s, expected):
+    results, on_workers, lines = run(made_clock(monkeypatch, *job_s), 48)
     assert sorted(results) == [2 * number for number in range(48)]
-    assert on_workers == list(range(3, 48))
-    assert lines[-1].startswith(
-        "worker processes: 45 tiles of about 2 s; 2 of them save more than their start"
-    )
+    assert on_workers == [*expected]
+    assert lines[0] == "no worker processes yet: 48 tiles, the first ones show whether workers pay"
+    assert [line[:18] for line in lines[1:]] == ["worker processes: "] * bool(on_workers)
 
 
-@pytest.mark.usefixtures("two_cores")
-def test_jobs_little_above_break_even_wait_for_a_reliable_mean(monkeypatch):
-    job_s = 2 * 1.2 * MARGIN * START_S / (48 - ENOUGH - 1)
-    _, on_workers, _ = run(made_clock(monkeypatch, job_s), 48)
-    assert on_workers == list(range(1 + ENOUGH, 48))
-
-
-@pytest.mark.usefixtures("two_cores")
-@pytest.mark.parametrize("slow", range(6))
-def test_one_slow_job_does_not_start_workers(monkeypatch, slow):
-    """A job that compiles or waits for a library says nothing about the others."""
-    job_s = [0.1] * 7
-    job_s[slow] = 50.0
-    assert not run(made_clock(monkeypatch, *job_s), 48)[1]
-
-
-@pytest.mark.usefixtures("two_cores")
 def test_quick_jobs_before_slow_ones_do_not_keep_workers_away(monkeypatch):
     """Tiles of the first files may be empty: jobs are measured until the last one."""
     _, on_workers, lines = run(made_clock(monkeypatch, 1.0, *[0.01] * 9, 2.0), 100)
@@ -98,20 +86,12 @@ def test_quick_jobs_before_slow_ones_do_not_keep_workers_away(monkeypatch):
     assert lines[-1].startswith("worker processes: ")
 
 
-@pytest.mark.usefixtures("two_cores")
-def test_workers_stay_when_later_jobs_are_quick(monkeypatch):
-    _, on_workers, _ = run(made_clock(monkeypatch, *[5.0] * 10, 0.01), 48)
-    assert on_workers == list(range(3, 48))
-
-
-@pytest.mark.usefixtures("two_cores")
 def test_waiting_for_a_core_is_no_work(monkeypatch):
     """On a busy machine the wall clock runs on while a job waits: the decision is that of an idle machine."""
     monkeypatch.setattr(time, "perf_counter", iter(range(0, 10**6, 100)).__next__)
     assert not run(made_clock(monkeypatch, 0.1), 48)[1]
 
 
-@pytest.mark.usefixtures("two_cores")
 @pytest.mark.parametrize("number", [4, 16, 48, 150])
 @pytest.mark.parametrize("job_s", [0.05, 0.3, 1.0, 3.0, 30.0])
 def test_two_workers_take_at_most_the_time_of_one(monkeypatch, number, job_s):
@@ -122,7 +102,6 @@ def test_two_workers_take_at_most_the_time_of_one(monkeypatch, number, job_s):
     assert start_s <= saved_s
 
 
-@pytest.mark.usefixtures("two_cores")
 def test_known_time_decides_before_the_first_job_if_it_is_clear(monkeypatch):
     logged = []
     _, on_workers, lines = run(made_clock(monkeypatch, 2.0), 48, job_s=2.0, log=logged.append)
@@ -133,14 +112,15 @@ def test_known_time_decides_before_the_first_job_if_it_is_clear(monkeypatch):
     assert lines == ["no worker processes: 48 tiles of about 0.1 s, less work than the start of 2"]
 
 
-@pytest.mark.usefixtures("two_cores")
 def test_measured_jobs_overrule_a_known_time(monkeypatch):
     """The earlier run waited for a busy machine or a slow disk, or had less to do."""
     assert not run(made_clock(monkeypatch, 0.1), 48, job_s=1.4)[1]
-    assert run(made_clock(monkeypatch, 2.0), 48, job_s=0.1)[1] == list(range(3, 48))
+    _, on_workers, lines = run(made_clock(monkeypatch, 2.0), 48, job_s=0.1)
+    assert on_workers == list(range(3, 48))
+    said = "worker processes: 45 tiles of about 2 s; 2 of them save more than their start"
+    assert lines[-1].startswith(said)
 
 
-@pytest.mark.usefixtures("two_cores")
 def test_one_worker_never_pays_but_many_jobs_are_isolated(monkeypatch):
     assert not run(made_clock(monkeypatch, 10), MANY, workers=1)[1]
     assert len(run(made_clock(monkeypatch, 10), MANY + 1, workers=1)[1]) == MANY + 1

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import nurbs, plane, raster
-from flexroad.tasks.types import RoadClusters, TileData
+from tests.builders import make_clusters, make_grid, make_tile
 
-GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 48, 40)
+GRID = make_grid(48, 40)
 GOLDEN = {
     "nurbs": (
         nurbs,
@@ -52,7 +51,7 @@ def tile():
     road = np.abs(n - 20 - 4 * np.sin(e / 15)) < 5
     dsm = dtm + 0.05 * noise[::-1] + 1.4 * (road & (noise > 0.45)) + 6.0 * ~road
     dtm[5:9, 30:37] = np.nan
-    return TileData("golden", GRID, GRID, dsm, dtm), RoadClusters(GRID, road.astype(np.int32))
+    return make_tile(dsm, dtm), make_clusters(road)
 
 
 def summary(surface):

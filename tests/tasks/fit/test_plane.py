@@ -5,18 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import plane
-from flexroad.tasks.types import RoadClusters, Surface, TileData
+from tests.builders import make_clusters, make_grid, make_tile
 
-GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 60, 40)
+GRID = make_grid(60, 40, 0.5)
 E, N = np.meshgrid(GRID.eastings, GRID.northings)
 TRUTH = 163 + 0.03 * (E - 295500) - 0.04 * (N - 5629480)
 
 
 def fitted(dsm, dtm, road):
-    return plane.fit(TileData("t", GRID, GRID, dsm, dtm), RoadClusters(GRID, road), plane.Options())
+    return plane.fit(make_tile(dsm, dtm, 0.5), make_clusters(road, 0.5), plane.Options())
 
 
 def road(rows=slice(10, 20)):
@@ -29,7 +28,6 @@ def test_fit_road_on_plane_returns_that_plane():
     dsm = np.where(road() > 0, TRUTH, np.nan)
     dsm[12, 3:9] = np.nan
     surface = fitted(dsm, TRUTH + 100, road())
-    assert isinstance(surface, Surface)
     assert not surface.from_dtm
     assert surface.bounds == GRID.hull
     np.testing.assert_allclose(surface.lattice(GRID.eastings, GRID.northings), TRUTH, atol=1e-9)
@@ -62,7 +60,7 @@ def test_fit_degenerate_road_is_level_where_undetermined():
     np.testing.assert_allclose(across.slope, (0.03, 0), atol=1e-9)
 
 
-def test_fit_without_heights_raises():
+def test_fit_without_any_height_raises():
     no_heights = np.full(GRID.shape, np.nan)
     with pytest.raises(TaskError, match="neither the DSM on the road nor the DTM has a height"):
         fitted(no_heights, no_heights, road())

@@ -8,9 +8,9 @@ from matplotlib.tri import LinearTriInterpolator, Triangulation
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import raster
-from flexroad.tasks.types import RoadClusters, Surface, TileData
+from tests.builders import make_clusters, make_grid, make_tile
 
-GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 13, 9)
+GRID = make_grid(13, 9, 0.5)
 RNG = np.random.default_rng(0)
 DSM, DTM = RNG.normal(160, 2, GRID.shape), RNG.normal(150, 2, GRID.shape)
 WEST, SOUTH, EAST, NORTH = GRID.hull
@@ -39,10 +39,9 @@ def peer():
 def test_fit_takes_heights_from_chosen_rasters(road, terrain):
     labels = np.zeros(GRID.shape, np.int32)
     labels[3:5] = 2
-    data = TileData("t", GRID, GRID, DSM, DTM)
-    fitted = raster.fit(data, RoadClusters(GRID, labels), raster.Options(road=road, terrain=terrain))
+    options = raster.Options(road=road, terrain=terrain)
+    fitted = raster.fit(make_tile(DSM, DTM, 0.5), make_clusters(labels, 0.5), options)
     source = {"dsm": DSM, "dtm": DTM}
-    assert isinstance(fitted, Surface)
     np.testing.assert_array_equal(fitted.heights[3:5], source[road][3:5])
     np.testing.assert_array_equal(fitted.heights[5:], source[terrain][5:])
 

@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import pytest
 import rasterio
@@ -9,9 +11,11 @@ from flexroad.catalog import Grid
 from flexroad.tasks import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.types import Source
+from tests.builders import make_grid
+from tests.make_rasters import UTM
+from tests.make_rasters import write as write_raster
 
-UTM = "EPSG:25832"
-GRID = Grid(UTM, 295500.0, 5629500.0, 1.0, 20, 12)
+GRID = make_grid(20, 12)
 """The area to read; photos of 40 x 24 pixels at 0.5 m cover it."""
 
 
@@ -19,36 +23,18 @@ def bands(count=3, kind=np.uint8, top=255, seed=0):
     return np.random.default_rng(seed).integers(1, top, (count, 24, 40)).astype(kind)
 
 
-def write(
-    path, values, *, cell=0.5, west=GRID.west, north=GRID.north, crs=UTM, mask=None, alpha=None, **more
-):
-    profile = {"driver": "GTiff", "dtype": values.dtype, "count": len(values), "crs": crs} | more
-    profile |= {"height": values.shape[1], "width": values.shape[2]}
-    profile.setdefault("transform", Affine(cell, 0, west, 0, -cell, north))
-    with rasterio.open(path, "w", **profile) as file:
-        file.write(values)
-        if alpha:
-            file.colorinterp = [*file.colorinterp[: alpha - 1], ColorInterp.alpha]
-        if mask is not None:
-            file.write_mask(mask)
-    return path
+write = partial(write_raster, cell=0.5)
 
 
 def source(*paths):
     return Source("dop", paths)
 
 
-def fails(match, *paths, grid=GRID):
+def fails(match, *paths):
     with pytest.raises(TaskError, match=match) as caught:
-        read_photo(source(*paths), grid)
+        read_photo(source(*paths), GRID)
     assert "\n" not in str(caught.value)
     return caught.value
-
-
-def means(values, n=2):
-    """Return the mean of each block of n x n pixels."""
-    count, height, width = values.shape
-    return values.reshape(count, height // n, n, width // n, n).mean((2, 4))
 
 
 def test_read_photo_coinciding_pixels_are_copied(tmp_path):
@@ -59,20 +45,17 @@ def test_read_photo_coinciding_pixels_are_copied(tmp_path):
     assert photo.known.all()
 
 
-@pytest.mark.parametrize("cell", [1.0, 2.0])
-def test_read_photo_coarser_pixels_are_means(tmp_path, cell):
-    values = bands()
-    photo = read_photo(source(write(tmp_path / "a.tif", values)), GRID, cell)
+@pytest.mark.parametrize(
+    ("wanted", "cell"),
+    [({"gsd_m": 1.0}, 1.0), ({"gsd_m": 2.0}, 2.0)]
+    + [({"finest_m": finest}, cell) for finest, cell in ((0.2, 0.5), (0.5, 0.5), (1.0, 1.0))],
+)
+def test_read_photo_coarser_pixels_are_means(tmp_path, wanted, cell):
+    values, n = bands(), round(cell / 0.5)
+    photo = read_photo(source(write(tmp_path / "a.tif", values)), GRID, **wanted)
     assert photo.grid.cell == cell
-    assert np.abs(photo.colour - means(values, round(cell / 0.5))).max() <= 0.5
-
-
-@pytest.mark.parametrize(("finest_m", "cell"), [(0.2, 0.5), (0.5, 0.5), (1.0, 1.0)])
-def test_read_photo_finest_averages_only_finer_photos(tmp_path, finest_m, cell):
-    values = bands()
-    photo = read_photo(source(write(tmp_path / "a.tif", values)), GRID, finest_m=finest_m)
-    assert photo.grid.cell == cell
-    assert np.abs(photo.colour - means(values, round(cell / 0.5))).max() <= 0.5
+    means = values.reshape(3, 24 // n, n, 40 // n, n).mean((2, 4))
+    assert np.abs(photo.colour - means).max() <= 0.5
 
 
 def test_read_photo_finer_pixels_are_interpolated(tmp_path):
@@ -96,11 +79,14 @@ def test_read_photo_nodata_mask_and_alpha_are_unknown(tmp_path):
     hole[10:14, 20:26] = True
     values[:, hole] = 0
     shown = np.where(hole, 0, 255).astype(np.uint8)
-    for path in (
-        write(tmp_path / "nodata.tif", values, nodata=0),
-        write(tmp_path / "mask.tif", values, mask=shown),
-        write(tmp_path / "alpha.tif", np.concatenate([values, shown[None]]), alpha=4),
-    ):
+    nodata = write(tmp_path / "nodata.tif", values, nodata=0)
+    mask = write(tmp_path / "mask.tif", values)
+    with rasterio.open(mask, "r+") as file:
+        file.write_mask(shown)
+    alpha = write(tmp_path / "alpha.tif", [*values, shown])
+    with rasterio.open(alpha, "r+") as file:
+        file.colorinterp = [*file.colorinterp[:3], ColorInterp.alpha]
+    for path in (nodata, mask, alpha):
         photo = read_photo(source(path), GRID)
         np.testing.assert_array_equal(photo.known, ~hole, err_msg=path.name)
         np.testing.assert_array_equal(photo.colour, values, err_msg=path.name)
@@ -155,25 +141,19 @@ def test_read_photo_unusable_file_fails(tmp_path):
     assert fails("dop gone.tif is missing", tmp_path / "gone.tif").layer == "dop"
     elsewhere = write(tmp_path / "elsewhere.tif", bands(), west=GRID.west + 500)
     fails("no dop file overlaps the tile .*elsewhere.tif", elsewhere)
-    fails("dop a.tif is in EPSG:4326, the tile in EPSG:25832", degrees(tmp_path / "a.tif"))
+    west, _, _, north = transform_bounds(UTM, "EPSG:4326", *GRID.bounds)
+    degrees = {"crs": "EPSG:4326", "transform": Affine(1e-5, 0, west, 0, -1e-5, north)}
+    a = write(tmp_path / "a.tif", bands(), **degrees)
+    fails("dop a.tif is in EPSG:4326, the tile in EPSG:25832", a)
     fails("float32, not 8 or 16 bits", write(tmp_path / "f.tif", bands().astype(np.float32)))
 
 
-def degrees(path):
-    west, _, _, north = transform_bounds(UTM, "EPSG:4326", *GRID.bounds)
-    return write(path, bands(), crs="EPSG:4326", transform=Affine(1e-5, 0, west, 0, -1e-5, north))
-
-
-def test_read_photo_broken_file_fails_only_where_needed(tmp_path):
+def test_read_photo_unusable_file_fails_only_where_needed(tmp_path):
     half = write(tmp_path / "half.tif", bands()[:, :, :20])
     gone = tmp_path / "gone.tif"
     west = Grid(UTM, GRID.west, GRID.north, 1.0, 10, 12)
     assert read_photo(source(gone, half), west).known.all()
     fails("gone.tif is missing", gone, half)
-
-
-def test_read_photo_unusable_file_fails_only_where_needed(tmp_path):
-    whole = write(tmp_path / "whole.tif", bands())
     bare = write(tmp_path / "bare.tif", bands(), crs=None)
-    photo = read_photo(source(bare, whole), GRID)
-    np.testing.assert_array_equal(photo.colour, bands())
+    whole = write(tmp_path / "whole.tif", bands(seed=1))
+    np.testing.assert_array_equal(read_photo(source(bare, whole), GRID).colour, bands(seed=1))

@@ -37,24 +37,27 @@ def height(x, y):
     return 100 + 0.0005 * x + 3 * np.sin(x / 40) + 2 * np.cos(y / 30)
 
 
-def sample(place, rows, cols, west=0, north=0):
-    """Return heights at the centres of a file's cells, ``west`` and ``north`` cells from the place."""
+def sample(place):
+    """Return heights at the centres of the 250 x 250 cells of a file."""
     source, target, x, y, cell = PLACES[place]
-    xs = x + (west + np.arange(cols) + 0.5) * cell
-    ys = y - (north + np.arange(rows) + 0.5) * cell
+    xs = x + (np.arange(250) + 0.5) * cell
+    ys = y - (np.arange(250) + 0.5) * cell
     return height(*Transformer.from_crs(source, target, always_xy=True).transform(*np.meshgrid(xs, ys)))
 
 
-def made(folder, place, parts, *, values=None, **profile):
-    """Write files of the surface, each of (row, col, rows, cols); return the tiles."""
-    source, target, x, y, cell = PLACES[place]
-    for number, (row, col, rows, cols) in enumerate(parts):
-        heights = sample(place, rows, cols, col, row) if values is None else values
-        for name in ("dsm", "dtm"):
-            path = folder / name / f"{number}.tif"
-            write(path, heights, x + col * cell, y - row * cell, cell=cell, crs=source, **profile)
-    patterns = {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif"}
-    return index(folder, patterns, tile_size_m=60, conversion=Conversion(True, target, "metre"))
+def made(folder, place, *, values=None, **profile):
+    """Write the surface as DSM and DTM; return the tiles."""
+    source, _, x, y, cell = PLACES[place]
+    profile = {"cell": cell, "crs": source} | profile
+    for name in ("dsm", "dtm"):
+        write(folder / f"{name}.tif", sample(place) if values is None else values, x, y, **profile)
+    return indexed(folder, place)
+
+
+def indexed(folder, place, unit="metre", **layers):
+    patterns = {"dsm": "dsm.tif", "dtm": "dtm.tif"}
+    conversion = Conversion(True, PLACES[place][1], unit)
+    return index(folder, patterns | layers.pop("more", {}), tile_size_m=60, conversion=conversion, **layers)
 
 
 def truth(grid):
@@ -63,7 +66,7 @@ def truth(grid):
 
 @pytest.mark.parametrize("place", PLACES)
 def test_surface_in_another_crs_is_read_within_the_error_of_interpolation(tmp_path, place):
-    result = made(tmp_path, place, [(0, 0, 250, 250)])
+    result = made(tmp_path, place)
     # A bilinear value is off by at most an eighth of h^2 (|f_xx| + |f_yy|), with cells of 0.7 to 1.2 m.
     bound = 1.2**2 / 8 * (3 / 40**2 + 2 / 30**2)
     full = 0
@@ -83,8 +86,8 @@ def test_surface_in_another_crs_is_read_within_the_error_of_interpolation(tmp_pa
 
 def test_surface_in_another_crs_is_that_of_rasterio(tmp_path):
     """rasterio.warp interpolates positions, with an error of an eighth of a cell at most."""
-    tile = next(t for t in made(tmp_path, "zones", [(0, 0, 250, 250)]).tiles if full(t))
-    with rasterio.open(tmp_path / "dsm" / "0.tif") as src:
+    tile = full_tile(made(tmp_path, "zones"))
+    with rasterio.open(tmp_path / "dsm.tif") as src:
         peer = np.full(tile.grid.shape, np.nan)
         reproject(
             rasterio.band(src, 1),
@@ -99,32 +102,24 @@ def test_surface_in_another_crs_is_that_of_rasterio(tmp_path):
     np.testing.assert_allclose(load.load(tile, OFF).dsm, peer, atol=1e-3)
 
 
-def full(tile):
-    return np.isfinite(load.load(tile, OFF).dsm).all()
+def full_tile(result):
+    """Return the first tile that the files cover completely."""
+    return next(tile for tile in result.tiles if np.isfinite(load.load(tile, OFF).dsm).all())
 
 
 def test_overlapping_windows_of_a_warped_file_have_equal_values(tmp_path):
-    tile = next(t for t in made(tmp_path, "zones", [(0, 0, 250, 250)]).tiles if full(t))
+    tile = full_tile(made(tmp_path, "zones"))
     inner = load.load(tile, OFF).dsm
     outer = load.load(tile, load.Options(min_valid=0, halo_m=20))
     np.testing.assert_array_equal(outer.dsm[20:-20, 20:-20], inner)
 
 
-@pytest.mark.parametrize("place", ["zones", "feet"])
-def test_files_in_another_crs_join_without_gap_or_step(tmp_path, place):
-    """Two files that touch, and the same ground in one file: equal values across the seam."""
-    split = made(tmp_path / "split", place, [(0, 0, 250, 113), (0, 113, 250, 137)])
-    whole = made(tmp_path / "whole", place, [(0, 0, 250, 250)])
-    for one, other in zip(split.tiles, whole.tiles, strict=True):
-        np.testing.assert_array_equal(load.load(one, OFF).dsm, load.load(other, OFF).dsm)
-
-
 @pytest.mark.parametrize("nodata", [-9999.0, None])
 def test_nodata_of_a_warped_file_has_no_halo(tmp_path, nodata):
     """A void of undeclared or declared nodata keeps its size, and nothing is mixed with it."""
-    values = sample("zones", 250, 250)
+    values = sample("zones")
     values[100:140, 90:130] = -9999
-    result = made(tmp_path, "zones", [(0, 0, 250, 250)], values=values, nodata=nodata)
+    result = made(tmp_path, "zones", values=values, nodata=nodata)
     to_source = Transformer.from_crs("EPSG:25833", "EPSG:25832", always_xy=True)
     voids = 0
     for tile in result.tiles:
@@ -142,7 +137,7 @@ def test_nodata_of_a_warped_file_has_no_halo(tmp_path, nodata):
 
 def test_extents_of_a_layer_in_feet_are_exact_in_metres(tmp_path):
     _, _, x, y, cell = PLACES["feet"]
-    result = made(tmp_path, "feet", [(0, 0, 250, 250)])
+    result = made(tmp_path, "feet")
     # The projection is the same one, whose false easting is 300,000 m in both.
     west, south, east, north = result.tiles[0].layer("dsm").extents[0]
     expected = [x * FOOT, (y - 250 * cell) * FOOT, (x + 250 * cell) * FOOT, y * FOOT]
@@ -157,11 +152,10 @@ def test_extents_of_a_layer_in_feet_are_exact_in_metres(tmp_path):
 )
 def test_heights_in_feet_of_a_warped_file_become_metres(tmp_path, unit, conversion, factor):
     """The band's unit is first, then --height-unit, then the unit of x and y, with a note."""
-    source, target, x, y, cell = PLACES["feet"]
+    source, _, x, y, cell = PLACES["feet"]
     for name in ("dsm", "dtm"):
         write(tmp_path / f"{name}.tif", np.full((120, 120), 300.0), x, y, cell=cell, crs=source, unit=unit)
-    patterns = {"dsm": "dsm.tif", "dtm": "dtm.tif"}
-    result = index(tmp_path, patterns, tile_size_m=60, conversion=Conversion(True, target, conversion))
+    result = indexed(tmp_path, "feet", conversion)
     data = load.load(result.tiles[0], OFF)
     np.testing.assert_allclose(data.dsm[np.isfinite(data.dsm)], 300 * factor, rtol=1e-9)
     is_assumed = not unit and conversion is None
@@ -170,13 +164,10 @@ def test_heights_in_feet_of_a_warped_file_become_metres(tmp_path, unit, conversi
 
 
 def test_classes_of_a_warped_file_are_not_mixed(tmp_path):
-    made(tmp_path, "zones", [(0, 0, 250, 250)])
+    made(tmp_path, "zones")
     classes = np.where(np.arange(250) // 5 % 2, 3, 8)[None].repeat(250, 0).astype(np.uint8)
     write(tmp_path / "mask.tif", classes, 900_000, 5_700_000)
-    patterns = {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif", "road_mask": "mask.tif"}
-    conversion = Conversion(True, "EPSG:25833")
-    tiles = index(tmp_path, patterns, road_values=(3, 5), tile_size_m=60, conversion=conversion).tiles
-    tile = next(t for t in tiles if full(t))
+    tile = full_tile(indexed(tmp_path, "zones", road_values=(3, 5), more={"road_mask": "mask.tif"}))
     to_source = Transformer.from_crs("EPSG:25833", "EPSG:25832", always_xy=True)
     x, _ = to_source.transform(*np.meshgrid(tile.grid.eastings, tile.grid.northings))
     expected = np.floor(x - 900_000) // 5 % 2 == 1
@@ -185,10 +176,10 @@ def test_classes_of_a_warped_file_are_not_mixed(tmp_path):
 
 def test_photo_in_another_crs_is_warped_where_the_layer_says_so(tmp_path):
     source, _, x, y, cell = PLACES["feet"]
-    heights = made(tmp_path, "feet", [(0, 0, 250, 250)])
+    heights = made(tmp_path, "feet")
     red = np.clip(np.arange(500) // 2, 0, 255).astype(np.uint8)[None].repeat(500, 0)
     write(tmp_path / "dop.tif", red, x, y, cell=cell / 2, crs=source)
-    tile = next(t for t in heights.tiles if full(t))
+    tile = full_tile(heights)
     layers = (*tile.layers, Layer("dop", ("dop.tif",), reproject=True))
     photo = read_photo(load.load(replace(tile, layers=layers), OFF).dop, tile.grid)
     assert photo.grid.cell == pytest.approx(1.5 * FOOT, abs=1e-3)
@@ -201,24 +192,25 @@ def test_photo_in_another_crs_is_warped_where_the_layer_says_so(tmp_path):
         read_photo(load.load(replace(tile, layers=layers), OFF).dop, tile.grid)
 
 
+def small_tile(folder, *files):
+    x, y = Transformer.from_crs("EPSG:25832", "EPSG:25833", always_xy=True).transform(900_030, 5_699_970)
+    grid = Grid("EPSG:25833", round(x) - 10.0, round(y) + 10.0, 1.0, 20, 20)
+    layers = tuple(Layer(name, files, reproject=True) for name in ("dsm", "dtm"))
+    return Tile("t", grid, layers, str(folder), datetime(2020, 5, 1, tzinfo=UTC))
+
+
 def test_warped_file_finer_than_the_tile_is_averaged(tmp_path):
     """Cells of 0.1 m with an alternating pattern of 2 m: the mean is read, not every tenth cell."""
     noise = np.where(np.indices((600, 600)).sum(0) % 2, 101.0, 99.0)
     write(tmp_path / "a.tif", noise, 900_000, 5_700_000, cell=0.1)
-    x, y = Transformer.from_crs("EPSG:25832", "EPSG:25833", always_xy=True).transform(900_030, 5_699_970)
-    grid = Grid("EPSG:25833", round(x) - 10.0, round(y) + 10.0, 1.0, 20, 20)
-    layers = tuple(Layer(name, ("a.tif",), reproject=True) for name in ("dsm", "dtm"))
-    tile = Tile("t", grid, layers, str(tmp_path), datetime(2020, 5, 1, tzinfo=UTC))
+    tile = small_tile(tmp_path, "a.tif")
     np.testing.assert_allclose(load.load(tile, OFF).dsm, 100, atol=0.02)
 
 
 def test_file_in_the_crs_of_the_tile_is_used_before_one_in_another(tmp_path):
-    x, y = Transformer.from_crs("EPSG:25832", "EPSG:25833", always_xy=True).transform(900_030, 5_699_970)
-    grid = Grid("EPSG:25833", round(x) - 10.0, round(y) + 10.0, 1.0, 20, 20)
+    tile = small_tile(tmp_path, "a.tif", "b.tif")
     write(tmp_path / "a.tif", np.full((60, 60), 50.0), 900_000, 5_700_000)
-    write(tmp_path / "b.tif", np.full((20, 5), 70.0), grid.west, grid.north, crs="EPSG:25833")
-    layers = tuple(Layer(name, ("a.tif", "b.tif"), reproject=True) for name in ("dsm", "dtm"))
-    tile = Tile("t", grid, layers, str(tmp_path), datetime(2020, 5, 1, tzinfo=UTC))
+    write(tmp_path / "b.tif", np.full((20, 5), 70.0), tile.grid.west, tile.grid.north, crs="EPSG:25833")
     heights = load.load(tile, OFF).dsm
     assert (heights[:, :5] == 70).all()
     np.testing.assert_allclose(heights[:, 5:], 50)
@@ -226,11 +218,6 @@ def test_file_in_the_crs_of_the_tile_is_used_before_one_in_another(tmp_path):
 
 def test_lattice_of_a_northward_file_is_read_from_the_north(tmp_path):
     """XYZ-like files whose rows run northward, in another CRS."""
-    values = sample("zones", 250, 250)
     flipped = Affine(1, 0, 900_000, 0, 1, 5_700_000 - 250)
-    for name in ("dsm", "dtm"):
-        write(tmp_path / f"{name}.tif", values[::-1], transform=flipped)
-    conversion = Conversion(True, "EPSG:25833")
-    tiles = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=60, conversion=conversion).tiles
-    tile = next(t for t in tiles if full(t))
+    tile = full_tile(made(tmp_path, "zones", values=sample("zones")[::-1], transform=flipped))
     np.testing.assert_allclose(load.load(tile, OFF).dsm, truth(tile.grid), atol=0.01)

@@ -72,6 +72,11 @@ SHEETS = {
         (20.3, -20, 1.5, 22, 22),
     ],
     "overlap": [(-10.5, 10.5, 1, 40, 61), (10, 10, 5, 8, 12)],
+    "noise of a cell size": [(-10.5, 10.5, 1.0, 30, 61), (19.5, 10.5, 1.0000000000000349, 31, 61)],
+}
+SHEETS |= {
+    f"{cell} m divide nothing": [(-10.13, 10.31, cell, int(60 / cell), int(60 / cell))]
+    for cell in (0.95, 0.8, 0.762, 0.6, 0.4, 0.3048, 0.27, 0.2, 0.17)
 }
 
 
@@ -79,12 +84,6 @@ SHEETS = {
 def test_sheets_of_a_plane_have_its_heights_at_their_borders(sheets, tmp_path):
     names = [sheet(tmp_path, number, *each) for number, each in enumerate(sheets)]
     assert_plane(load(tile(tmp_path, names), OFF))
-
-
-@pytest.mark.parametrize("cell", [0.95, 0.8, 0.762, 0.6, 0.4, 0.3048, 0.27, 0.2, 0.17])
-def test_plane_of_cells_that_divide_none_of_the_tile_is_exact(cell, tmp_path):
-    side = int(60 / cell)
-    assert_plane(load(tile(tmp_path, [sheet(tmp_path, 0, -10.13, 10.31, cell, side, side)]), OFF))
 
 
 def rough(x, y):
@@ -118,15 +117,6 @@ def test_incomplete_step_beside_another_lattice_has_no_rim(others, tmp_path):
     loaded = load(tile(tmp_path, names), OFF)
     whole = load(tile(tmp_path, [sheet(tmp_path, "whole", -10, 10, 0.2, 300, 300)]), OFF)
     np.testing.assert_allclose(core(loaded), core(whole), rtol=0, atol=0.002)
-
-
-def test_noise_of_a_cell_size_is_no_other_lattice(tmp_path):
-    """Sheets with cells of 1.0000000000000349 m among sheets of 1 m."""
-    names = [
-        sheet(tmp_path, "a", -10.5, 10.5, 1.0, 30, 61),
-        sheet(tmp_path, "b", 19.5, 10.5, 1.0000000000000349, 31, 61),
-    ]
-    assert_plane(load(tile(tmp_path, names), OFF))
 
 
 def test_void_filled_by_another_sheet_has_no_rim(tmp_path):

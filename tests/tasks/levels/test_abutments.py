@@ -1,14 +1,20 @@
-"""Abutments of decks and tunnels, found from vectors and from heights near them."""
+"""Abutments of decks and tunnels, from vectors and heights, and roads of one level that cross."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import shapely
+from shapely.affinity import translate
 
-from flexroad.catalog.grid import Grid
-from flexroad.tasks.levels.abutments import GAP_M, levels_of
-from flexroad.tasks.types import TileData
+from flexroad.tasks.levels.abutments import GAP_M, crossing_notes, levels_of
+from flexroad.tasks.roads.rasterise import Options, roads
+from flexroad.tasks.types import Source, TileData
+from tests.builders import make_grid
+from tests.make_roads import GRID as FILE_GRID
+from tests.make_roads import on_grid, write
 
-GRID = Grid("EPSG:25832", 500_000.0, 5_600_100.0, 1.0, 100, 100)
+GRID = make_grid(100, 100, west=500_000.0, north=5_600_100.0)
 FLAT = np.zeros(GRID.shape)
 
 
@@ -25,9 +31,9 @@ def across(x, width=7.0, low=0.0, high=100.0):
     )
 
 
-def found(*roads, dsm=FLAT, dtm=FLAT, grid=GRID):
+def found(*given, dsm=FLAT, dtm=FLAT, grid=GRID):
     """Return the levels of roads, given as (level, area), and notes."""
-    numbers, areas = zip(*roads, strict=True)
+    numbers, areas = zip(*given, strict=True)
     data = TileData("a", grid, grid, dsm, dtm)
     areas = np.array(areas, object)
     return levels_of(areas, areas, np.array(numbers), data)
@@ -107,14 +113,9 @@ def test_hidden_roads_do_not_refuse_a_abutment():
     assert abutment_ends(level) == [40, 60]
 
 
-def test_road_on_level_ground_alone_has_no_levels():
+def test_road_on_level_ground_alone_or_far_from_a_deck_has_no_levels():
     assert found(*WAYS, BELOW) == ((), ())
-
-
-def test_deck_far_from_the_tile_is_left_out():
-    far = Grid(GRID.crs, GRID.west - 90, GRID.north, 1.0, 100, 100)
-    levels, notes = found(DECK, *WAYS, grid=far)
-    assert (levels, notes) == ((), ())
+    assert found(DECK, *WAYS, grid=replace(GRID, west=GRID.west - 90)) == ((), ())
 
 
 @pytest.mark.parametrize(("high", "kept"), [(70, True), (95, False)])
@@ -178,3 +179,68 @@ def test_damaged_polygons_are_mended():
     )
     levels, _ = found((1, bow), *WAYS, (0, shapely.Polygon()))
     assert levels[0].areas.is_valid
+
+
+ALONG, ACROSS = ((30, 46), (70, 54)), ((47, 35), (54, 75))
+
+
+def notes(*roads_of, numbers=None, core=GRID):
+    """Roads are polygons, or boxes between two corners, by metres from the south-west corner of the grid."""
+    areas = [
+        shapely.box(*each[0], *each[1]) if len(each) == 2 else shapely.Polygon(each) for each in roads_of
+    ]
+    areas = np.array([translate(area, GRID.west, GRID.south) for area in areas], object)
+    return crossing_notes(areas, areas, np.array(numbers or [1] * len(areas)), core)
+
+
+def test_roads_of_one_level_that_cross_are_noted_with_both_and_the_place():
+    assert notes(ALONG, ACROSS) == (
+        "segment: 1 pair of roads of level 1 cross without a common vertex, such as those around "
+        "E 500050 N 5600050 and E 500050 N 5600055, at E 500050 N 5600050; give the upper one level 2, or "
+        "both a vertex there if it is a junction",
+    )
+    (note,) = notes(ALONG, ACROSS, numbers=[-1, -1])
+    assert "level -1" in note
+    assert "give the lower one level -2" in note
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        ((47, 35), (54, 46)),
+        ((47, 35), (54, 50)),
+        ((47, 35), (54, 54.1)),
+        ((60, 46), (90, 54)),
+        ((30, 53), (70, 60)),
+        ((32, 44), (68, 56)),
+    ],
+    ids=["beside", "ends in it", "barely beyond it", "goes on", "parallel", "its deck"],
+)
+def test_roads_of_one_level_that_do_not_cross_are_not_noted(other):
+    assert notes(ALONG, other) == ()
+
+
+def test_roads_of_two_levels_on_the_ground_or_beside_the_tile_may_cross():
+    assert notes(ALONG, ACROSS, numbers=[1, 2]) == ()
+    assert notes(ALONG, ACROSS, numbers=[0, 0]) == ()
+    # A crossing is noted on its own tile.
+    assert notes(ALONG, ACROSS, core=replace(GRID, width=46)) == ()
+
+
+@pytest.mark.parametrize(("junction", "number"), [(True, 0), (False, 1)])
+def test_lines_that_share_a_vertex_are_a_junction(tmp_path, junction, number):
+    middle = [(50, 50)] if junction else []
+    lines = [
+        shapely.LineString([on_grid(at)[0] for at in (start, *middle, end)])
+        for start, end in (((20, 50), (80, 50)), ((50, 20), (50, 80)))
+    ]
+    path = write(tmp_path / "r.gpkg", lines, width=[6, 6], level=[1, 1])
+    found = roads(Source("roads", (path,)), FILE_GRID, Options(), levels=True)
+    assert len(crossing_notes(found.areas, found.shapes, found.level, FILE_GRID)) == number
+
+
+@pytest.mark.parametrize(("corner", "number"), [([(47, 46)], 0), ([], 1)])
+def test_areas_that_share_a_corner_are_a_junction(corner, number):
+    along = [(30, 46), (47, 46), (70, 46), (70, 54), (30, 54)]
+    across = [(47, 35), (54, 35), (54, 75), (47, 75), *corner]
+    assert len(notes(along, across)) == number

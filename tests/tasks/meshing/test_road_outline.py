@@ -12,8 +12,9 @@ from flexroad.tasks.meshing.road_outline import crossings, encoded
 from flexroad.tasks.metrics.mesh_check import faults
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.sample import Options, sample
-from flexroad.tasks.spline.frame import Corner, Edge, Frame
+from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, RoadMask
+from tests.crossing import border_part
 from tests.mesh_union import Union
 from tests.tasks.test_sample import Hills, areas
 
@@ -49,17 +50,7 @@ def grid_of(column, row, cell=1.0, size_m=100):
 
 
 def frame_of(grid, polygons):
-    parts = []
-    for number, border in enumerate(border_of(grid, 10.0)):
-        if number < 4:
-            parts.append(Corner(np.zeros((3, 3)), np.zeros((2, 2), bool)))
-            continue
-        order = slice(None) if border.kind == "east" else slice(None, None, -1)
-        on_road = cells(polygons, border.grid)[border.sides[1]].ravel()[order]
-        nowhere = np.zeros((2, len(on_road)), bool)
-        places = crossings(encoded(polygons, border.grid), border)
-        parts.append(Edge(np.zeros((3, 0)), on_road, on_road, nowhere, places))
-    return Frame(*parts)
+    return Frame(*(border_part(border, polygons) for border in border_of(grid, 10.0)))
 
 
 def meshed(polygons, grid, frame=None, options=None, exact=True, outside=None):

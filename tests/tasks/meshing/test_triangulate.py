@@ -25,28 +25,12 @@ def crosses(p, q, r, s):
     return side(p, q, r) * side(p, q, s) < 0 and side(r, s, p) * side(r, s, q) < 0
 
 
-def test_constrained_long_edge_through_lattice_is_there():
-    x, y = np.meshgrid(np.arange(11.0), np.arange(11.0))
-    points = np.vstack([np.stack([x, y], axis=-1).reshape(-1, 2), [0.3, 0.4], [9.7, 8.1]])
-    ends = len(points) - 2, len(points) - 1
-    faces = constrained(points, np.array([ends]))
-    assert ends not in edges_of(delaunay(points))
-    assert ends in edges_of(faces)
-    assert doubled_areas(points, faces).min() > 0
-    assert doubled_areas(points, faces).sum() == pytest.approx(200)
-
-
 def test_constrained_segment_through_points_is_several_edges():
     points = np.array(
         [[0, 0], [3, 0], [3, 2], [0, 2], [1, 1], [2, 1], [0, 1], [3, 1], [1.5, 1.2], [1.5, 0.8]], float
     )
     edges = edges_of(constrained(points, np.array([[6, 7]])))
     assert {(4, 6), (4, 5), (5, 7)} <= edges
-
-
-def test_constrained_without_segments_is_delaunay():
-    points = np.random.default_rng(0).uniform(0, 10, (50, 2))
-    np.testing.assert_array_equal(constrained(points, np.empty((0, 2), int)), delaunay(points))
 
 
 def test_constrained_crossing_segment_is_left_out():

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,16 +12,16 @@ from scipy.spatial import Delaunay
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import MeshFault
 from flexroad.tasks.metrics.dihedral import mean_angles
-from flexroad.tasks.metrics.evaluate import Options, evaluate
-from flexroad.tasks.metrics.mesh_distance import drape, nearest
+from flexroad.tasks.metrics.evaluate import FIGURES, Options, evaluate, mesh_distances
+from flexroad.tasks.metrics.mesh_distance import at_nodes, drape, nearest
 from flexroad.tasks.sample import Options as SampleOptions
 from flexroad.tasks.sample import sample
+from flexroad.tasks.spline.moving import moving
+from flexroad.tasks.spline.space import clamped_space, surface_on
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Mesh, Metrics, RoadMask, TileData
-from tests.crossing import GROUND_M, Crossing
-
-
-def ground(width=40, height=30, cell=1.0, west=295500.0, north=5629500.0) -> Grid:
-    return Grid("EPSG:25832", west, north, cell, width, height)
+from tests.builders import make_grid, make_mask, make_tile
+from tests.crossing import Crossing
 
 
 def on_lattice(grid: Grid, height_at, bounds=None, step=1.0) -> Mesh:
@@ -37,18 +38,23 @@ def on_lattice(grid: Grid, height_at, bounds=None, step=1.0) -> Mesh:
     return Mesh(grid.crs, origin, vertices, faces, np.zeros(len(faces), bool))
 
 
-class Level:
-    """A surface at 160 m."""
+def surface(height_at):
+    """Return a surface with these heights at eastings and northings."""
 
-    def lattice(self, eastings, northings):
-        return np.full((len(northings), len(eastings)), 160.0)
+    def lattice(eastings, northings):
+        heights = height_at(eastings[None, :], northings[:, None])
+        return np.broadcast_to(heights, (len(northings), len(eastings)))
+
+    return SimpleNamespace(lattice=lattice)
+
+
+LEVEL = surface(lambda x, y: 160.0)
 
 
 def figures(mesh, grid, truth, is_road=None, options=None, **layers) -> Metrics:
     is_road = np.zeros(grid.shape, bool) if is_road is None else is_road
-    data = TileData("t", grid, grid, truth, truth, **layers)
-    road = RoadMask(grid, grid, is_road, np.zeros_like(is_road))
-    return evaluate(mesh, data, road, Level(), options or Options())
+    data = make_tile(truth, grid=grid, **layers)
+    return evaluate(mesh, data, make_mask(is_road), LEVEL, options or Options())
 
 
 def centres(grid: Grid):
@@ -73,34 +79,8 @@ def random_surface(rng, n=60, size=20.0, relief=3.0):
 # Distances
 
 
-@pytest.mark.parametrize("step", [1.0, 13.0, 39.0])
-def test_evaluate_shifted_plane_measures_shift(step):
-    grid = ground(40, 40)
-    plane = tilt(0.1, -0.05)
-    is_road = western_half(grid)
-    metrics = figures(on_lattice(grid, plane, step=step), grid, plane(*centres(grid)) + 0.25, is_road)
-    for value in (metrics.l2_road_m, metrics.l2_terrain_m, metrics.rmse_road_m, metrics.rmse_terrain_m):
-        assert value == pytest.approx(0.25, abs=1e-9)
-    assert metrics.p95_road_m == pytest.approx(0.25, abs=1e-9)
-    assert metrics.nmad_road_m == pytest.approx(0, abs=1e-9)
-    assert metrics.mad_road_deg == pytest.approx(0, abs=1e-6)
-    assert (metrics.completeness, metrics.road_fraction) == (1.0, 0.5)
-    assert math.isnan(metrics.nearest_road_m)
-    assert math.isnan(metrics.nearest_terrain_m)
-
-
-def test_evaluate_slope_nearest_is_cosine_of_vertical():
-    grid = ground(40, 40)
-    slope = 0.75
-    # The mesh extends beyond the cells, so the nearest points lie inside it.
-    mesh = on_lattice(grid, tilt(slope), bounds=(295490.0, 5629450.0, 295550.0, 5629510.0))
-    metrics = figures(mesh, grid, tilt(slope)(*centres(grid)) + 1, western_half(grid), Options(nearest=True))
-    assert metrics.l2_road_m == metrics.l2_terrain_m == pytest.approx(1.0)
-    assert metrics.nearest_road_m == metrics.nearest_terrain_m == pytest.approx(1 / math.hypot(1, slope))
-
-
 def test_evaluate_statistics_are_per_class():
-    grid = ground(40, 30)
+    grid = make_grid(40, 30)
     errors = np.random.default_rng(0).normal(0.1, 0.5, grid.shape)
     is_road = western_half(grid)
     metrics = figures(on_lattice(grid, tilt(0.0)), grid, 160 - errors, is_road)
@@ -111,10 +91,14 @@ def test_evaluate_statistics_are_per_class():
     assert metrics.rmse_terrain_m == pytest.approx(math.sqrt((terrain**2).mean()))
     assert metrics.nmad_road_m == pytest.approx(1.4826 * np.median(np.abs(road - np.median(road))))
     assert metrics.p95_road_m == pytest.approx(np.percentile(np.abs(road), 95))
+    assert (metrics.mad_road_deg, metrics.mad_terrain_deg) == pytest.approx((0, 0), abs=1e-6)
+    assert (metrics.completeness, metrics.road_fraction) == (1.0, 0.5)
+    assert math.isnan(metrics.nearest_road_m)
+    assert math.isnan(metrics.nearest_terrain_m)
 
 
 def test_evaluate_reference_layers_replace_dtm_and_mask():
-    grid = ground()
+    grid = make_grid(40, 30)
     layers = {"reference": np.full(grid.shape, 162.0), "reference_road": ~western_half(grid)}
     mesh, dtm = on_lattice(grid, tilt(0.0)), np.where(western_half(grid), 161.0, 165.0)
     without_layers = figures(mesh, grid, dtm, western_half(grid))
@@ -125,7 +109,7 @@ def test_evaluate_reference_layers_replace_dtm_and_mask():
 
 
 def test_evaluate_classes_segmented_uses_raw_mask():
-    grid = ground()
+    grid = make_grid(40, 30)
     layers = {"reference": np.where(western_half(grid), 161.0, 165.0), "reference_road": ~western_half(grid)}
     segmented = western_half(grid)
     segmented[:, 10:] = False
@@ -140,7 +124,7 @@ def test_evaluate_classes_segmented_uses_raw_mask():
 
 
 def test_evaluate_nan_reference_cells_are_ignored():
-    grid = ground()
+    grid = make_grid(40, 30)
     truth = np.full(grid.shape, 161.0)
     truth[:, :10] = np.nan
     metrics = figures(on_lattice(grid, tilt(0.0)), grid, truth, western_half(grid))
@@ -150,7 +134,7 @@ def test_evaluate_nan_reference_cells_are_ignored():
 
 
 def test_evaluate_hole_in_mesh_lowers_completeness():
-    grid = ground(41, 31)
+    grid = make_grid(41, 31)
     mesh = on_lattice(grid, tilt(0.0))
     centroids = mesh.vertices[mesh.faces].mean(axis=1)
     used, faces = np.unique(
@@ -164,7 +148,7 @@ def test_evaluate_hole_in_mesh_lowers_completeness():
 
 
 def test_evaluate_class_without_cells_is_nan():
-    grid = ground()
+    grid = make_grid(40, 30)
     metrics = figures(
         on_lattice(grid, tilt(0.0)), grid, np.full(grid.shape, 160.0), options=Options(nearest=True)
     )
@@ -175,16 +159,15 @@ def test_evaluate_class_without_cells_is_nan():
 
 
 def test_evaluate_ignores_halo():
-    core = ground(20, 20)
+    core = make_grid(20, 20)
     grid = core.buffered(7)
     truth = np.full(grid.shape, 500.0)
     truth[grid.window(core)] = 161.0
     is_road = np.ones(grid.shape, bool)
     is_road[grid.window(core)] = western_half(core)
-    data = TileData("t", grid, core, truth, truth)
     mesh = on_lattice(core, tilt(0.0), bounds=core.bounds)
-    road = RoadMask(grid, core, is_road, np.zeros_like(is_road))
-    metrics = evaluate(mesh, data, road, Level(), Options(nearest=True))
+    inputs = TileData("t", grid, core, truth, truth), RoadMask(grid, core, is_road, np.zeros_like(is_road))
+    metrics = evaluate(mesh, *inputs, LEVEL, Options(nearest=True))
     assert (metrics.l2_road_m, metrics.nearest_road_m) == pytest.approx((1, 1))
     assert (metrics.completeness, metrics.road_fraction) == (1, 0.5)
 
@@ -199,7 +182,7 @@ def test_evaluate_ignores_halo():
     step=st.sampled_from([0.2, 1.0, 1.7, 50.0]),
 )
 def test_drape_covered_hull_has_no_nan(shape, cell, corner, step):
-    grid = ground(shape[1], shape[0], cell, *corner)
+    grid = make_grid(shape[1], shape[0], cell, *corner)
     plane = tilt(0.1, 0.2)
     mesh = on_lattice(grid, plane, step=step * cell)
     heights = drape(mesh, grid) + mesh.origin[2]
@@ -225,7 +208,7 @@ def test_drape_equals_barycentric_height(seed):
     vertices, faces = random_surface(np.random.default_rng(seed))
     if seed == 2:
         faces = np.ascontiguousarray(faces[:, ::-1])
-    grid = ground(24, 22, west=-2.0, north=21.0)
+    grid = make_grid(24, 22, west=-2.0, north=21.0)
     mesh = Mesh("EPSG:25832", (1.0, -2.0, 100.0), vertices, faces, np.zeros(len(faces), bool))
     heights, truth = drape(mesh, grid), _slow_drape(mesh, grid)
     assert 0.3 < np.isnan(truth).mean() < 0.7
@@ -256,37 +239,19 @@ def test_mean_angles_equal_paper_formula(seed):
     np.testing.assert_allclose(mean_angles(mesh), _slow_angles(mesh), rtol=1e-7)
 
 
-def test_mean_angles_single_face_is_nan():
-    grid = ground()
-    mesh = on_lattice(grid, tilt(0.1))
-    alone = replace(mesh, faces=mesh.faces[[0, 200]])
-    assert np.isnan(mean_angles(alone)).all()
-
-
-def test_mean_angles_fold_has_known_angles():
-    """Two planes meet at 30 degrees: each face at the crease has one neighbour on the other plane."""
-    grid = ground(41, 31)
-    crease = 295520.5
-    mesh = on_lattice(grid, lambda x, y: 160 + np.maximum(x - crease, 0) * math.tan(math.radians(30)))
-    angles = mean_angles(mesh)
-    at_crease = angles > 1e-6
-    # One of the two faces of a quad has an edge on the crease; at the mesh's border it has one neighbour
-    # less.
-    assert at_crease.sum() == 2 * 30
-    assert sorted(set(angles[at_crease].round(6))) == [10.0, 15.0]
-
-
 def test_mean_angles_almost_level_ground_is_accurate():
-    grid = ground()
+    grid = make_grid(40, 30)
     mesh = on_lattice(grid, lambda x, y: 160 + 1e-9 * (x - 295500) ** 2)
     bend = math.degrees(2e-9)
     inner = mean_angles(mesh)
     assert 0 < inner.max() < bend
+    # Faces without neighbours have none.
+    assert np.isnan(mean_angles(replace(mesh, faces=mesh.faces[[0, 200]]))).all()
     assert figures(mesh, grid, np.full(grid.shape, 160.0)).mad_terrain_deg == pytest.approx(bend / 3, rel=0.1)
 
 
 def test_evaluate_faces_are_classed_by_centroid():
-    grid = ground(40, 30)
+    grid = make_grid(40, 30)
     rng = np.random.default_rng(0)
     rough = np.where(western_half(grid), 0.0, rng.uniform(0, 1, grid.shape))[::-1]
     mesh = on_lattice(grid, lambda x, y: 160 + rough)
@@ -299,7 +264,7 @@ def test_evaluate_faces_are_classed_by_centroid():
 
 
 def test_evaluate_class_without_centroid_uses_all_faces():
-    grid = ground(40, 40)
+    grid = make_grid(40, 40)
     bent = on_lattice(grid, lambda x, y: 160 + 0.1 * ((x > 295530) & (y > 5629490)), step=39)
     is_road = np.zeros(grid.shape, bool)
     is_road[0, 0] = True
@@ -337,18 +302,14 @@ def test_nearest_equals_brute_force(seed, n):
 
 
 def test_evaluate_nearest_is_mean_of_class():
-    grid = ground(14, 12)
+    grid = make_grid(14, 12)
     rng = np.random.default_rng(0)
     mesh = on_lattice(grid, lambda x, y: 160 + rng.uniform(0, 2, x.shape))
     truth, is_road = 160 + rng.uniform(0, 5, grid.shape), western_half(grid)
     metrics = figures(mesh, grid, truth, is_road, Options(nearest=True))
     points = np.stack([*centres(grid), truth], axis=-1) - mesh.origin
-    assert metrics.nearest_road_m == pytest.approx(
-        _brute_force(mesh.vertices, mesh.faces, points[is_road]).mean()
-    )
-    assert metrics.nearest_terrain_m == pytest.approx(
-        _brute_force(mesh.vertices, mesh.faces, points[~is_road]).mean()
-    )
+    for found, cells in ((metrics.nearest_road_m, is_road), (metrics.nearest_terrain_m, ~is_road)):
+        assert found == pytest.approx(_brute_force(mesh.vertices, mesh.faces, points[cells]).mean())
     assert metrics.nearest_road_m < metrics.l2_road_m
 
 
@@ -358,30 +319,108 @@ def test_figures_of_mesh_with_deck_are_those_of_the_ground_beside_it():
     mesh = sample(*tile[:3], SampleOptions(), tile.frame)
     below = level.covers(*centres(grid))
     truth = np.where(below, -100.0, tile.surface.height(*centres(grid)))
-    result = evaluate(mesh, TileData("t", grid, grid, truth, truth), tile.road, tile.surface, Options())
+    data = make_tile(truth, grid=grid)
+    result = evaluate(mesh, data, tile.road, tile.surface, Options())
     assert result.l2_road_m < 0.05
     assert result.completeness == 1
     assert result.triangles == len(mesh.faces)
-
-
-def test_fault_of_a_deck_is_an_error():
-    tile = next(Crossing((40.0, 30.0)).tiles())
-    mesh = sample(*tile[:3], SampleOptions(), tile.frame)
+    # A fault of the deck is an error.
     last = mesh.faces.copy()
     last[-1] = last[-1, ::-1]
-    truth = np.full(tile.road.core.shape, GROUND_M)
-    data = TileData("t", tile.road.core, tile.road.core, truth, truth)
     with pytest.raises(MeshFault, match="inverted faces"):
         evaluate(replace(mesh, faces=last), data, tile.road, tile.surface, Options())
 
 
 def test_evaluate_truth_dsm_measures_distance_from_the_dsm_where_it_has_a_height():
-    grid = ground(40, 30)
+    grid = make_grid(40, 30)
     mesh, truth = on_lattice(grid, tilt(0)), np.full(grid.shape, 160.0)
-    data = TileData("t", grid, grid, truth + 0.5, truth, reference=truth - 1)
+    data = make_tile(truth + 0.5, truth, reference=truth - 1)
     data.dsm[:, :10] = np.nan
-    road = RoadMask(grid, grid, western_half(grid), np.zeros(grid.shape, bool))
-    by_dsm = evaluate(mesh, data, road, Level(), Options(truth="dsm"))
-    assert by_dsm.l2_road_m == pytest.approx(0.5)
-    assert by_dsm.road_fraction == pytest.approx(10 / 30)
-    assert evaluate(mesh, data, road, Level(), Options()).l2_road_m == pytest.approx(1.0)
+    by_dsm, by_reference = (
+        evaluate(mesh, data, make_mask(western_half(grid)), LEVEL, Options(truth=truth))
+        for truth in ("dsm", "reference")
+    )
+    assert (by_dsm.l2_road_m, by_dsm.road_fraction) == pytest.approx((0.5, 10 / 30))
+    assert by_reference.l2_road_m == pytest.approx(1.0)
+
+
+def test_at_nodes_heights_of_a_plane_and_nothing_beside_it():
+    """The lattice has other spacings from east to west and north to south."""
+    points = np.array([[10, 20, 0], [40, 20, 0], [40, 30, 0], [10, 30, 0]], float)
+    points[:, 2] = 0.5 * points[:, 0] - 2 * points[:, 1]
+    heights = at_nodes(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), (0.0, 20.0, 60.0, 40.0), (5, 7))
+    x, y = np.meshgrid(np.linspace(0, 60, 7), np.linspace(40, 20, 5))
+    inside = (x >= 10) & (x <= 40) & (y <= 30)
+    np.testing.assert_allclose(heights[inside], (0.5 * x - 2 * y)[inside], atol=1e-4)
+    assert np.isnan(heights[~inside]).all()
+
+
+CORE = make_grid(20, 20, north=5629520.0)
+WEST = np.arange(20) < 10
+ROAD = np.tile(WEST, (20, 1))
+
+
+def above(distances):
+    """Return a surface above the mesh by the distances of its cells, ``(20, 20)``, m."""
+    return surface(lambda x, y: 160.0 + distances[CORE.cells(x, y)])
+
+
+def strip(x, z, mask=ROAD) -> tuple[Mesh, RoadMask]:
+    """Return a mesh of strips from south to north with heights ``z`` at ``x``, and the road mask."""
+    x = np.asarray(x, float)
+    south, north = np.c_[x, np.zeros_like(x), z], np.c_[x, np.full_like(x, 20.0), z]
+    a = np.arange(len(x) - 1)
+    n = len(x)
+    faces = np.concatenate([np.c_[a, a + 1, a + n + 1], np.c_[a, a + n + 1, a + n]]).astype(np.int32)
+    vertices = np.concatenate([south, north])
+    mesh = Mesh(CORE.crs, (295500, 5629500, 150.0), vertices, faces, np.zeros(len(faces), bool))
+    return mesh, RoadMask(CORE, CORE, mask, np.zeros_like(mask))
+
+
+def test_distances_are_percentile_and_maximum_of_each_class():
+    distances = np.where(WEST, 0.02, -0.3) * np.ones((20, 1))
+    distances[3, 4], distances[5, 15] = -0.5, 4.9
+    mesh, road = strip([0, 20], [10.0, 10.0])
+    expected = dict(zip(FIGURES, (0.02, 0.5, 0.3, 4.9), strict=True))
+    assert mesh_distances(mesh, above(distances), road) == pytest.approx(expected)
+
+
+def test_mesh_with_vertices_at_centres_of_cells_has_the_distance_between_them():
+    x = np.arange(20) + 0.5
+    mesh, road = strip(x, 10 + 0.08 * np.arange(20) ** 2)
+    expected = 0.08 * 0.25 * 0.75
+    bowl = surface(lambda x, y: 160 + 0.08 * (x - 295500.5) ** 2)
+    assert list(mesh_distances(mesh, bowl, road).values()) == pytest.approx(4 * [expected])
+
+
+def test_places_without_mesh_do_not_count():
+    distances = np.where(np.arange(20) < 12, 0.1, 7.0) * np.ones((20, 1))
+    mesh, road = strip([0, 12], [10.0, 10.0])
+    assert list(mesh_distances(mesh, above(distances), road).values()) == pytest.approx(4 * [0.1])
+    mesh, road = strip([0, 9], [10.0, 10.0])
+    p95, largest = list(mesh_distances(mesh, above(distances), road).values())[2:]
+    assert math.isnan(p95)
+    assert math.isnan(largest)
+
+
+@pytest.fixture
+def level():
+    """Return a spline at 160 m."""
+    space = clamped_space(CORE, 3, (6, 6))
+    return surface_on(space, CORE, CORE.hull, np.zeros((6, 6)), np.ones((6, 6)), 160.0)
+
+
+def test_steps_of_the_surface_count(level):
+    steps, rim = np.zeros((20, 20), np.float32), np.zeros((2, 20), np.float32)
+    steps[:, 14:16] = 0.75
+    stepped = SteppedSurface(**vars(level), steps=steps, cells=CORE, south_north=rim, west_east=rim)
+    mesh, road = strip([0, 20], [10.0, 10.0])
+    expected = dict(zip(FIGURES, (0, 0, 0.75, 0.75), strict=True))
+    assert mesh_distances(mesh, stepped, road) == pytest.approx(expected, abs=1e-9)
+
+
+def test_surface_whose_plan_moves_has_no_distance(level):
+    mesh, road = strip([0, 20], [10.0, 10.0])
+    distances = mesh_distances(mesh, moving(level), road)
+    assert list(distances) == list(FIGURES)
+    assert all(math.isnan(distance) for distance in distances.values())

@@ -16,7 +16,8 @@ from flexroad.tasks.errors import MeshFault, TaskError
 from flexroad.tasks.metrics.mesh_check import check, faults
 from flexroad.tasks.sample import Options
 from flexroad.tasks.types import Mesh
-from tests.tasks.test_sample import Hills, ground, sampled
+from tests.builders import make_grid
+from tests.tasks.test_sample import Hills, sampled
 from tests.tasks.test_sample_border import block, meshes
 
 ORIGIN = (295500.0, 5629250.0, 150.0)
@@ -77,65 +78,45 @@ def turned_twice():
     return mesh_of(np.vstack([rim, [[0, 0]]]), [(10, k, (k + 1) % 10) for k in range(10)])
 
 
+def with_faces(*new, points=()):
+    """Further faces, and further points as corners of faces."""
+    vertices, faces = square()
+    return mesh_of(np.vstack([vertices, *points]), np.vstack([faces, *new]))
+
+
+UNDER, TOUCH = "outline edges under or over other faces", "outline edges that cross or touch others"
+OVERLAP = "edges with overlapping faces"
 FAULTS = {
-    "NaN": (with_number(7, 2, np.nan), "1 vertices that are not finite (the first at vertex 7)"),
-    "infinite": (with_number(9, 0, -np.inf), "1 vertices that are not finite (the first at vertex 9)"),
-    "too large index": (
-        with_face(3, (0, 1, 36)),
-        "1 faces with unknown vertices (the first at face 3)",
-    ),
-    "negative index": (with_face(4, (-1, 1, 2)), "1 faces with unknown vertices (the first at face 4)"),
-    "repeated index": (
-        with_face(0, (0, 1, 1)),
-        "1 degenerate faces (the first at 295500.667, 5629250.000)",
-    ),
+    "NaN": (with_number(7, 2, np.nan), 1, "vertices that are not finite", "vertex 7"),
+    "infinite": (with_number(9, 0, -np.inf), 1, "vertices that are not finite", "vertex 9"),
+    "too large index": (with_face(3, (0, 1, 36)), 1, "faces with unknown vertices", "face 3"),
+    "negative index": (with_face(4, (-1, 1, 2)), 1, "faces with unknown vertices", "face 4"),
+    "repeated index": (with_face(0, (0, 1, 1)), 1, "degenerate faces", (0.667, 0)),
     # Vertex 7 is at (1, 1); the place is the middle of the diagonal of the quad in its north-west.
-    "no area": (moved(7, (0.5, 1.5)), "1 degenerate faces (the first at 295500.500, 5629251.500)"),
-    "moved across an edge": (moved(7, (0.4, 1.6)), "1 inverted faces (the first at 295500.467, 5629251.533)"),
-    "looks down": (with_face(0, (1, 0, 7)), "1 inverted faces (the first at 295500.667, 5629250.333)"),
-    "vertex twice": (with_split_vertex(), "1 duplicate vertices (the first at 295500.000, 5629250.000)"),
-    "vertex unused": (
-        mesh_of(np.vstack([square()[0], [[9, 8]]]), square()[1]),
-        "1 unused vertices (the first at 295509.000, 5629258.000)",
-    ),
-    "face twice": (
-        mesh_of(square()[0], np.vstack([square()[1], square()[1][:1]])),
-        "3 edges with overlapping faces (the first at 295500.500, 5629250.500)",
-    ),
+    "no area": (moved(7, (0.5, 1.5)), 1, "degenerate faces", (0.5, 1.5)),
+    "moved across an edge": (moved(7, (0.4, 1.6)), 1, "inverted faces", (0.467, 1.533)),
+    "looks down": (with_face(0, (1, 0, 7)), 1, "inverted faces", (0.667, 0.333)),
+    "vertex twice": (with_split_vertex(), 1, "duplicate vertices", (0, 0)),
+    "vertex unused": (with_faces(points=[(9, 8)]), 1, "unused vertices", (9, 8)),
+    "face twice": (with_faces(square()[1][0]), 3, OVERLAP, (0.5, 0.5)),
     # A face on two edges of the outline, folded back over the mesh, shares one of them in the same direction.
-    "face over others": (
-        mesh_of(square()[0], np.vstack([square()[1], [(0, 1, 14)]])),
-        "1 edges with overlapping faces (the first at 295500.500, 5629250.000)",
-    ),
-    "layer": (
-        with_patch(1.2, 1.3, 0.5),
-        "8 outline edges under or over other faces (the first at 295501.450, 5629251.300)",
-    ),
-    "layer below all": (
-        with_patch(-1.5, -1.5, 4.0),
-        "20 outline edges under or over other faces (the first at 295500.500, 5629250.000)",
-    ),
-    "overhanging layer": (
-        with_patch(4.2, 1.3, 0.7),
-        "4 outline edges that cross or touch others (the first at 295505.000, 5629251.500)",
-    ),
-    "edge at two edges": (
-        with_patch(5.0, 0.5, 1.0),
-        "7 outline edges that cross or touch others (the first at 295505.000, 5629250.500)",
-    ),
-    "vertex in edge": (
-        mesh_of(
-            np.vstack([square()[0], [(5, 0.5), (6, 0), (6, 1)]]), np.vstack([square()[1], [(36, 37, 38)]])
-        ),
-        "3 outline edges that cross or touch others (the first at 295505.000, 5629250.500)",
-    ),
-    "two turns": (turned_twice(), "2 outline edges that cross or touch others (the first at"),
+    "face over others": (with_faces((0, 1, 14)), 1, OVERLAP, (0.5, 0)),
+    "layer": (with_patch(1.2, 1.3, 0.5), 8, UNDER, (1.45, 1.3)),
+    "layer below all": (with_patch(-1.5, -1.5, 4.0), 20, UNDER, (0.5, 0)),
+    "overhanging layer": (with_patch(4.2, 1.3, 0.7), 4, TOUCH, (5, 1.5)),
+    "edge at two edges": (with_patch(5.0, 0.5, 1.0), 7, TOUCH, (5, 0.5)),
+    "vertex in edge": (with_faces((36, 37, 38), points=[(5, 0.5), (6, 0), (6, 1)]), 3, TOUCH, (5, 0.5)),
+    "two turns": (turned_twice(), 2, TOUCH, ""),
 }
+"""Mesh, number and kind of its faults, and place of the first (m from the corner)."""
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_fault_is_found_with_kind_count_and_place(name):
-    mesh, line = FAULTS[name]
+    mesh, count, kind, place = FAULTS[name]
+    if isinstance(place, tuple):
+        place = f"{ORIGIN[0] + place[0]:.3f}, {ORIGIN[1] + place[1]:.3f}"
+    line = f"{count} {kind} (the first at {place}"
     assert len(faults(mesh)) == 1
     with pytest.raises(MeshFault, match="the mesh has .*; this is an error of FlexRoad, report it") as error:
         check(mesh)
@@ -226,7 +207,7 @@ def test_sampled_mesh_of_any_mask_and_survey_has_no_fault(
     cell, shape, road_m, ratio, method, halo, hole, data
 ):
     """Also where the survey ends at single cells, so that parts of the mesh meet at a vertex only."""
-    core = ground(shape[1], shape[0], cell)
+    core = make_grid(shape[1], shape[0], cell)
     mask, outside = (data.draw(arrays.arrays(bool, core.buffered(halo).shape)) for _ in range(2))
     options = Options(method=method, road_m=road_m * cell, terrain_m=ratio * road_m * cell)
     surface = Hills(hole and (core.west + hole[0], core.south + hole[1], hole[2]))

@@ -6,19 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality.estimate import INTERVAL
 from flexroad.tasks.quality.holdout import INSET_M, holdout, withheld_squares
 from flexroad.tasks.roads.dtm_validity import ground_to_fit
-from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 from flexroad.tools.prepare.points.to_rasters import Options
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from flexroad.tools.synthetic.scene import scan
+from tests.builders import given_heights, make_clusters, make_grid, make_mask, make_tile
 from tests.make_clouds import rasterise
 
-GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
+GRID = make_grid(250, 250)
 EVERYWHERE = np.ones(GRID.shape, bool)
 
 
@@ -49,22 +48,17 @@ def test_withheld_squares_need_road_cells():
         assert road[number == square].sum() >= 5
 
 
-def test_holdout_of_nothing_does_not_fit():
+def test_holdout_without_squares_or_second_fit_counts_no_square():
     def refit(data, clusters):
-        raise AssertionError
-
-    data, road, clusters = tile(1)
-    assert np.isnan(holdout(data, road, clusters, refit, 0.3, 0.0)["holdout_squares"])
-    nowhere = replace(clusters, labels=np.zeros_like(clusters.labels))
-    assert holdout(data, road, nowhere, refit, 0.3, 0.1)["holdout_squares"] == 0
-
-
-def test_holdout_without_enough_heights_for_a_second_fit_counts_no_square():
-    def refit(data, clusters):
+        if not clusters.mask.any():
+            raise AssertionError
         raise TaskError("fewer cells than control points")
 
     data, road, clusters = tile(1)
+    assert np.isnan(holdout(data, road, clusters, refit, 0.3, 0.0)["holdout_squares"])
     assert holdout(data, road, clusters, refit, 0.3, 0.5)["holdout_squares"] == 0
+    nowhere = replace(clusters, labels=np.zeros_like(clusters.labels))
+    assert holdout(data, road, nowhere, refit, 0.3, 0.1)["holdout_squares"] == 0
 
 
 def test_holdout_hides_squares_from_fit():
@@ -76,7 +70,7 @@ def test_holdout_hides_squares_from_fit():
         assert np.isnan(rest.dsm[hidden]).all()
         assert np.isnan(rest.dtm[hidden]).all()
         np.testing.assert_array_equal(rest.dsm[~hidden], data.dsm[~hidden])
-        return Heights(ground_to_fit(data, clusters) + hidden)
+        return given_heights(ground_to_fit(data, clusters) + hidden, GRID)
 
     result = holdout(data, road, clusters, refit, 0.3, 0.2)
     assert result["holdout_squares"] > 10
@@ -104,22 +98,9 @@ def covered(results: Iterable[dict[str, float]]) -> float:
 
 def tile(seed, scanned=False):
     scene = make_scene(GRID, seed, "suburban", SceneOptions(dsm_noise_m=(0.0, 0.0)))
-    data, mask = TileData("made", GRID, GRID, scene.dsm, scene.dtm), scene.reference_road
+    data, mask = make_tile(scene.dsm, scene.dtm), scene.reference_road
     if scanned:
         rasters = rasterise(scan(scene, per_m2=8, noise_m=0.03, seed=seed), GRID, Options(), None)
         data = replace(data, dsm=rasters.dsm, dtm=rasters.dtm, road_height=rasters.top.height)
     kept = mask & (np.abs(data.dsm - scene.reference) < 0.3)
-    nowhere = np.zeros(GRID.shape, bool)
-    return data, RoadMask(GRID, GRID, mask, nowhere), RoadClusters(GRID, kept.astype(np.int32))
-
-
-class Heights:
-    """A surface with given heights."""
-
-    bounds = GRID.hull
-
-    def __init__(self, heights):
-        self.heights = heights
-
-    def lattice(self, eastings, northings):
-        return self.heights
+    return data, make_mask(mask), make_clusters(kept)

@@ -21,9 +21,13 @@ from tests.make_roads import GRID, on_grid, tile, write, write_osm
 WEST_EAST = LineString(on_grid((10, 50), (90, 50)))
 
 
+def union(*paths, grid=GRID, **options):
+    """Return the union of all roads of the files near the tile."""
+    return shapely.union_all(roads(tile(*paths).roads, grid, Options(**options)).areas)
+
+
 def area(*paths, **options):
-    """Area of the union of all roads of the files near the tile (m2)."""
-    return shapely.union_all(roads(tile(*paths).roads, GRID, Options(**options)).areas).area
+    return union(*paths, **options).area
 
 
 def test_line_is_buffered_to_its_width_with_flat_ends(tmp_path):
@@ -44,7 +48,7 @@ def test_joined_lines_leave_no_wedge(tmp_path_factory, turn, wide, narrow):
     lines = [LineString(on_grid((10, 50), middle)), LineString(on_grid(middle, far))]
     path = tmp_path_factory.mktemp("abutment") / "r.geojson"
     write(path, lines, width_m=[wide, narrow])
-    result = shapely.union_all(roads(tile(path).roads, GRID, Options()).areas)
+    result = union(path)
     disc = Point(*on_grid(middle)[0]).buffer(min(wide, narrow) / 2, quad_segs=8)
     assert disc.difference(result).area < 1e-6
     round_ended = shapely.union_all(shapely.buffer(lines, np.array([wide, narrow]) / 2, quad_segs=64))
@@ -53,9 +57,7 @@ def test_joined_lines_leave_no_wedge(tmp_path_factory, turn, wide, narrow):
 
 def test_closed_line_has_no_gap(tmp_path):
     ring = LineString(on_grid((30, 30), (70, 30), (70, 70), (30, 70), (30, 30)))
-    result = shapely.union_all(
-        roads(tile(write(tmp_path / "r.gpkg", [ring], width=[6])).roads, GRID, Options()).areas
-    )
+    result = union(write(tmp_path / "r.gpkg", [ring], width=[6]))
     assert result.contains(Point(*on_grid((28, 28))[0])) is True
     assert len(result.interiors) == 1
 
@@ -86,17 +88,7 @@ def kept(mask, n):
 
 @pytest.mark.parametrize("column", ["highway", "class", "fclass", "HIGHWAY"])
 def test_left_out_classes_are_not_road(tmp_path, column):
-    classes = [
-        "residential",
-        "footway",
-        "steps",
-        "cycleway",
-        "proposed",
-        "razed",
-        "abandoned",
-        "construction",
-        "track",
-    ]
+    classes = "residential footway steps cycleway proposed razed abandoned construction track".split()
     mask = rasterise_roads(tile(strips(tmp_path, column, classes)))
     assert kept(mask, 9) == [True] + [False] * 7 + [True]
     chosen = rasterise_roads(tile(tmp_path / "r.gpkg"), Options(left_out=("track",)))
@@ -148,32 +140,23 @@ def test_layer_and_where_select_features(tmp_path):
     assert shapely.area(roads(chosen, GRID, Options()).areas).sum() == pytest.approx(80 * 20)
 
 
-# --- OSM's own format ---------------------------------------------------------------------------------
-
-
 def degrees(*places):
     lon, lat = transformer(GRID.crs, "EPSG:4326").transform(*np.array(on_grid(*places)).T)
     return list(zip(lon.tolist(), lat.tolist(), strict=True))
 
 
-@pytest.fixture
-def osm(tmp_path):
-    """Ways: road, bridge, tunnel, footway, river, building, and a service area as polygon."""
-    return write_osm(
-        tmp_path / "map.osm",
-        {
-            "highway=residential;width=7 m": degrees((10, 90), (90, 90)),
-            "highway=primary;lanes=2;bridge=yes": degrees((10, 70), (90, 70)),
-            "highway=primary;tunnel=yes": degrees((10, 55), (90, 55)),
-            "highway=footway": degrees((10, 45), (90, 45)),
-            "waterway=river;width=9": degrees((10, 35), (90, 35)),
-            "building=yes": degrees((10, 10), (30, 10), (30, 25), (10, 25), (10, 10)),
-            "highway=service;area=yes": degrees((60, 10), (80, 10), (80, 25), (60, 25), (60, 10)),
-        },
-    )
-
-
-def test_osm_file_gives_lines_and_areas(osm):
+def test_osm_file_gives_lines_and_areas(tmp_path):
+    ways = {
+        "highway=residential;width=7 m": degrees((10, 90), (90, 90)),
+        "highway=primary;lanes=2;bridge=yes": degrees((10, 70), (90, 70)),
+        "highway=primary;tunnel=yes": degrees((10, 55), (90, 55)),
+        "highway=footway": degrees((10, 45), (90, 45)),
+        "waterway=river;width=9": degrees((10, 35), (90, 35)),
+        "building=yes": degrees((10, 10), (30, 10), (30, 25), (10, 25), (10, 10)),
+        "highway=service;area=yes": degrees((60, 10), (80, 10), (80, 25), (60, 25), (60, 10)),
+    }
+    osm = tmp_path / "map.osm"
+    write_osm(osm, ways)
     result = roads(tile(osm).roads, GRID, Options())
     # The scale of the UTM zone is 0.9996 here; nodes are stored to 1e-7 degrees, about 1 cm.
     assert sorted(shapely.area(result.areas)) == pytest.approx([15 * 20, 80 * 7, 80 * 7], rel=0.01)
@@ -191,31 +174,20 @@ def test_osm_pbf_with_unsorted_nodes_is_read():
         sample, layer="lines", where="highway IS NOT NULL", USE_CUSTOM_INDEXING="NO"
     ).to_crs("EPSG:32630")
     grid = Grid.covering("EPSG:32630", tuple(table.total_bounds), 1.0)
-    result = shapely.union_all(roads(tile(sample).roads, grid, Options()).areas)
+    result = union(sample, grid=grid)
     streets = table[table.highway == "residential"].geometry
     assert len(streets) == 20
     assert all(result.buffer(0.01).covers(street) for street in streets)
     (motorway,) = table[table.highway == "motorway"].geometry
     assert not result.covers(motorway)
-    with_tunnels = shapely.union_all(roads(tile(sample).roads, grid, Options(tunnels=True)).areas)
-    assert with_tunnels.buffer(0.01).covers(motorway)
-
-
-# --- one index per file -------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def readings(monkeypatch):
-    """A list that grows by one entry per read of a file."""
-    count = []
-    read = vectors._read
-    monkeypatch.setattr(vectors, "_read", lambda *args: count.append(1) or read(*args))
-    return count
+    assert union(sample, grid=grid, tunnels=True).buffer(0.01).covers(motorway)
 
 
 @pytest.mark.parametrize("suffix", ["gpkg", "geojson"])
-def test_file_is_read_once_for_many_tiles(tmp_path, readings, suffix):
+def test_file_is_read_once_for_many_tiles(tmp_path, monkeypatch, suffix):
     """Also if the tiles lie in two of the squares in which an indexed file is read."""
+    readings, read = [], vectors._read
+    monkeypatch.setattr(vectors, "_read", lambda *args: readings.append(1) or read(*args))
     line = LineString([(399_000, 5_699_990), (401_000, 5_699_990)])
     crs = GRID.crs
     path = tmp_path / f"r.{suffix}"

@@ -1,22 +1,20 @@
 """Heights that roads are fitted to, and the fit on synthetic scans with a scanner's noise."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from flexroad.catalog import Grid
-from flexroad.catalog.borders import border_of
-from flexroad.tasks.border import ENDS
-from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality import assess
 from flexroad.tasks.roads.road_height import dsm_offset, with_road_heights
-from flexroad.tasks.spline.frame import Frame
-from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import RoadClusters, TileData
 from flexroad.tools.prepare.points.to_rasters import Options as Rastering
 from flexroad.tools.synthetic import SceneOptions, make_scene
 from flexroad.tools.synthetic.scene import scan
+from tests.builders import filtered, make_frame
 from tests.make_clouds import rasterise
 
 GRID = Grid("EPSG:25832", 500000, 5600300, 1.0, 300, 300)
@@ -46,11 +44,8 @@ def test_dsm_offset_is_local_median_on_open_road():
     assert np.abs(offset - 0.02)[:, :100][road[:, :100]].max() < 0.01
     assert np.abs(offset - 0.08)[:, 200:][road[:, 200:]].max() < 0.01
     assert np.isfinite(offset).all()
-
-
-def test_dsm_offset_without_open_road_is_zero():
-    data, clusters = flat(np.zeros(GRID.shape, bool), 0.05)
-    assert not dsm_offset(data, clusters.mask).any()
+    # Without open road it is 0.
+    assert not dsm_offset(data, np.zeros_like(road)).any()
 
 
 def test_dsm_offset_of_part_equals_that_of_whole_inside():
@@ -87,37 +82,11 @@ def scanned(seed, stratum):
     return scene, data, rasters.top.height
 
 
-def filtered(data):
-    road = RoadMask(data.grid, data.core, data.road_mask, data.beyond_extent())
-    return road, planar.ecsrc(data, road, planar.Options(shoulder_m=5))
-
-
-def part_of(data, grid):
-    cut = data.grid.window(grid)
-    layer = None if data.road_height is None else data.road_height[cut]
-    return replace(
-        data,
-        grid=grid,
-        core=grid,
-        dsm=data.dsm[cut],
-        dtm=data.dtm[cut],
-        road_mask=data.road_mask[cut],
-        road_height=layer,
-    )
-
-
 def surface_of(data):
     """Fit the corners, the edges and the tile, as in a run."""
-    parts, options = [], smoothing_spline.Options()
-    for number, border in enumerate(border_of(CORE, AROUND_M)):
-        around = part_of(data, border.grid)
-        road, clusters = filtered(around)
-        if number < 4:
-            parts.append(smoothing_spline.corner(around, road, clusters, border, options))
-        else:
-            ends = [parts[end] for end in ENDS[number - 4]]
-            parts.append(smoothing_spline.edge(around, road, clusters, border, ends, options))
-    return smoothing_spline.fit(data, filtered(data)[1], options, Frame(*parts))
+    options = smoothing_spline.Options()
+    frame = make_frame(partial(filtered, data), CORE, AROUND_M, options)
+    return smoothing_spline.fit(data, filtered(data, GRID, CORE)[2], options, frame)
 
 
 @pytest.mark.slow
@@ -125,7 +94,7 @@ def surface_of(data):
 def test_road_of_noisy_scan_is_unbiased_with_layer_and_offset_and_not_with_dsm(seed, stratum):
     scene, data, layer = scanned(seed, stratum)
     core = GRID.window(CORE)
-    kept = filtered(data)[1].mask[core] & scene.reference_road[core]
+    kept = filtered(data, GRID, CORE)[2].mask[core] & scene.reference_road[core]
     truth = scene.reference[core]
     rim = np.ones(CORE.shape, bool)
     rim[8:-8, 8:-8] = False
@@ -148,7 +117,7 @@ def test_road_of_noisy_scan_is_unbiased_with_layer_and_offset_and_not_with_dsm(s
 def test_assess_compares_with_the_heights_that_the_road_was_fitted_to():
     _, data, layer = scanned(3, "urban")
     for chosen, excess in ((data, 0.0), (replace(data, road_height=layer), 1.6 * NOISE_M)):
-        road, clusters = filtered(chosen)
+        _, road, clusters = filtered(chosen, GRID, CORE)
         surface = smoothing_spline.fit(chosen, clusters, smoothing_spline.Options())
         quality = assess.assess(chosen, road, clusters, surface, assess.Options())
         assert abs(quality.residual_median_m) < 0.004

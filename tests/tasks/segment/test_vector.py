@@ -1,12 +1,11 @@
-import re
-
+import geopandas
 import numpy as np
 import pytest
 from shapely import LineString, box
 
 from flexroad.tasks import TaskError
 from flexroad.tasks.segment.vector import VERSION, Options, segment
-from tests.make_roads import GRID, on_grid, tile, write
+from tests.make_roads import GRID, in_cp1252, on_grid, tile, write
 
 LINE = LineString(on_grid((0, 50), (100, 50)))
 GOLDEN = (2, 2045, 106474, 109174, 672)
@@ -27,13 +26,10 @@ def test_segment_lines_give_mask_and_bridges(tmp_path):
 
 
 def test_segment_lines_in_degrees_are_reprojected(tmp_path):
-    import geopandas
-
-    lines = geopandas.GeoSeries([LINE], crs=GRID.crs).to_crs("EPSG:4326")
-    projected = segment(tile(write(tmp_path / "m.gpkg", [LINE], width=[6.4])), Options())
-    reprojected = segment(
-        tile(write(tmp_path / "d.geojson", list(lines), "EPSG:4326", width=[6.4])), Options()
-    )
+    lines = list(geopandas.GeoSeries([LINE], crs=GRID.crs).to_crs("EPSG:4326"))
+    metres = write(tmp_path / "m.gpkg", [LINE], width=[6.4])
+    degrees = write(tmp_path / "d.geojson", lines, "EPSG:4326", width=[6.4])
+    projected, reprojected = (segment(tile(path), Options()) for path in (metres, degrees))
     np.testing.assert_array_equal(projected.mask, reprojected.mask)
 
 
@@ -48,26 +44,24 @@ def test_segment_file_without_crs_uses_that_of_catalog(tmp_path):
     assert segment(tile(path, crs=GRID.crs), Options()).mask.sum() == 600
 
 
-def test_segment_line_beside_tile_covers_cells_within_half_width(tmp_path):
-    line = LineString(on_grid((0, -10), (100, -10)))
-    path = write(tmp_path / "r.gpkg", [line], width=[24])
-    assert segment(tile(path), Options()).mask.sum() == 200
+BESIDE = LineString(on_grid((0, -10), (100, -10)))
 
 
-def test_segment_road_only_in_halo_is_kept_with_a_note(tmp_path):
-    core = GRID
-    path = write(tmp_path / "r.gpkg", [LineString(on_grid((0, -10), (100, -10)))], width=[6])
-    road = segment(tile(path, grid=core.buffered(20), core=core), Options())
-    assert road.mask.sum() == 600
-    assert re.match("segment: no road of r.gpkg lies on this tile; .*segment.where", road.notes[-1])
-
-
-@pytest.mark.parametrize(("crs", "options"), [("EPSG:25832", {"where": "id = 7"}), ("EPSG:3857", {})])
-def test_segment_no_road_on_tile_gives_empty_mask_and_note(tmp_path, crs, options):
-    path = write(tmp_path / "r.gpkg", [LINE], crs)
-    road = segment(tile(path), Options(**options))
-    assert not road.mask.any()
-    assert "no road of r.gpkg lies on this tile" in road.notes[-1]
+@pytest.mark.parametrize(
+    ("line", "crs", "options", "cells"),
+    [
+        (BESIDE, GRID.crs, {}, 600),
+        (LINE, GRID.crs, {"where": "width = 7"}, 0),
+        (LINE, "EPSG:3857", {}, 0),
+    ],
+    ids=["in the halo", "not selected", "elsewhere"],
+)
+def test_segment_no_road_on_tile_gives_a_note(tmp_path, line, crs, options, cells):
+    path = write(tmp_path / "r.gpkg", [line], crs, width=[6])
+    road = segment(tile(path, grid=GRID.buffered(20), core=GRID), Options(**options))
+    assert road.mask.sum() == cells
+    assert road.notes[-1].startswith("segment: no road of r.gpkg lies on this tile; ")
+    assert "segment.where" in road.notes[-1]
 
 
 def test_segment_several_files_are_merged(tmp_path):
@@ -95,19 +89,16 @@ def test_segment_unusable_file_raises_one_line(tmp_path, make, options, message)
     assert caught.value.layer == "roads"
 
 
-def test_segment_crs_that_is_no_text_raises_one_line(tmp_path):
+def test_segment_damaged_file_raises(tmp_path):
+    path = write(tmp_path / "r.geojson", [LINE] * 50)
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(TaskError, match="r.geojson cannot be read"):
+        segment(tile(path), Options())
+    # The CRS is no text.
     path = write(tmp_path / "r.shp", [LINE])
     crs = path.with_suffix(".prj")
     crs.write_bytes(crs.read_bytes().replace(b"ETRS", b"\xd8TRS"))
     with pytest.raises(TaskError, match="cannot be read as vectors"):
-        segment(tile(path), Options())
-
-
-def test_segment_truncated_file_raises(tmp_path):
-    whole = write(tmp_path / "whole.geojson", [LINE] * 50)
-    path = tmp_path / "r.geojson"
-    path.write_bytes(whole.read_bytes()[:-500])
-    with pytest.raises(TaskError, match="r.geojson cannot be read"):
         segment(tile(path), Options())
 
 
@@ -143,9 +134,7 @@ def test_segment_golden(tmp_path):
 
 def test_class_in_another_encoding_than_declared_costs_no_road(tmp_path):
     path = write(tmp_path / "a.shp", [LINE], highway=["xxxxxxx"])
-    dbf = path.with_suffix(".dbf")
-    dbf.write_bytes(dbf.read_bytes().replace(b"xxxxxxx", "Straße ".encode("cp1252")))
-    path.with_suffix(".cpg").write_text("UTF-8")
+    in_cp1252(path, "xxxxxxx", "Straße ")
     declared = write(tmp_path / "b.shp", [LINE], highway=["Straße"])
     road, expected = (segment(tile(file), Options()) for file in (path, declared))
     assert np.array_equal(road.mask, expected.mask)

@@ -7,19 +7,17 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from flexroad.catalog.borders import border_of
-from flexroad.catalog.grid import Grid
 from flexroad.pipeline.store.artefacts import decode, encode
 from flexroad.tasks import sample
-from flexroad.tasks.border import ENDS
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.metrics.mesh_check import check
-from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+from tests.builders import make_frame, make_grid
 
 SIZE, AROUND_M, STEP_M = 60, 40, 0.3
-TILES = [Grid("EPSG:25832", 500000.0 + SIZE * k, 5600060.0, 1.0, SIZE, SIZE) for k in (0, 1)]
+TILES = [make_grid(SIZE, SIZE, west=500000.0 + SIZE * k, north=5600060.0) for k in (0, 1)]
 EDGE = TILES[1].west
-WORLD = Grid("EPSG:25832", 499950.0, 5600110.0, 1.0, 220, 160)
+WORLD = make_grid(220, 160, west=499950.0, north=5600110.0)
 OPTIONS = smoothing_spline.Options()
 ALONG = {
     "across the edge": lambda x, y: np.abs(y - 5600030) < 5,
@@ -43,7 +41,8 @@ def world(where):
     return dsm, ground(x, y, where), road, ~road & (away < 6), beside
 
 
-def part(where, grid, core):
+def part(where, grid, core=None):
+    core = core or grid
     window = WORLD.window(grid)
     dsm, dtm, road, verge, beside = (values[window] for values in world(where))
     data = TileData("t", grid, core, dsm, dtm)
@@ -53,15 +52,7 @@ def part(where, grid, core):
 
 @cache
 def frame_of(where, tile):
-    parts = []
-    for number, border in enumerate(border_of(tile, AROUND_M)):
-        data, mask, clusters = part(where, border.grid, border.grid)
-        if number < 4:
-            parts.append(smoothing_spline.corner(data, mask, clusters, border, OPTIONS))
-        else:
-            ends = [parts[end] for end in ENDS[number - 4]]
-            parts.append(smoothing_spline.edge(data, mask, clusters, border, ends, OPTIONS))
-    return Frame(*parts)
+    return make_frame(lambda grid: part(where, grid), tile, AROUND_M, OPTIONS)
 
 
 @cache
@@ -72,14 +63,6 @@ def fitted(where, number):
 
 
 ON_EDGE = 5600000 + np.linspace(0, SIZE, 10 * SIZE + 1)
-
-
-@pytest.mark.parametrize("where", ALONG)
-def test_heights_of_neighbours_on_their_edge_have_the_same_bits(where):
-    west, east = (fitted(where, number).height(EDGE, ON_EDGE) for number in (0, 1))
-    assert west.tobytes() == east.tobytes()
-    lattices = [fitted(where, number).lattice(np.array([EDGE]), ON_EDGE)[:, 0] for number in (0, 1)]
-    np.testing.assert_allclose(lattices, [west, east], rtol=0, atol=1e-9)
 
 
 def test_ground_goes_on_across_the_edge():
@@ -134,7 +117,7 @@ def test_edge_is_stored_without_loss():
 def test_edge_without_steps_has_none():
     tile = TILES[0]
     border = border_of(tile, AROUND_M)[7]
-    data, mask, clusters = part("across the edge", border.grid, border.grid)
-    ends = frame_of("across the edge", tile).south_east, frame_of("across the edge", tile).north_east
+    frame = frame_of("across the edge", tile)
     options = OPTIONS.model_copy(update={"steps": False})
-    assert smoothing_spline.edge(data, mask, clusters, border, ends, options).steps is None
+    made = part("across the edge", border.grid), border, (frame.south_east, frame.north_east), options
+    assert smoothing_spline.edge(*made[0], *made[1:]).steps is None

@@ -1,31 +1,28 @@
 """The convex solver against exact optima; its parts against dense matrices and known integrals."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 from scipy.optimize import linprog
 
-from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import nurbs, smoothing_spline
-from flexroad.tasks.spline import adam, irls
+from flexroad.tasks.spline import irls
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import clamped_space
 from flexroad.tasks.spline.stencil import bending_energy, from_lines, line_width, multiply, to_lines
 from flexroad.tasks.spline.surface import basis_matrix, dense
-from flexroad.tasks.types import RoadClusters, TileData
+from tests.builders import NORTH, WEST, make_clusters, make_grid, make_street
 
-WEST, NORTH = 295500.0, 5629500.0
 UNIFORM_L1 = {"lambda_terrain": 1.0, "huber_m": 0.0, "bending_m3": 100.0}
 """Options of an L1 loss with equal weights for road and terrain."""
 
 
 def space(n, m, shape, degree=3, cell=1.0):
-    rows, cols = shape
-    return clamped_space(Grid("", 0, 0, cell, cols, rows), degree, (n, m))
+    return clamped_space(make_grid(*shape[::-1], cell), degree, (n, m))
 
 
 def noisy_heights(shape, seed=0):
@@ -80,18 +77,17 @@ def test_bending_energy_uses_curvature_in_metres(cells):
 
 def test_bending_energy_grows_with_stiffness_and_square_of_height():
     stiffness, z = np.random.default_rng(0).random((20, 24)), np.random.default_rng(1).normal(size=(6, 7))
-    energy, gradient = energy_of(bending_energy(stiffness, space(7, 6, (20, 24))), z)
-    thrice = bending_energy(3 * stiffness, space(7, 6, (20, 24)))
+    bending, thrice = (bending_energy(share * stiffness, space(7, 6, (20, 24))) for share in (1, 3))
+    energy, gradient = energy_of(bending, z)
     assert energy_of(thrice, 2 * z)[0] == pytest.approx(12 * energy)
     h, direction = 1e-6, np.random.default_rng(2).normal(size=z.shape)
-    bending = bending_energy(stiffness, space(7, 6, (20, 24)))
     numeric = (energy_of(bending, z + h * direction)[0] - energy_of(bending, z - h * direction)[0]) / (2 * h)
     assert np.vdot(gradient, direction) == pytest.approx(numeric, rel=1e-6)
 
 
-def test_irls_l1_reaches_linear_programming_optimum():
-    """Against the exact optimum by linear programming."""
-    loss = convex_loss()
+@pytest.mark.parametrize("degree", [1, 2, 3, 6])
+def test_irls_l1_reaches_linear_programming_optimum(degree):
+    loss = convex_loss(degree=degree)
     z, losses = irls.minimise(loss, np.zeros(loss.held.shape), 100, 1e-7)
     o = loss.objective
     design, size = design_matrix(loss), np.prod(loss.held.shape)
@@ -127,37 +123,12 @@ def test_irls_huber_near_newton_reaches_same_minimum_in_few_steps(huber_m, more,
     assert (np.diff(fast) <= 0).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("degree", [1, 2, 3, 6])
-def test_irls_reaches_loss_of_long_adam_run(degree, monkeypatch):
-    """The paper's loss without its regulariser; Adam takes ten times as many steps at a tenth of the rate."""
-    loss = convex_loss((40, 44), degree + 6, degree + 7, degree)
-    z, losses = irls.minimise(loss, np.zeros(loss.held.shape), 100, 1e-6)
-    start, limit = np.zeros((2, *loss.held.shape)), np.full((2, 1, 1), np.inf)
-    monkeypatch.setattr(adam, "STOP_TOLERANCE", 0)
-    _, by_adam = adam.minimise(loss.objective, start, limit, 0.01, 2000)
-    assert losses[-1] < 1.0005 * min(by_adam)
-    assert loss.objective(np.stack([z, np.zeros_like(z)]))[0] == pytest.approx(losses[-1])
-    assert (np.diff(losses) <= 0).all()
-
-
-def tile(ground, noise=0.0, size=90):
-    grid = Grid("EPSG:25832", WEST, NORTH, 1.0, size, size)
-    truth = ground(*np.meshgrid(grid.eastings - WEST, NORTH - grid.northings))
-    rng = np.random.default_rng(0)
-    dsm, dtm = (truth + rng.normal(0, noise, truth.shape) for _ in range(2))
-    road = np.zeros(truth.shape, np.int32)
-    road[size // 2 - 5 : size // 2 + 5] = 1
-    return TileData("t", grid, grid, dsm, dtm), RoadClusters(grid, road), truth
+tile = partial(make_street, shape=(90, 90))
 
 
 def fitted(data, clusters, **changes):
     options = smoothing_spline.Options(**{"spacing_m": 89 / 24, **UNIFORM_L1, **changes})
     return smoothing_spline.fit(data, clusters, options)
-
-
-def fitted_by_adam(data, clusters):
-    return nurbs.fit(data, clusters, nurbs.Options(control_points=(25, 25)))
 
 
 def on_cells(surface, data):
@@ -185,7 +156,7 @@ def test_fit_noisy_road_is_smoother_than_paper_fit():
 
     data, clusters, truth = tile(lambda e, s: 160 + 2 * np.sin(e / 25) + np.cos(s / 30), noise=0.1)
     by_irls = on_cells(fitted(data, clusters), data)
-    by_adam = on_cells(fitted_by_adam(data, clusters), data)
+    by_adam = on_cells(nurbs.fit(data, clusters, nurbs.Options(control_points=(25, 25))), data)
     errors = [abs(heights - truth)[40:50].mean() for heights in (by_irls, by_adam)]
     assert errors[0] < 0.75 * errors[1]
     assert roughness(by_irls) < 0.75 * roughness(by_adam)
@@ -204,7 +175,7 @@ def test_fit_soft_terrain_follows_bank_beside_road(monkeypatch):
 
 def test_fit_without_road_or_terrain_follows_other_data():
     data, clusters, truth = tile(lambda e, s: 160 + np.sin(e / 20), noise=0.02)
-    no_road = RoadClusters(data.grid, np.zeros_like(clusters.labels))
+    no_road = make_clusters(np.zeros_like(clusters.mask))
     assert abs(on_cells(fitted(data, no_road), data) - truth).mean() < 0.05
     road_only = on_cells(fitted(data, clusters, lambda_terrain=0), data)
     assert abs(road_only - truth)[clusters.mask].mean() < 0.05
@@ -225,7 +196,7 @@ def test_fit_without_road_or_terrain_follows_other_data():
 def test_fit_any_input_has_no_pole_and_bounded_weights(method, options, seed, road, missing, scale):
     """Any mask and DSM: the surface stays within its control heights and near the data."""
     rng = np.random.default_rng(seed)
-    data, clusters, _ = tile(lambda e, s: 160 + 0 * e, size=40)
+    data, clusters, _ = tile(lambda e, s: 160 + 0 * e, shape=(40, 40))
     heights = np.clip(10**scale * rng.standard_t(2, (2, 40, 40)), -3000, 3000)
     heights[rng.random(heights.shape) < missing] = np.nan
     clusters.labels[:] = np.kron(rng.random((5, 5)) < road, np.ones((8, 8)))
@@ -243,10 +214,3 @@ def test_fit_any_input_has_no_pole_and_bounded_weights(method, options, seed, ro
     steps = options.iterations if method is nurbs else 0
     # Control points outside the tile continue its slope; their heights alone mean nothing.
     assert np.abs(inner - np.nanmedian(heights)).max() <= 3 * spread + steps
-
-
-@pytest.mark.parametrize("wrong", [{"iterations": 9}, {"degree": 1}, {"bending_m3": 0}, {"weights": "free"}])
-def test_options_out_of_bounds_are_refused(wrong):
-    (name,) = wrong
-    with pytest.raises(ValidationError, match=name):
-        smoothing_spline.Options(**wrong)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import shapely
 
-from flexroad.catalog.grid import Grid
 from flexroad.pipeline.store.artefacts import decode, encode
 from flexroad.tasks.spline.frame import Corner, Edge
 from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.space import Lattice, surface_on
 from flexroad.tasks.types import Level, LevelSpline, RoadClusters, RoadMask
+from tests.builders import make_grid
 
-GRID = Grid("EPSG:25832", 500000.0, 5600060.0, 1.0, 60, 60)
+GRID = make_grid(60, 60, west=500000.0, north=5600060.0)
 WEST, SOUTH = GRID.west, GRID.south
 LEVEL = Level(
     1,

@@ -4,21 +4,19 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from flexroad.catalog.grid import Grid
 from flexroad.tasks.spline.moving import WEIGHTS, loss_by_variables, moving
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import clamped_space, surface_on
 from flexroad.tasks.spline.surface import NurbsSurface, basis_matrix
+from tests.builders import make_grid
 
-GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 40, 50)
+GRID = make_grid(40, 50)
 SPACE = clamped_space(GRID, 3, (8, 9))
 
 
-def surface(weights: str = "random") -> NurbsSurface:
+def surface(w=None) -> NurbsSurface:
     rng = np.random.default_rng(4)
-    z, w = rng.normal(0, 1, (9, 8)), np.ones((9, 8))
-    if weights == "random":
-        w = rng.uniform(0.2, 5, w.shape)
+    z, w = rng.normal(0, 1, (9, 8)), rng.uniform(0.2, 5, (9, 8)) if w is None else w
     return surface_on(SPACE, GRID, GRID.hull, w * z, w, 150.0)
 
 
@@ -47,7 +45,7 @@ def test_moved_equals_the_rational_sum_over_control_points(uniform):
 
 def test_moved_with_unit_weights_stays_in_place():
     easting, northing = lattice()
-    made = moving(surface("unit"))
+    made = moving(surface(np.ones((9, 8))))
     x, y = made.moved(easting, northing)
     np.testing.assert_allclose(x + made.origin[0], easting, atol=1e-6)
     np.testing.assert_allclose(y + made.origin[1], northing, atol=1e-6)
@@ -78,12 +76,9 @@ def test_loss_gradient_equals_finite_differences(name):
     )
 
 
-@pytest.mark.parametrize("name", WEIGHTS)
-def test_weights_start_at_one(name):
-    assert WEIGHTS[name][1](np.array(WEIGHTS[name][0])) == pytest.approx(1)
-
-
-def test_softplus_weights_are_positive_and_without_bound():
+def test_weights_start_at_one_and_softplus_is_positive_without_bound():
+    for start, weights, *_ in WEIGHTS.values():
+        assert weights(np.array(start)) == pytest.approx(1)
     values = WEIGHTS["softplus"][1](np.array([-30.0, 0.0, 500.0]))
     assert values[0] > 0
     assert values[2] == pytest.approx(500)

@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexroad.catalog.grid import Grid
 from flexroad.pipeline.store.artefacts import decode, encode
 from flexroad.tasks import sample
 from flexroad.tasks.fit import smoothing_spline
+from flexroad.tasks.meshing.survey_limit import APART, breaklines
 from flexroad.tasks.metrics.mesh_check import check
 from flexroad.tasks.metrics.mesh_distance import drape
-from flexroad.tasks.spline.stepped import between
+from flexroad.tasks.spline.stepped import SteppedSurface, between
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+from tests.builders import make_clusters, make_grid, make_mask, make_tile
 
-GRID = Grid("EPSG:25832", 500000.0, 5600060.0, 1.0, 60, 60)
+GRID = make_grid(60, 60)
 ROWS = np.arange(60)[:, None] * np.ones(60)
 ROAD = np.abs(ROWS - 29.5) < 5
 EDGE = np.abs(np.abs(ROWS - 29.5) - 5) < 1
@@ -34,8 +34,7 @@ def tile(height, noise_m=0.02):
     truth = 100 + np.where(ROAD, 0.0, height)
     smoothed = 100 + height * np.clip(beyond / 2, 0, 1)
     dsm = truth + noise_m * np.random.default_rng(0).standard_normal(GRID.shape)
-    clusters = RoadClusters(GRID, ROAD.astype(np.int32), VERGE, BESIDE)
-    return TileData("t", GRID, GRID, dsm, smoothed), clusters, truth
+    return make_tile(dsm, smoothed), make_clusters(ROAD, dtm_invalid=VERGE, beside=BESIDE), truth
 
 
 def fitted(data, clusters, steps=True):
@@ -61,6 +60,9 @@ def test_steps_error_at_edge_is_halved_and_road_unchanged(height):
     assert np.array_equal(stepped.A, smooth.A)
     assert np.array_equal(heights(stepped)[ROAD], heights(smooth)[ROAD])
     assert np.abs(heights(stepped) - truth)[inner(VERGE)].mean() < 0.03
+    restored, *_ = decode(encode(stepped, {}, (), ""), "")
+    assert type(restored) is type(stepped)
+    assert heights(restored).tobytes() == heights(stepped).tobytes()
 
 
 def test_steps_on_level_ground_are_noise():
@@ -94,18 +96,13 @@ def test_height_on_the_border_is_that_of_the_spline():
     expected = surface.smooth(np.linspace(west, east, 5), np.full(5, south))
     np.testing.assert_allclose(nodes[0], expected, rtol=0, atol=1e-9)
     assert np.abs(surface.steps[:, [0, -1]]).max() > 1
-
-
-def test_steps_height_equals_lattice():
-    data, clusters, _ = tile(4.0)
-    surface = fitted(data, clusters)
-    x, y = np.meshgrid(GRID.eastings, GRID.northings)
-    np.testing.assert_allclose(surface.height(x, y), heights(surface), rtol=0, atol=1e-9)
+    inside = surface.height(*np.meshgrid(GRID.eastings, GRID.northings))
+    np.testing.assert_allclose(inside, heights(surface), rtol=0, atol=1e-9)
 
 
 def test_surface_without_verge_has_no_steps():
     data, clusters, _ = tile(4.0)
-    assert type(fitted(data, RoadClusters(GRID, clusters.labels))) is NurbsSurface
+    assert type(fitted(data, make_clusters(clusters.mask))) is NurbsSurface
 
 
 def test_ground_beside_the_road_is_the_dtm():
@@ -132,24 +129,13 @@ def test_hidden_road_has_no_steps():
     assert not np.array_equal(stepped, plain)
 
 
-def test_stepped_surface_is_stored_without_loss():
-    data, clusters, _ = tile(4.0)
-    surface = fitted(data, clusters)
-    restored, *_ = decode(encode(surface, {}, (), ""), "")
-    assert type(restored) is type(surface)
-    assert isinstance(restored, NurbsSurface)
-    assert heights(restored).tobytes() == heights(surface).tobytes()
-
-
 @pytest.mark.parametrize("height", [0.12, 4.0, -4.0])
 def test_mesh_has_edges_of_steps(height):
     data, clusters, truth = tile(height)
-    nothing = np.zeros_like(ROAD)
-    road = RoadMask(GRID, GRID, ROAD, nothing)
     errors = []
     for steps in (False, True):
         options = sample.Options(breaklines=steps)
-        mesh = sample.sample(fitted(data, clusters, steps), road, clusters, options)
+        mesh = sample.sample(fitted(data, clusters, steps), make_mask(ROAD), clusters, options)
         check(mesh)
         errors.append(np.abs(drape(mesh, GRID) + mesh.origin[2] - truth)[EDGE & (np.abs(ROWS.T - 29.5) < 27)])
     assert errors[1].mean() < errors[0].mean() / 2
@@ -165,9 +151,8 @@ def test_steps_are_measured_from_the_heights_that_the_road_is_fitted_to():
 @pytest.mark.parametrize("method", ["dynamic", "uniform"])
 def test_mesh_without_breaklines_has_a_smooth_road_and_the_ground_beside(method):
     data, clusters, truth = tile(0.5)
-    road = RoadMask(GRID, GRID, ROAD, np.zeros(GRID.shape, bool))
     plain, stepped = (
-        sample.sample(fitted(data, clusters, steps), road, clusters, sample.Options(method=method))
+        sample.sample(fitted(data, clusters, steps), make_mask(ROAD), clusters, sample.Options(method=method))
         for steps in (False, True)
     )
     check(stepped)
@@ -181,17 +166,6 @@ def test_mesh_without_breaklines_has_a_smooth_road_and_the_ground_beside(method)
 def test_breaklines_without_dynamic_sampling_are_refused():
     with pytest.raises(ValueError, match="method uniform has no breaklines; choose method dynamic"):
         sample.Options(method="uniform", breaklines=True)
-
-
-def test_plane_with_a_hole_is_filled_with_the_plane():
-    plane = 3 + 0.2 * ROW - 0.1 * COL
-    hole = (ROW > 3) & (ROW < 8) & (COL > 4) & (COL < 10)
-    np.testing.assert_allclose(between(np.where(hole, np.nan, plane), INSIDE), plane, atol=1e-6)
-
-
-def test_cells_outside_have_no_effect():
-    values = np.where(COL == 1, 5.0, np.where(INSIDE, np.nan, 1e6))
-    np.testing.assert_allclose(between(values, INSIDE)[INSIDE], 5.0, atol=1e-5)
 
 
 def test_part_without_a_known_value_is_zero():
@@ -212,3 +186,35 @@ def test_each_filled_value_is_the_mean_of_its_neighbours(seed, share):
         away = np.abs(ROW - row) + np.abs(COL - col)
         beside = filled[cells & (away == 1)]
         assert abs(filled[row, col] - (beside.mean() if beside.size else 0.0)) < 1e-5
+
+
+CELLS = make_grid(30, 30)
+LOCAL = (0.0, 0.0, 30.0, 30.0)
+NOISE = 0.1 * np.random.default_rng(0).standard_normal(CELLS.shape)
+HIGH = np.zeros(CELLS.shape, bool)
+HIGH[10:20] = True
+
+
+def level(steps) -> SteppedSurface:
+    """A level spline with steps."""
+    knots = np.array([0.0, 0, 1, 1])
+    spline = {"crs": CELLS.crs, "bounds": CELLS.exact_bounds, "degree": (1, 1), "datum": 0.0}
+    spline |= {"knots_u": knots, "knots_v": knots, "A": np.full((2, 2), 100.0), "W": np.ones((2, 2))}
+    steps = np.asarray(steps, np.float32)
+    spline |= {"south_north": np.zeros((2, CELLS.width)), "west_east": np.zeros((2, CELLS.height))}
+    return SteppedSurface(**spline, origin=CELLS.origin, steps=steps, cells=CELLS)
+
+
+def test_noise_of_single_cells_has_no_line():
+    assert breaklines(level(NOISE), LOCAL)[0].is_empty
+
+
+@pytest.mark.parametrize("step", [0.3, -4.0])
+def test_edge_with_noise_has_two_lines_with_its_heights(step):
+    lines, height = breaklines(level(np.where(HIGH, step, 0.0) + 0.3 * NOISE), LOCAL)
+    _, low, _, high = lines.bounds
+    assert (low, high) == pytest.approx((10 - APART / 2, 20 + APART / 2))
+    # Two lines around a block that ends one cell from the border of the tile.
+    assert lines.length == pytest.approx(2 * 2 * (28 + 10), rel=0.05)
+    sides = np.array([[15.5, 20 - APART / 2], [15.5, 20 + APART / 2]])
+    np.testing.assert_allclose(height(sides), [100 + step, 100], atol=0.2)

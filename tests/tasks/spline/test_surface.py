@@ -1,6 +1,4 @@
-"""The basis against SciPy, the exported surface against geomdl, other properties against algebra."""
-
-from dataclasses import fields
+"""The basis against SciPy, the exported surface against geomdl, and the lattice that tiles share."""
 
 import numpy as np
 import pytest
@@ -9,8 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from flexroad.tasks.spline.surface import NurbsSurface, basis, basis_matrix, clamped_knots, exact, greville
-from flexroad.tasks.types import Surface
+from flexroad.tasks.spline.space import Lattice
+from flexroad.tasks.spline.surface import (
+    NurbsSurface,
+    basis,
+    basis_matrix,
+    clamped_knots,
+    exact,
+    greville,
+    uniform_knots,
+)
+from tests.builders import make_surface
 
 BOUNDS = (295500.5, 5629250.5, 295749.5, 5629399.5)
 DEGREES = range(1, 11)
@@ -20,36 +27,13 @@ parameters = st.lists(st.floats(0, 1), min_size=1, max_size=20).map(np.array)
 
 
 def surface(degree=(3, 3), points=(12, 14), seed=0, weights=True):
-    rng = np.random.default_rng(seed)
     n, m = (max(k, d + 1) for k, d in zip(points, degree, strict=True))
-    W = np.exp(rng.uniform(-np.log(10), np.log(10), (m, n))) if weights else np.ones((m, n))
-    return NurbsSurface(
-        crs="EPSG:25832",
-        bounds=BOUNDS,
-        degree=degree,
-        knots_u=clamped_knots(n, degree[0]),
-        knots_v=clamped_knots(m, degree[1]),
-        A=W * rng.normal(0, 3, (m, n)),
-        W=W,
-        datum=163.25,
-        origin=(295500.0, 5629250.0),
-    )
+    return make_surface((m, n), degree, weights=weights, seed=seed, bounds=BOUNDS)
 
 
 def points_inside(seed, count=200):
     rng = np.random.default_rng(seed)
     return rng.uniform(BOUNDS[0], BOUNDS[2], count), rng.uniform(BOUNDS[1], BOUNDS[3], count)
-
-
-@given(spaces, parameters)
-def test_basis_sums_to_one(space, u):
-    degree, points = space
-    start, values, slopes = basis(clamped_knots(points, degree), degree, u)
-    assert (start >= 0).all()
-    assert (start + degree < points).all()
-    assert (values >= -1e-15).all()
-    np.testing.assert_allclose(values.sum(axis=1), 1, atol=1e-13)
-    np.testing.assert_allclose(slopes.sum(axis=1), 0, atol=1e-10)
 
 
 @given(spaces, parameters)
@@ -78,19 +62,6 @@ def test_clamped_knots_too_few_points_raises():
         clamped_knots(5, 5)
 
 
-def test_surface_satisfies_protocol_with_plain_fields():
-    s = surface()
-    assert isinstance(s, Surface)
-    assert all(isinstance(getattr(s, f.name), np.ndarray | str | int | float | tuple) for f in fields(s))
-
-
-def test_coefficients_row_zero_is_in_south():
-    s = surface(weights=False)
-    west, south, east, north = BOUNDS
-    corners = s.lattice(np.array([west, east]), np.array([south, north])) - s.datum
-    np.testing.assert_allclose(corners, s.A[[0, 0, -1, -1], [0, -1, 0, -1]].reshape(2, 2), atol=1e-12)
-
-
 @pytest.mark.parametrize("degree", [(1, 1), (3, 3), (2, 5), (10, 10)])
 def test_height_and_lattice_equal_definition(degree):
     s = surface(degree)
@@ -113,12 +84,9 @@ def test_slopes_equal_finite_differences(p, q, seed):
     e, n = rng.uniform(BOUNDS[0] + 1, BOUNDS[2] - 1, 50), rng.uniform(BOUNDS[1] + 1, BOUNDS[3] - 1, 50)
     h = 1e-3
     by_e, by_n = s.slope(e, n)
-    np.testing.assert_allclose(
-        by_e, (s.height(e + h, n) - s.height(e - h, n)) / (2 * h), atol=2e-4, rtol=1e-3
-    )
-    np.testing.assert_allclose(
-        by_n, (s.height(e, n + h) - s.height(e, n - h)) / (2 * h), atol=2e-4, rtol=1e-3
-    )
+    for slope, x, y in ((by_e, h, 0), (by_n, 0, h)):
+        numeric = (s.height(e + x, n + y) - s.height(e - x, n - y)) / (2 * h)
+        np.testing.assert_allclose(slope, numeric, atol=2e-4, rtol=1e-3)
 
 
 def test_normals_are_upward_and_orthogonal_to_surface():
@@ -196,3 +164,90 @@ def test_control_points_unit_weights_define_surface():
     assert y == pytest.approx(BOUNDS[1] + 0.7 * 149)
     assert z == pytest.approx(float(s.height(x, y)), abs=1e-9)
     assert w == pytest.approx(1)
+
+
+@pytest.mark.parametrize("degree", range(2, 8))
+def test_basis_at_knot_is_equal_from_both_sides(degree):
+    """A line is the end of one tile's domain and the start of the next one's."""
+    knots = np.array([17.0])
+    left = basis(uniform_knots(0, 17, degree), degree, knots)
+    right = basis(uniform_knots(17, 40, degree), degree, knots)
+    for ours, theirs in zip(left[1:], right[1:], strict=True):
+        assert ours[0, 0] == theirs[0, -1] == 0
+        assert ours[0, 1:].tobytes() == theirs[0, :-1].tobytes()
+
+
+@pytest.mark.parametrize("degree", [2, 3, 5])
+def test_uniform_basis_does_not_depend_on_domain(degree):
+    t = np.linspace(7, 9, 41)
+    (_, *ours), (_, *theirs) = (basis(uniform_knots(*ends, degree), degree, t) for ends in ((0, 20), (7, 9)))
+    assert [part[:-1].tobytes() for part in ours] == [part[:-1].tobytes() for part in theirs]
+
+
+def tile_of_block(column, row, control, n, m, p=3, size=(250.0, 200.0)):
+    """The tile of a block whose control points are a part of the block's."""
+    west, south = 295500 + column * size[0], 5629250 + row * size[1]
+    a = control[row * m : row * m + m + p, column * n : column * n + n + p]
+    knots = uniform_knots(0, n, p), uniform_knots(0, m, p)
+    bounds = west, south, west + size[0], south + size[1]
+    return NurbsSurface("EPSG:25832", bounds, (p, p), *knots, a, np.ones_like(a), 0.0, (west, south))
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**31), st.integers(4, 70), st.integers(4, 70), st.integers(2, 5))
+def test_surfaces_with_common_points_meet_exactly(seed, n, m, p):
+    rng = np.random.default_rng(seed)
+    control = 300 + 50 * rng.normal(size=(2 * m + p, 2 * n + p))
+    tiles = {(c, r): tile_of_block(c, r, control, n, m, p) for c in (0, 1) for r in (0, 1)}
+    along = rng.uniform(0, 1, 50)
+    for one, other, (x, y) in (
+        ((0, 0), (1, 0), (np.full(50, 295750.0), 5629250 + 200 * along)),
+        ((0, 0), (0, 1), (295500 + 250 * along, np.full(50, 5629450.0))),
+        ((0, 0), (1, 1), (np.array([295750.0]), np.array([5629450.0]))),
+    ):
+        a, b = tiles[one], tiles[other]
+        np.testing.assert_array_equal(a.height(x, y), b.height(x, y))
+        np.testing.assert_array_equal(a.normal(x, y), b.normal(x, y))
+
+
+def test_surface_on_uniform_knots_exports_exactly():
+    rng = np.random.default_rng(0)
+    ours = tile_of_block(0, 0, 300 + rng.normal(size=(12, 14)), n=11, m=9)
+    nurbs = exact(ours)
+    t = np.linspace(0, 1, 23)
+    along_u, along_v = (
+        basis_matrix(knots, degree, t)[0]
+        for knots, degree in zip((nurbs.knots_u, nurbs.knots_v), nurbs.degree, strict=True)
+    )
+    x, y, z, w = np.moveaxis(nurbs.points, -1, 0)
+    weight = along_v @ w @ along_u.T
+    at = [along_v @ (part * w) @ along_u.T / weight for part in (x, y, z)]
+    np.testing.assert_allclose(at[0], np.broadcast_to(250 * t, (23, 23)), atol=1e-9)
+    np.testing.assert_allclose(at[1], np.broadcast_to(200 * t[:, None], (23, 23)), atol=1e-9)
+    heights = ours.lattice(ours.bounds[0] + 250 * t, ours.bounds[1] + 200 * t)
+    np.testing.assert_allclose(at[2], heights, atol=1e-9)
+    assert (nurbs.knots_u[0], nurbs.knots_u[-1]) == (0, 1)
+
+
+@pytest.mark.parametrize(("spacing", "intervals"), [(3.6, (70, 56)), (250, (3, 3)), (2.5, (100, 80))])
+def test_lattice_spacing_is_at_most_the_given_one(spacing, intervals):
+    lattice = Lattice.of((250, 200), 1.0, 3, spacing)
+    assert lattice.intervals == intervals
+    assert max(lattice.unit_m) <= max(spacing, 250 / 3)
+
+
+def test_lattice_lines_over_a_distance():
+    lattice = Lattice.of((250, 200), 1.0, 3, 30.0)
+    assert lattice.lines_within(99.5) == (3, 3)
+    assert lattice.lines_over(99.5) == (4, 4)
+    assert Lattice.of((250, 200), 1.0, 3, 5.0).lines_over(100.0) == (20, 20)
+
+
+def test_lattice_part_has_cells_between_its_lines():
+    lattice = Lattice.of((250, 200), 1.0, 3, 5.0)
+    space, (rows, cols) = lattice.part((300, 400), start=(280, 60), u=(-4, 10), v=(0, 6))
+    assert (rows, cols) == (slice(250, 280), slice(40, 110))
+    assert space.points == (14 + 3, 6 + 3)
+    assert space.unit_m == (5.0, 5.0)
+    np.testing.assert_allclose(space.u, (np.arange(-20, 50) + 0.5) / 5)
+    np.testing.assert_allclose(space.v, (np.arange(30)[::-1] + 0.5) / 5)

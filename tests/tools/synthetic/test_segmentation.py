@@ -29,7 +29,7 @@ def false_road(scene: Scene) -> np.ndarray:
 
 
 def test_benchmark_shares_of_mask_and_truth_are_those_of_paper():
-    """Over 8 tiles the means may be off by a fifth; the complete survey is checked by bench_gerod.py."""
+    """Over 8 tiles the means may be off by a fifth; `bench_synthetic.py` checks the complete survey."""
     assert np.mean([scene.reference_road.mean() for scene in benchmark()]) == pytest.approx(0.18, rel=0.2)
     assert np.mean([scene.road_mask.mean() for scene in benchmark()]) == pytest.approx(0.26, rel=0.2)
 

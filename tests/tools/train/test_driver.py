@@ -21,7 +21,7 @@ from flexroad.tools.synthetic.scenes import write_scenes
 from flexroad.tools.train.driver import LabelledTiles, TrainOptions, inside, samples, split, train
 from tests.command_line import call
 from tests.make_backbone import save_backbone
-from tests.pipeline.cli.test_main import flexroad
+from tests.pipeline.cli.test_run import flexroad
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """DINOv2 with random weights: it runs the same code as the real model, but cannot recognise roads."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks import TaskError, load
+from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.segment.dinov2 import backbone, head
-from flexroad.tasks.segment.dinov2 import segment as method
-from flexroad.tasks.segment.dinov2.backbone import MEAN, STD, load_backbone, normalised
+from flexroad.tasks.segment.dinov2.backbone import load_backbone, normalised
 from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
 from flexroad.tasks.segment.dinov2.segment import Options, files, segment
 from flexroad.tasks.types import TileData
@@ -50,13 +52,11 @@ def train_options(folder: Path, **options) -> training.Options:
 
 
 @pytest.fixture(scope="session")
-def heads(backbones, sample, tmp_path_factory) -> dict[int, Path]:
-    """Heads trained on the sample tile, by number of registers."""
-    paths = {}
-    for n, folder in backbones.items():
-        paths[n] = tmp_path_factory.mktemp("heads") / f"head-{n}.safetensors"
-        paths[n].write_bytes(training.train([sample], [sample], train_options(folder), print)[0])
-    return paths
+def model(backbones, sample, tmp_path_factory) -> Path:
+    """A head trained on the sample tile."""
+    path = tmp_path_factory.mktemp("heads") / "head.safetensors"
+    path.write_bytes(training.train([sample], [sample], train_options(backbones[0]), print)[0])
+    return path
 
 
 def segmented(data: TileData, model: Path, **options):
@@ -74,9 +74,6 @@ def with_threshold(path: Path, threshold: float) -> Path:
 
 def iou(a, b) -> float:
     return np.count_nonzero(a & b) / np.count_nonzero(a | b)
-
-
-# --- the backbone -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("registers", [0, 4])
@@ -97,31 +94,16 @@ def test_tokens_belong_to_patches(backbones, registers):
     assert int(change.argmax()) == 3 * 1 + 2
 
 
-def test_half_precision_changes_result_slightly(backbones, heads, sample):
-    whole, half = (segmented(sample.data, heads[0], device="cpu", half=half) for half in (False, True))
+def test_half_precision_changes_result_slightly(backbones, model, sample):
+    whole, half = (segmented(sample.data, model, device="cpu", half=half) for half in (False, True))
     difference = np.abs(whole.probability - half.probability)
     assert 0 < difference.max() < 0.2
     assert difference.mean() < 0.01
     assert iou(whole.mask, half.mask) > 0.97
 
 
-def test_normalised_pixels_without_data_have_mean_colour(sample):
-    from flexroad.tasks.io.orthophoto import read_photo
-
-    photo = read_photo(sample.data.dop, sample.data.grid.buffered(10))
-    image = normalised(photo)
-    assert not photo.known.all()
-    np.testing.assert_array_equal(image[:, ~photo.known], 0)
-    back = image * np.array(STD)[:, None, None] + np.array(MEAN)[:, None, None]
-    np.testing.assert_allclose(255 * back[:, photo.known], photo.colour[:, photo.known], atol=1e-3)
-
-
-# --- training -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("registers", [0, 4])
-def test_train_small_scene_reproduces_labels(heads, sample, registers):
-    road = segmented(sample.data, heads[registers])
+def test_train_small_scene_reproduces_labels(model, sample):
+    road = segmented(sample.data, model)
     assert iou(road.mask, sample.road) > 0.75
     # A mask that is road everywhere has this fraction as IoU.
     assert sample.road.mean() < 0.25
@@ -131,58 +113,38 @@ def test_train_small_scene_reproduces_labels(heads, sample, registers):
     assert road.probability.dtype == np.float32
 
 
-def test_train_twice_gives_equal_models_with_provenance(backbones, sample, tmp_path):
+def test_train_again_with_other_labels_in_unlabelled_cells_gives_equal_models(backbones, sample, tmp_path):
     lines = []
+    labelled = np.zeros_like(sample.labelled)
+    labelled[:, 20:] = True
+    right, wrong = (
+        replace(sample, labelled=labelled, road=road) for road in (sample.road, sample.road ^ ~labelled)
+    )
     options = train_options(backbones[0], epochs=5)
-    model, history = training.train([sample], [sample], options, lines.append)
-    again, _ = training.train([sample], [sample], options, print)
-    assert model == again
+    first, history = training.train([right], [right], options, lines.append)
+    assert first == training.train([wrong], [wrong], options, print)[0]
     assert lines == [
         f"epoch {n} of 5: loss {loss:.4f}, validation {validation:.4f}"
         for n, (loss, validation) in enumerate(history, 1)
     ]
     assert history[-1][1] < history[0][1]
     path = tmp_path / "head.safetensors"
-    path.write_bytes(model)
+    path.write_bytes(first)
     about = read_head(path).about
     assert (about.gsd_m, about.window_px, about.layers, about.classes) == (GSD, WINDOW, 3, ("road",))
-    assert about.trained["train_cells"] == sample.labelled.sum()
-    assert about.trained["train_road_cells"] == sample.road.sum()
+    assert about.trained["train_cells"] == labelled.sum()
+    assert about.trained["train_road_cells"] == (sample.road & labelled).sum()
     assert about.trained["train_tiles"] == sample.data.tile_id
 
 
-def test_train_ignores_labels_of_unlabelled_cells(backbones, sample):
-    """Wrong labels outside the labelled cells do not change the model."""
-    labelled = np.zeros_like(sample.labelled)
-    labelled[:, 20:] = True
-    options = train_options(backbones[0], epochs=2)
-    right, wrong = (
-        training.train([s], [s], options, print)[0]
-        for s in (
-            replace(sample, labelled=labelled),
-            replace(sample, labelled=labelled, road=sample.road ^ ~labelled),
-        )
-    )
-    assert right == wrong
-
-
-def test_train_stops_early_and_keeps_best_epoch(backbones, sample):
+def test_train_stops_early_and_keeps_best_epoch_and_needs_labels(backbones, sample):
     """The labels of the validation tile are the inverse of the training labels."""
     inverse = replace(sample, road=~sample.road)
-    model, history = training.train([sample], [inverse], train_options(backbones[0], patience=3), print)
+    full, history = training.train([sample], [inverse], train_options(backbones[0], patience=3), print)
     best = 1 + int(np.argmin([validation for _, validation in history]))
     assert len(history) == best + 3 < 60
     until, _ = training.train([sample], [inverse], train_options(backbones[0], epochs=best), print)
-    np.testing.assert_array_equal(weight_of(model), weight_of(until))
-
-
-def weight_of(content: bytes) -> np.ndarray:
-    from safetensors.numpy import load as decode
-
-    return decode(content)["weight"]
-
-
-def test_train_labels_of_one_class_raises(backbones, sample):
+    np.testing.assert_array_equal(*(safetensors.numpy.load(one)["weight"] for one in (full, until)))
     no_road = replace(sample, road=np.zeros_like(sample.road))
     with pytest.raises(TaskError, match="no training tile has an orthophoto and labels of both road"):
         training.train([no_road], [sample], train_options(backbones[0]), print)
@@ -191,11 +153,11 @@ def test_train_labels_of_one_class_raises(backbones, sample):
         training.train([sample], [no_photo], train_options(backbones[0]), print)
 
 
-def test_at_cells_interpolates_like_predictor(backbones, heads):
+def test_at_cells_interpolates_like_predictor(backbones, model):
     """The loss uses the same logit at a pixel's centre as the prediction."""
     import torch
 
-    backbone, head = load_backbone(str(backbones[0]), "cpu"), read_head(heads[0])
+    backbone, head = load_backbone(str(backbones[0]), "cpu"), read_head(model)
     windows = np.random.default_rng(1).normal(size=(1, 3, 56, 56)).astype(np.float32)
     predicted = predictor(head, backbone)(windows)[0]
     centres = 2 * (np.arange(56, dtype=np.float32) + 0.5) / 56 - 1
@@ -224,44 +186,18 @@ def test_best_threshold_maximises_iou():
     assert best == pytest.approx(max(each))
 
 
-# --- windows over a tile ------------------------------------------------------------------------------
+def test_segment_does_not_depend_on_tiling(model, sample):
+    data, grid = sample.data, sample.data.grid
+    smaller = Grid(grid.crs, grid.west + 20, grid.north - 17, 1.0, 35, 31)
+    window = grid.window(smaller)
+    part = replace(data, grid=smaller, core=smaller, dsm=data.dsm[window], dtm=data.dtm[window])
+    whole, piece = segmented(data, model), segmented(part, model)
+    np.testing.assert_allclose(piece.probability, whole.probability[window], atol=2e-5)
+    assert np.mean(piece.mask == whole.mask[window]) > 0.999
 
 
-def part(data: TileData, rows: slice, cols: slice) -> TileData:
-    """A part of the tile as a separate tile with the same photo."""
-    grid = data.grid
-    window = np.s_[rows, cols]
-    north, west = grid.north - rows.start * grid.cell, grid.west + cols.start * grid.cell
-    height, width = data.dsm[window].shape
-    smaller = Grid(grid.crs, west, north, grid.cell, width, height)
-    return replace(data, grid=smaller, core=smaller, dsm=data.dsm[window], dtm=data.dtm[window])
-
-
-def test_segment_does_not_depend_on_tiling(heads, sample):
-    rows, cols = slice(17, 48), slice(20, 55)
-    whole, piece = segmented(sample.data, heads[0]), segmented(part(sample.data, rows, cols), heads[0])
-    np.testing.assert_allclose(piece.probability, whole.probability[rows, cols], atol=2e-5)
-    assert np.mean(piece.mask == whole.mask[rows, cols]) > 0.999
-
-
-def test_segment_other_overlap_changes_result_slightly(heads, sample, monkeypatch):
-    """Other window positions have other surroundings and other position codes, which are random here.
-
-    Tolerance: probabilities differ by 0.05 on average, and 19 of 20 cells have the same class.
-    """
-    narrow = segmented(sample.data, heads[0])
-    monkeypatch.setattr(method, "BATCH", 7)
-    batched = segmented(sample.data, heads[0])
-    np.testing.assert_allclose(batched.probability, narrow.probability, atol=1e-5)
-    monkeypatch.setattr(method, "OVERLAP", 0.5)
-    wide = segmented(sample.data, heads[0])
-    difference = np.abs(narrow.probability - wide.probability)
-    assert 0 < difference.mean() < 0.05
-    assert np.mean(narrow.mask == wide.mask) > 0.95
-
-
-def test_segment_threshold_changes_mask_only(heads, sample):
-    strict, lax = (segmented(sample.data, with_threshold(heads[0], t)) for t in (0.9, 0.1))
+def test_segment_threshold_changes_mask_only(model, sample):
+    strict, lax = (segmented(sample.data, with_threshold(model, t)) for t in (0.9, 0.1))
     np.testing.assert_array_equal(strict.probability, lax.probability)
     assert not np.any(strict.mask & ~lax.mask)
     assert strict.mask.sum() < lax.mask.sum()
@@ -269,13 +205,17 @@ def test_segment_threshold_changes_mask_only(heads, sample):
     assert np.mean(lax.mask == (lax.probability >= 0.1)) > 0.9
 
 
-def test_segment_cells_without_photo_are_no_road(heads, sample):
+def test_segment_cells_without_photo_are_no_road(model, sample):
     data, grid = sample.data, sample.data.grid
     wide = grid.buffered(30)
     rows, cols = wide.window(grid)
     around = {name: np.pad(getattr(data, name), 30, mode="edge") for name in ("dsm", "dtm")}
     own = replace(data.dop, paths=data.dop.paths[:1])
-    road = segmented(replace(data, grid=wide, core=grid, dop=own, **around), with_threshold(heads[0], 0.01))
+    # Pixels without data have the mean colour.
+    photo = read_photo(own, grid.buffered(10))
+    assert not photo.known.all()
+    np.testing.assert_array_equal(normalised(photo)[:, ~photo.known], 0)
+    road = segmented(replace(data, grid=wide, core=grid, dop=own, **around), with_threshold(model, 0.01))
     beyond = np.ones(wide.shape, bool)
     beyond[rows, cols] = False
     assert not road.mask[beyond].any()
@@ -283,41 +223,33 @@ def test_segment_cells_without_photo_are_no_road(heads, sample):
     assert road.notes[0] == f"dop: {beyond.mean():.1%} of the cells have no orthophoto and count as no road"
 
 
-def test_segment_shifted_photo_adds_note(heads, sample, monkeypatch):
+def test_segment_shifted_photo_adds_note(model, sample, monkeypatch):
     """Its measurement is tested in tests/tasks/roads/test_coregistration.py; this tile is too small."""
-    assert segmented(sample.data, heads[0]).notes == ()
+    assert segmented(sample.data, model).notes == ()
     monkeypatch.setattr(coregistration, "note", lambda data, photo: f"{data.tile_id}: {photo.grid.cell:g} m")
-    (note,) = segmented(sample.data, heads[0]).notes
-    assert note == f"{sample.data.tile_id}: {read_head(heads[0]).about.gsd_m:g} m"
+    (note,) = segmented(sample.data, model).notes
+    assert note == f"{sample.data.tile_id}: {read_head(model).about.gsd_m:g} m"
 
 
-def test_segment_no_road_gives_empty_mask_and_note(heads, sample):
-    head = read_head(heads[0])
-    blind = heads[0].with_name("blind.safetensors")
+def test_segment_no_road_gives_empty_mask_and_note(model, sample):
+    head = read_head(model)
+    blind = model.with_name("blind.safetensors")
     blind.write_bytes(Head(head.weight * 0, head.bias * 0 - 1, head.about).encode())
     road = segmented(sample.data, blind)
     assert not road.mask.any()
     assert "no road on this tile: probabilities reach 0.27, the threshold" in road.notes[-1]
 
 
-# --- missing or incompatible files --------------------------------------------------------------------
-
-
-def test_segment_no_orthophoto_raises(heads, sample):
+def test_segment_broken_head_names_file_and_remedy(backbones, model, sample, tmp_path):
     with pytest.raises(TaskError, match="no orthophoto .* give --dop to") as caught:
-        segmented(replace(sample.data, dop=None), heads[0])
+        segmented(replace(sample.data, dop=None), model)
     assert caught.value.layer == "dop"
-
-
-def test_segment_broken_head_names_file_and_remedy(backbones, heads, sample, tmp_path):
-    from safetensors.numpy import save_file
-
     broken = tmp_path / "broken.safetensors"
-    broken.write_bytes(heads[0].read_bytes()[:-100])
+    broken.write_bytes(model.read_bytes()[:-100])
     text = tmp_path / "text.safetensors"
     text.write_text("<html>404 Not Found</html>")
     no_head = tmp_path / "other.safetensors"
-    save_file({"weight": np.zeros((1, 4), np.float32)}, no_head, {"format": "pt"})
+    safetensors.numpy.save_file({"weight": np.zeros((1, 4), np.float32)}, no_head, {"format": "pt"})
     weights = next(backbones[0].glob("*.safetensors"))
     for path in (tmp_path / "none.safetensors", tmp_path, broken, text, no_head, weights):
         with pytest.raises(TaskError, match=f"{path}.*flexroad train CATALOG --labels") as caught:
@@ -326,47 +258,38 @@ def test_segment_broken_head_names_file_and_remedy(backbones, heads, sample, tmp
         assert caught.value.file == str(path)
 
 
-def test_segment_other_backbone_raises(backbones, heads, sample, tmp_path):
+def test_segment_other_backbone_raises(backbones, model, sample, tmp_path):
     other = save_backbone(tmp_path / "other", seed=1, hidden_size=96)
     with pytest.raises(TaskError, match=r"head was trained on .*tiny-0, not on .*other \(weights"):
-        segmented(sample.data, heads[0], backbone=str(other))
+        segmented(sample.data, model, backbone=str(other))
     with pytest.raises(TaskError, match="model_type dinov2 not dinov2_with_registers, registers 0 not 4"):
-        segmented(sample.data, heads[0], backbone=str(backbones[4]))
-    head = read_head(heads[0])
+        segmented(sample.data, model, backbone=str(backbones[4]))
+    head = read_head(model)
     deeper = Head(head.weight, head.bias, head.about.model_copy(update={"layers": 4}))
     with pytest.raises(TaskError, match="uses 4 layers, the backbone has 3"):
         check(deeper, load_backbone(str(backbones[0])))
 
 
-def test_segment_moved_backbone_gives_same_result(backbones, heads, sample, tmp_path):
-    moved = tmp_path / "moved"
-    moved.mkdir()
-    for file in backbones[0].iterdir():
-        (moved / file.name).write_bytes(file.read_bytes())
-    options = Options(model=heads[0], backbone=str(moved), cleanup="none")
-    np.testing.assert_array_equal(
-        segment(sample.data, options).probability, segmented(sample.data, heads[0]).probability
-    )
-    assert files(options) == (heads[0], moved / "config.json", moved / "model.safetensors")
-    assert files(Options(model=heads[0], backbone="facebook/dinov2-small")) == (heads[0],)
-
-
-def test_segment_hub_name_reads_cache(backbones, heads, sample, tmp_path, monkeypatch):
-    """The cache has the folder layout of `hf download`."""
+def test_segment_moved_or_downloaded_backbone_gives_same_result(
+    backbones, model, sample, tmp_path, monkeypatch
+):
+    """The cache of downloads has the folder layout of `hf download`."""
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     commit = "0123456789abcdef0123456789abcdef01234567"
     home = tmp_path / "models--facebook--dinov2-tiny"
-    snapshot = home / "snapshots" / commit
-    snapshot.mkdir(parents=True)
-    for file in backbones[0].iterdir():
-        (snapshot / file.name).write_bytes(file.read_bytes())
+    snapshot = shutil.copytree(backbones[0], home / "snapshots" / commit)
     (home / "refs").mkdir()
     (home / "refs" / "main").write_text(commit)
-    named = segmented(sample.data, heads[0], backbone="facebook/dinov2-tiny")
-    np.testing.assert_array_equal(named.probability, segmented(sample.data, heads[0]).probability)
+    expected = segmented(sample.data, model).probability
+    for name in ("facebook/dinov2-tiny", str(snapshot)):
+        found = segmented(sample.data, model, backbone=name).probability
+        np.testing.assert_array_equal(found, expected)
+    moved = Options(model=model, backbone=str(snapshot))
+    assert files(moved) == (model, snapshot / "config.json", snapshot / "model.safetensors")
+    assert files(Options(model=model, backbone="facebook/dinov2-small")) == (model,)
 
 
-def test_load_backbone_missing_weights_names_remedy(tmp_path, monkeypatch):
+def test_load_backbone_missing_weights_names_remedy(backbones, tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
     with pytest.raises(TaskError, match="facebook/dinov2-tiny are not .* `hf download facebook/dinov2-tiny`"):
         load_backbone("facebook/dinov2-tiny")
@@ -377,43 +300,38 @@ def test_load_backbone_missing_weights_names_remedy(tmp_path, monkeypatch):
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "vit"}))
     with pytest.raises(TaskError, match="model of type 'vit'"):
         load_backbone(str(tmp_path))
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(TaskError, match="no device 'cuda'"):
+        load_backbone(str(backbones[0]), "cuda")
 
 
-@pytest.mark.parametrize("size", [0, 100, 100_000])
-def test_load_backbone_damaged_weights_raises_one_line(backbones, tmp_path, size):
+def test_load_backbone_damaged_weights_raises_one_line(backbones, tmp_path):
     (tmp_path / "config.json").write_bytes((backbones[0] / "config.json").read_bytes())
-    (tmp_path / "model.safetensors").write_bytes((backbones[0] / "model.safetensors").read_bytes()[:size])
-    with pytest.raises(TaskError, match="cannot read the weights") as caught:
-        load_backbone(str(tmp_path))
-    assert "\n" not in str(caught.value)
-
-
-def test_load_backbone_missing_array_raises(backbones, tmp_path):
-    from safetensors.numpy import load_file, save_file
-
-    (tmp_path / "config.json").write_bytes((backbones[0] / "config.json").read_bytes())
-    arrays = load_file(backbones[0] / "model.safetensors")
+    weights = tmp_path / "model.safetensors"
+    content = (backbones[0] / weights.name).read_bytes()
+    arrays = safetensors.numpy.load(content)
     arrays.pop("layernorm.weight")
-    save_file(arrays, tmp_path / "model.safetensors", {"format": "pt"})
-    with pytest.raises(TaskError, match="weights lack 1 arrays"):
-        load_backbone(str(tmp_path))
+    for damaged, message in (
+        (b"", "cannot read the weights"),
+        (content[:100], "cannot read the weights"),
+        (content[:100_000], "cannot read the weights"),
+        (safetensors.numpy.save(arrays, {"format": "pt"}), "weights lack 1 arrays"),
+    ):
+        weights.write_bytes(damaged)
+        with pytest.raises(TaskError, match=message) as caught:
+            load_backbone(str(tmp_path))
+        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("module", ["transformers", "safetensors"])
-def test_segment_without_extra_names_package(heads, sample, monkeypatch, module):
+def test_segment_without_extra_names_package(model, sample, monkeypatch, module):
     load_backbone.cache_clear()
     for name in [name for name in sys.modules if name.split(".")[0] == module]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr({"transformers": backbone, "safetensors": head}[module], module, lazy(module))
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(TaskError, match=rf'needs {module}: pip install "flexroad\[dinov2\]"'):
-        segmented(sample.data, heads[0])
-
-
-def test_load_backbone_no_gpu_raises(backbones, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(TaskError, match="no device 'cuda'"):
-        load_backbone(str(backbones[0]), "cuda")
+        segmented(sample.data, model)
 
 
 def test_tokens_full_gpu_raises(backbones, monkeypatch):

@@ -1,4 +1,4 @@
-"""The worst piece of road is a climbed object, not a sound deck, and has the size of the true error."""
+"""The place of each flag, and the worst piece of road: a climbed object, not a sound deck."""
 
 import numpy as np
 import pytest
@@ -7,10 +7,11 @@ import scipy
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import nurbs
 from flexroad.tasks.quality.assess import Options, assess
-from flexroad.tasks.quality.flagged import PIECE_M2, flag_names, worst_piece
-from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+from flexroad.tasks.quality.estimate import compare
+from flexroad.tasks.quality.flagged import PIECE_M2, flag_names, places, worst_piece
+from tests.builders import given_heights, make_clusters, make_grid, make_mask, make_tile
 
-GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 120, 120)
+GRID = make_grid(120, 120)
 ROW, COL = np.indices(GRID.shape)
 EVERY = np.ones(GRID.shape, bool)
 STREET = np.abs(ROW - 60) < 10
@@ -25,28 +26,14 @@ HEAPS = {
 FIT = nurbs.Options(control_points=(40, 40), weights="unit")
 
 
-class GivenHeights:
-    """A surface with given heights."""
-
-    bounds = GRID.hull
-
-    def __init__(self, heights):
-        self.heights = heights
-
-    def lattice(self, eastings, northings):
-        return self.heights
-
-
 def assessed(above, road=EVERY, dtm=GROUND, exact=False):
     """Return the quality of a surface on the ground with something above it, all of which the filter kept.
 
     The surface is fitted to the heights, or has them exactly.
     """
-    data = TileData("made", GRID, GRID, GROUND + above + NOISE, dtm)
-    clusters = RoadClusters(GRID, road.astype(np.int32), None)
-    mask = RoadMask(GRID, GRID, road, np.zeros(GRID.shape, bool))
-    surface = GivenHeights(GROUND + above) if exact else nurbs.fit(data, clusters, FIT)
-    return assess(data, mask, clusters, surface, Options())
+    data, clusters = make_tile(GROUND + above + NOISE, dtm), make_clusters(road)
+    surface = given_heights(GROUND + above, GRID) if exact else nurbs.fit(data, clusters, FIT)
+    return assess(data, make_mask(road), clusters, surface, Options())
 
 
 @pytest.mark.parametrize("name", HEAPS)
@@ -83,17 +70,18 @@ def test_worst_error_of_deck_on_ramps_is_small(grade, ramps_in_dtm):
     assert "worst-error" not in quality.flags
 
 
-def test_worst_error_of_level_bridge_above_steep_banks_is_small():
-    valley = np.interp(np.abs(COL - 60), [8, 20], [-8, 0])
-    quality = assessed(np.zeros(GRID.shape), STREET, GROUND + valley, exact=True)
+VALLEY = np.interp(np.abs(COL - 60), [8, 20], [-8, 0])
+
+
+@pytest.mark.parametrize(
+    ("street", "dtm"),
+    [(np.zeros(GRID.shape), GROUND + VALLEY), (0.2 * COL, GROUND + 0.2 * COL - 1)],
+    ids=["level bridge above steep banks", "steep street with a DTM too low"],
+)
+def test_worst_error_of_street_away_from_its_dtm_is_small(street, dtm):
+    quality = assessed(street, STREET, dtm, exact=True)
     assert quality.worst_error_estimate_m < 0.3
     assert not {"worst-error", "patch", "error-estimate"} & set(quality.flags)
-
-
-def test_worst_error_of_steep_street_with_dtm_too_low_is_small():
-    street = 0.2 * COL
-    quality = assessed(street, STREET, GROUND + street - 1, exact=True)
-    assert quality.worst_error_estimate_m < 0.3
 
 
 def naive(estimate, road, cells):
@@ -120,16 +108,68 @@ def test_worst_piece_equals_search_over_all_thresholds(seed, cell):
     assert estimate[cells][0] >= value
 
 
-def test_worst_piece_of_small_road_is_that_road():
-    road = np.zeros(GRID.shape, bool)
-    road[10:12, 10:15] = True
-    estimate = np.where(road, 0.2, 9.0)
-    estimate[11, 12] = 0.4
-    assert worst_piece(estimate, road, GRID) == (0.2, (GRID.west + 12.5, GRID.north - 11.5))
-    assert np.isnan(worst_piece(estimate, ~EVERY, GRID)[0])
-
-
 def test_single_wrong_cells_are_no_worst_piece():
     values = np.full(GRID.shape, 0.05)
     values[::7, ::7] = 5.0
     assert worst_piece(values, EVERY, GRID)[0] == 0.05
+    assert np.isnan(worst_piece(values, ~EVERY, GRID)[0])
+
+
+PLACES = make_grid(120, 100, 2.0)
+PLACE_ROW, PLACE_COL = np.indices(PLACES.shape)
+ROAD = np.abs(PLACE_ROW - 50) < 6
+FLAT = np.full(PLACES.shape, 100.0)
+
+
+def found(surface=FLAT, dsm=FLAT, dtm=FLAT, kept=ROAD):
+    """Return raised flags and places."""
+    given = make_tile(dsm, dtm, 2.0), make_mask(ROAD, 2.0), make_clusters(kept, 2.0)
+    inputs, options = (*given, given_heights(surface, PLACES)), Options()
+    cells = compare(*inputs, options.dsm_dtm_tolerance_m)
+    return assess(*inputs, options).flags, places(cells, PLACES, options.dsm_dtm_tolerance_m)
+
+
+def changed(rows, cols, metres):
+    heights = FLAT.copy()
+    heights[rows, cols] += metres
+    return heights
+
+
+def near(place, row, col, tolerance_cells=0):
+    east, north = PLACES.eastings[col], PLACES.northings[row]
+    return place == pytest.approx((east, north), abs=PLACES.cell * tolerance_cells + 1e-9)
+
+
+def test_place_without_fault_is_that_of_largest_estimate():
+    flags, at = found()
+    assert flags == ()
+    assert at.keys() == {"error-estimate", "worst-error"}
+
+
+def test_spike_and_step_are_at_the_pole():
+    flags, at = found(surface=changed(50, 70, 3.0))
+    assert "spike" in flags
+    assert near(at["spike"], 50, 70)
+    assert near(at["loose"], 50, 70)
+
+
+def test_edge_step_is_on_the_last_road_cell():
+    _, at = found(surface=changed(44, 90, 1.0))
+    assert near(at["edge-step"], 45, 90)
+
+
+def test_patch_estimate_and_dtm_are_in_the_middle_of_the_raised_part():
+    rows, cols = slice(45, 56), slice(20, 41)
+    flags, at = found(surface=changed(rows, cols, 1.0))
+    assert {"patch", "error-estimate", "off-dtm"} <= set(flags)
+    for flag in ("patch", "error-estimate", "off-dtm"):
+        assert near(at[flag], 50, 30, 8), flag
+
+
+def test_dropped_and_inferred_are_in_the_largest_patch():
+    kept = ROAD & ((PLACE_COL < 10) | (PLACE_COL > 100)) | (ROAD & (PLACE_COL == 50))
+    hole = changed(slice(None), slice(60, 80), np.nan)
+    flags, at = found(dsm=hole, dtm=hole, kept=kept)
+    assert {"dropped", "inferred"} <= set(flags)
+    assert near(at["inferred"], 50, 70, 6)
+    assert 50 < PLACES.cells(*map(np.atleast_1d, at["dropped"]))[1][0] <= 100

@@ -1,15 +1,22 @@
-"""Indexing and loading real surveys: three UMEP cities (1 m, some with land cover) and a state's DSM."""
+"""Indexing and loading real surveys: three UMEP cities, some with land cover, and the DSM of a state."""
 
+import gzip
+import shutil
 import zipfile
 
 import numpy as np
 import pytest
+import rasterio
 
+from flexroad.catalog.sources import nrw
 from flexroad.catalog.sources.rasters import index
+from flexroad.tasks import TaskError
 from flexroad.tasks.load import Options, load
 from flexroad.tasks.segment import mask
 
 pytestmark = pytest.mark.real
+
+DSM = "dom1_32_356_5699_1_nw_2020.tif"
 
 
 @pytest.fixture
@@ -86,12 +93,39 @@ def test_index_ascii_grid_uses_given_crs(unpack):
 
 
 def test_index_half_square_kilometre_of_nrw_gives_eight_tiles(real_data):
-    """The western half of a 1 km file gives eight tiles of the paper's size."""
-    result = index(real_data / "nrw", {"dsm": "dom1_*.tif", "dtm": "dom1_*.tif"})
-    assert [t.id for t in result.tiles] == [
+    """The western half of a 1 km file of the paper's data source gives eight tiles of the paper's size."""
+    result = nrw.index(real_data / "nrw")
+    assert [tile.id for tile in result.tiles] == [
         f"{east}_{north}" for east in (356000, 356250) for north in (5699000, 5699250, 5699500, 5699750)
     ]
-    heights = [load(tile, Options()).dsm for tile in result.tiles]
+    assert {(tile.dataset, tile.datetime.year, tile.datetime_assumed) for tile in result.tiles} == {
+        ("Geobasis NRW", 2020, False)
+    }
+    heights = [load(tile, Options()).dsm for tile in index(real_data / "nrw", {"dsm": DSM, "dtm": DSM}).tiles]
     assert all(np.isfinite(h).all() for h in heights)
     assert min(h.min() for h in heights) == pytest.approx(87.29, abs=0.01)
     assert max(h.max() for h in heights) == pytest.approx(167.28, abs=0.01)
+    (note,) = result.notes
+    assert note.startswith("no dgm1 file under 356000_5699000")
+    with pytest.raises(TaskError, match="the tile has no dtm"):
+        load(result.tiles[0], Options())
+
+
+def test_load_gzipped_xyz_dtm_matches_dsm_cells(real_data, tmp_path):
+    shutil.copy(real_data / "nrw" / DSM, tmp_path)
+    with rasterio.open(tmp_path / DSM) as src:
+        surface = src.read(1)
+    # There is no terrain model of this area; 250 m of the surface model, lowered by 10 m, replace it.
+    lower = surface[:250, :250] - 10
+    north, west = 5700000, 356000
+    lines = (
+        f"{west + col + 0.5:.2f} {north - row - 0.5:.2f} {lower[row, col]:.2f}"
+        for row in range(250)
+        for col in range(250)
+    )
+    (tmp_path / "dgm1_32_356_5699_1_nw.xyz.gz").write_bytes(gzip.compress("\n".join(lines).encode()))
+    tile = next(tile for tile in nrw.index(tmp_path).tiles if tile.id == "356000_5699750")
+    data = load(tile, Options())
+    assert data.notes == ("the DSM lies 10.0 m above the DTM: ellipsoidal heights?",)
+    assert np.array_equal(data.dsm, surface[:250, :250].astype(float))
+    assert np.allclose(data.dsm - data.dtm, 10, atol=0.006)

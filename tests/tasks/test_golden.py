@@ -1,4 +1,4 @@
-"""Pinned output of ecsrc, sample and evaluate for one synthetic tile, with the VERSION of each stage.
+"""Pinned output of load, segment, ecsrc, sample and evaluate for small tiles, with the VERSION of each stage.
 
 If the output of a stage changes on purpose, raise its VERSION, so that stored results are computed again, and
 update the figures here.
@@ -6,20 +6,24 @@ update the figures here.
 
 import hashlib
 from dataclasses import asdict
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 import shapely
 
-from flexroad.catalog.grid import Grid
-from flexroad.tasks import sample
+from flexroad.catalog import Layer, Tile
+from flexroad.tasks import load, sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.meshing.road_outline import encoded
 from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.roads.rasterise import cells
+from flexroad.tasks.segment import mask
 from flexroad.tasks.types import RoadClusters, RoadMask, Surface, TileData
+from tests.builders import make_grid, make_mask, make_tile
+from tests.make_rasters import write
 
-GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 90, 80)
+GRID = make_grid(90, 80)
 
 
 class Hills(Surface):
@@ -47,8 +51,7 @@ def tile() -> tuple[TileData, RoadMask]:
     dsm[(y < 30) & (x - y > 3)] += 0.7
     dsm[:3, :3] = np.nan
     reference = dtm + 0.2 * np.sin(x / 5)
-    data = TileData("golden", GRID, GRID, dsm, dtm, reference=reference)
-    return data, RoadMask(GRID, GRID, mask, np.zeros(GRID.shape, bool))
+    return make_tile(dsm, dtm, reference=reference), make_mask(mask)
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +119,59 @@ def test_evaluate_output_is_pinned_to_version(tile, clusters):
     }
     assert evaluate.VERSION == 3
     assert metrics == pytest.approx(golden, rel=1e-9)
+
+
+PINNED = {
+    "versions": (3, 1),
+    "dsm": (1391, 120.006118, 52.134236),
+    "dtm": (699, 118.97161, 19.40491),
+    "road": (756, 626481),
+    "outside": (108, 101912),
+    "notes": (
+        "dsm resampled: its lattice is off by (0.25, -0.40) m",
+        "dsm: 1 cell outside -500..9000 m taken as nodata",
+        "dtm resampled: its cells are 0.5 m, the tile's 1 m",
+        "dtm: 4 cells outside -500..9000 m taken as nodata",
+    ),
+}
+
+
+def case(root) -> Tile:
+    """Two DSM files off the lattice with a void and an outlier, a DTM at 0.5 m, a land-cover mask."""
+    grid = make_grid(30, 30)
+    row, col = np.mgrid[:40, :40].astype(float)
+    dsm = 120 + 3 * np.sin(row / 5) + 2 * np.cos(col / 7)
+    dsm[:2, 5:9], dsm[20, 20] = np.nan, 1e6
+    write(root / "a.tif", dsm[:, :22], grid.west - 4.75, grid.north + 4.6)
+    write(root / "b.tif", dsm[:, 22:35], grid.west + 17.25, grid.north + 4.6)
+    write(root / "dtm.tif", np.repeat(np.repeat(dsm[5:25] - 1, 2, 0), 2, 1), grid.west, grid.north, cell=0.5)
+    cover = ((row // 9 + col // 6) % 4).astype(np.uint8)
+    write(root / "cover.tif", cover, grid.west - 4, grid.north + 4)
+    layers = (
+        Layer("dsm", ("a.tif", "b.tif")),
+        Layer("dtm", ("dtm.tif",)),
+        Layer("road_mask", ("cover.tif",), values=(1, 3)),
+    )
+    return Tile("golden", grid, layers, str(root), datetime(2020, 1, 1, tzinfo=UTC))
+
+
+def summary(heights) -> tuple[int, float, float]:
+    """Return the number of values, their mean, and a mean weighted by position."""
+    filled = np.where(np.isnan(heights), 0.0, heights)
+    weights = np.arange(filled.size).reshape(filled.shape) / filled.size
+    mean, weighted = float(np.nanmean(heights)), float((filled * weights).mean())
+    return int(np.isfinite(heights).sum()), round(mean, 6), round(weighted, 6)
+
+
+def test_load_and_segment_output_is_pinned(tmp_path):
+    data = load.load(case(tmp_path), load.Options(halo_m=5))
+    road = mask.segment(data, mask.Options())
+    got = {
+        "versions": (load.VERSION, mask.VERSION),
+        "dsm": summary(data.dsm),
+        "dtm": summary(data.dtm),
+        "road": (int(road.mask.sum()), int(np.flatnonzero(road.mask).sum())),
+        "outside": (int(road.outside.sum()), int(np.flatnonzero(road.outside).sum())),
+        "notes": data.notes,
+    }
+    assert got == PINNED
