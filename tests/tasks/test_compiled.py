@@ -39,24 +39,6 @@ def test_error_model_is_that_of_the_function_itself():
         _reciprocals(np.zeros(1))
 
 
-def test_function_called_by_compiled_ones_alone_has_no_cache(tmp_path, monkeypatch):
-    """Its code is part of the caller's."""
-    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
-
-    @compiled()
-    def double(value):
-        return 2.0 * value
-
-    @compiled()
-    def quadruple(value):
-        return double(double(value))
-
-    assert quadruple(3.0) == 12.0
-    assert {path.name.split("-")[0] for path in tmp_path.rglob("*.nbi")} == {
-        "test_compiled.test_function_called_by_compiled_ones_alone_has_no_cache.locals.quadruple"
-    }
-
-
 def test_import_read_only_installation_without_home(tmp_path):
     """Numba raises on import if it has no writable cache folder; FlexRoad sets one."""
     root = Path(__file__).parents[2]
