@@ -168,7 +168,7 @@ def test_fit_without_road_equals_run_and_is_flagged(tmp_path, rasters):
     run_tiles(Run.create(tmp_path / "run", load_config("production"), catalog), SerialExecutor())
     run = flexroad.open_run(tmp_path / "run")
     assert run.metrics["flags"].item() == "no-road"
-    with pytest.warns(UserWarning, match="road_mask has no road cell .* the surface is that of the terrain"):
+    with pytest.warns(UserWarning, match="road_mask has no road cell .* the surface is the terrain's"):
         fitted = flexroad.fit(rasters["dsm"], rasters["dtm"], rasters["road_mask"] * 0)
     assert fitted.flags == ("no-road",)
     assert "road: 0 cells given, 0 kept by the filter; no-road" in repr(fitted)

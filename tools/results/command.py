@@ -69,7 +69,7 @@ def query(
         str | None,
         typer.Option(
             metavar="N|all",
-            help="Level of roads above roads: 0 is the sampler, all: a row per level; default: the highest.",
+            help="Level of roads above roads: 0 is the ground, all: a row per level; default: the highest.",
         ),
     ] = None,
     variant: Annotated[
