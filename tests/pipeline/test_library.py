@@ -435,7 +435,7 @@ def test_fit_plane_and_raster_have_heights_but_no_file(scene, tmp_path):
         flat = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, "ablation", variant)
         assert repr(flat).startswith(f"<flexroad.Surface: {kind}, config ablation>")
         assert np.isfinite(flat.height(*CENTRE))
-        with pytest.raises(flexroad.TaskError, match="no NURBS surface"):
+        with pytest.raises(flexroad.TaskError, match="not a NURBS surface"):
             flat.save(tmp_path / "flat.npz")
 
 

@@ -191,7 +191,7 @@ class Surface:
         ({'y': 120, 'x': 120}, ['height', 'road'], 25832)
         """
         if not 0 < resolution < np.inf:
-            raise ConfigError(f"resolution {resolution:g} m is no cell size; give one above 0, such as 0.5")
+            raise ConfigError(f"resolution {resolution:g} m is not a cell size; give a number above 0")
         grid = Grid.covering(self.crs, self.bounds, resolution)
         x, y = np.meshgrid(grid.eastings, grid.northings)
         heights = self.fitted.lattice(grid.eastings, grid.northings)
@@ -272,7 +272,7 @@ class Surface:
         """
         if not isinstance(self.fitted, NurbsSurface):
             raise TaskError(
-                f"a {type(self.fitted).__name__} is no NURBS surface; save the result of to_xarray()"
+                f"a {type(self.fitted).__name__} is not a NURBS surface; save the result of to_xarray()"
             )
         buffer = io.BytesIO(npz.encode(self.fitted))
         if self.road is not None and self.clusters is not None:
