@@ -155,8 +155,8 @@ def test_network_without_crs_needs_one(run, flexroad, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda data: data[:-20], "is not whole XML"),
-        (lambda data: data.replace(b"</", b"<", 1), "is not whole XML"),
+        (lambda data: data[:-20], "is not complete XML"),
+        (lambda data: data.replace(b"</", b"<", 1), "is not complete XML"),
         (
             lambda data: b'<!DOCTYPE a [<!ENTITY b "c"><!ENTITY d "&b;&b;">]>' + data,
             "declares the entity 'b'",
