@@ -55,7 +55,7 @@ def load_arrays(
     - `road_mask`: road where True or not 0, or roads as vectors.
     - `options`: the halo is NaN where the DTM and the mask do not reach beyond the DSM.
     - `road_values`: values of the mask that mean road; empty: every value but 0 and nodata.
-    - result: the DTM and the mask are copied where their cells coincide with those of the DSM. Otherwise they
+    - result: the DTM and the mask are copied where their cells coincide with the DSM's cells. Otherwise they
       are resampled (heights bilinearly, the mask to the nearest cell), with a note. A mask without road
       cells, or whose values do not fit those that mean road, gives a note, too.
     """

@@ -130,8 +130,8 @@ PRESET: Mapping[str, SceneOptions] = {
 def survey(tiles: int = TILES, seed: int = 0) -> list[tuple[str, Grid, str, SceneOptions]]:
     """Return id, grid, stratum and options of the benchmark's tiles, in the paper's shares of the strata.
 
-    The tiles of a smaller survey are a subset of those of a larger one. Tiles lie on the absolute grid, 3 km
-    apart.
+    The tiles of a smaller survey are a subset of the tiles of a larger survey. They lie on the absolute grid,
+    3 km apart.
 
     - `tiles`: number of tiles; 240 as in the paper.
     """
