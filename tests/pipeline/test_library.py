@@ -376,7 +376,7 @@ def rotated(array):
         ("dsm", lambda a: a.to_dataset(), "dsm is a Dataset; give an xarray.DataArray"),
         ("dsm", lambda a: xr.concat([a, a], "time"), r"dsm has dimensions \(time: 2, y: 60, x: 60\)"),
         ("dsm", lambda a: a.assign_attrs(units="m", scale_factor=0.01), "scale_factor 0.01"),
-        ("road_mask", lambda a: a.astype(str), "road_mask holds <U5, not numbers"),
+        ("road_mask", lambda a: a.astype(str), "road_mask has <U5, not numbers"),
         ("dsm", lambda a: a[:1], "dsm has 1 x 60 cells; give at least 2 x 2"),
     ],
 )  # fmt: skip

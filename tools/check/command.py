@@ -131,7 +131,7 @@ def catalog_check(
         str | None,
         typer.Option(
             metavar="NAME|FILE",
-            help="Configuration of the run; default: the one that fits the layers.",
+            help="Configuration of the run; default: the configuration that fits the layers.",
             rich_help_panel=INPUTS,
         ),
     ] = None,
@@ -141,8 +141,8 @@ def catalog_check(
 ) -> None:
     """Check a catalog before a long run.
 
-    Prints layers, expected failures of a run, the shift between photo and heights, and the number of places
-    that look like decks but have no road with a level. They are written to decks.geojson next to the catalog.
+    Prints layers, expected failures of a run, the shift between photo and heights, and decks without a level.
+    These are written to decks.geojson next to the catalog.
     """
     catalog, faults = Catalog.read(path, options.allowed(ctx)), 0
     for remark in check(catalog, load_config(config or fitting_config(catalog)), path, decks):

@@ -132,7 +132,7 @@ def _geometry(curve: PPoly, start: float, end: float, s: float, s_end: float) ->
     along = derivatives @ (math.cos(heading), math.sin(heading))
     left = derivatives @ (-math.sin(heading), math.cos(heading))
     geometry = ET.Element("geometry", _attributes(s=s, x=x, y=y, hdg=heading, length=s_end - s))
-    # The curve starts at the origin of these axes, along the first one.
+    # The curve starts at the origin of these axes, along the first axis.
     u = _attributes(aU=0.0, bU=along[1], cU=along[2], dU=along[3])
     v = _attributes(aV=0.0, bV=0.0, cV=left[2], dV=left[3])
     ET.SubElement(geometry, "paramPoly3", {**u, **v, "pRange": "normalized"})

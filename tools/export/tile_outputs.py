@@ -191,7 +191,7 @@ def figures(rows: Iterable[ManifestRow]) -> dict[str, Any]:
 
 
 def write_whole(file: Location, key: str, row: ManifestRow, fill: Callable[[Path], None]) -> None:
-    """Write the one file of a folder, unless it exists and was made with the same key.
+    """Write the only file of a folder, unless it exists and was made with the same key.
 
     The former file is removed if it had another name.
 

@@ -145,7 +145,7 @@ def plan_crs(crs: str) -> str:
     try:
         return in_plan(crs)
     except CatalogError as error:
-        raise TaskError(f"has a CRS that PROJ does not read: {error}; give another one with --crs") from error
+        raise TaskError(f"has a CRS that PROJ does not read: {error}; give another CRS with --crs") from error
 
 
 @dataclass(frozen=True)

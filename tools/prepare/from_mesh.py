@@ -208,7 +208,7 @@ def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float) -> Floats:
 
     - `dtm` ``(H, W)``: bare ground from a ground filter, m; NaN where unknown.
     - `ground` ``(H, W)``: cells with ground points; the heights of the others are interpolated.
-    - `fill_m`: gaps up to this width are interpolated linearly (m), wider ones become NaN.
+    - `fill_m`: gaps up to this width are interpolated linearly (m), wider gaps become NaN.
     - result ``(H, W)``: m; cells without a height in ``dtm`` have none in the result.
     """
     ground = ground & np.isfinite(dtm)

@@ -91,10 +91,10 @@ DECKS = {
 }
 """Columns of the table of decks and tunnels."""
 DECKS_MEANING = (
-    "Levels above 0 are decks, levels below 0 tunnels. Abutments are ends where a road of level 0 goes on, "
+    "Levels above 0 are decks, levels below 0 tunnels. Abutments are ends where a road of level 0 continues, "
     "clearance is the median height between the level and level 0. docs/levels.md explains the flags."
 )
-HOLDOUT = "A second fit did without these squares of road (`assess.holdout`); 90% intervals hold 90% of them."
+HOLDOUT = "A second fit left out these squares of road (`assess.holdout`); 90% intervals contain 90% of them."
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """The test of the paper's claims on a run, and the bootstrap confidence intervals for it.
 
-Tiles are drawn with replacement, the same tiles for every variant, so that intervals of differences and
-ratios between variants use the pairing (Efron & Tibshirani, An Introduction to the Bootstrap, 1993).
+Tiles are drawn with replacement, the same tiles for every variant. So intervals of differences and ratios
+between variants use the pairing (Efron & Tibshirani, An Introduction to the Bootstrap, 1993).
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ def compare(data: MetricsData) -> Comparison:
     # Table II with the full pipeline only would repeat Table I.
     tables = {name: rows for name, rows in tables.items() if {row.variant for row in rows} - {BASE}}
     if not tables:
-        raise ConfigError("the run has none of the variants FlexRoad is compared with; use --config ablation")
+        raise ConfigError("the run has no variants to compare FlexRoad with; use --config ablation")
     dsc3d_sections, dsc3d_notes, dsc3d_numbers, dsc3d_claims = _dsc3d(data.dsc3d)
     # Claims about DSC3D have their own table if there is a run to test them on.
     tested = [claim for claim in CLAIMS if claim.dataset == paper or not data.dsc3d]

@@ -60,7 +60,7 @@ def query(
         str | None,
         typer.Option(
             metavar="CRS",
-            help="CRS of the points or the line, if it is another one: EPSG:4326 for degrees. First east, "
+            help="CRS of the points or the line, if it is not the run's: EPSG:4326 for degrees. First east, "
             "then north.",
             rich_help_panel=INPUTS,
         ),

@@ -205,7 +205,7 @@ def _values(name: str, array: xr.DataArray) -> Floats:
         )
     raw: np.ndarray[Any, Any] = np.asarray(array.values)
     if raw.dtype.kind not in "buif":
-        raise TaskError(f"{name} holds {raw.dtype}, not numbers; convert it with .astype(float)")
+        raise TaskError(f"{name} has {raw.dtype}, not numbers; convert it with .astype(float)")
     values = raw.astype(np.float64)
     # A comparison keeps the attribute of its raster, and rioxarray cannot convert 255 to bool.
     nodata = None if raw.dtype.kind == "b" else array.rio.nodata

@@ -264,7 +264,7 @@ class RunView:
             ``height`` (m, float32; NaN off the finished tiles and beyond the survey) and ``road`` (bool, the
             filtered mask), backed by Dask: one chunk per tile, read from the tile's GeoTIFF when it is
             computed. Coordinates ``x`` (ascending) and ``y`` (descending) are eastings and northings (m);
-            ``.rio.crs`` is set. Where tiles overlap, the first one in the catalog is used.
+            ``.rio.crs`` is set. Where tiles overlap, the first tile in the catalog is used.
 
         Raises
         ------
@@ -459,7 +459,7 @@ def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str |
     path : str or Path
         The folder given to ``flexroad run --out``, or its address in object storage (``s3://...``).
     variant : str, optional
-        The variant whose surfaces are used; by default the first one exported.
+        The variant whose surfaces are used; by default the first exported variant.
     allow : sequence of str or Path
         Further folders that the sources of the run may lie below. Needed for runs of another user, or of
         another machine, with sources outside the run's folder.

@@ -336,7 +336,7 @@ def fit(
     config : str or Path
         A shipped configuration (``production``, ``paper``) or a YAML file.
     variant : str, optional
-        A variant of the configuration; by default the first one exported.
+        A variant of the configuration; by default the first exported variant.
     road_values : sequence of int
         Values of the road mask that mean road; empty: all except 0 and nodata.
     settings : sequence of str, or mapping
@@ -371,7 +371,7 @@ def fit(
     if variant not in chosen.chains:
         raise ConfigError(f"{config} has no variant {variant!r}; it has {', '.join(chosen.chains)}")
     chain = chosen.chains[variant]
-    # At these sizes several BLAS threads are much slower than one.
+    # At these sizes several BLAS threads are much slower than one thread.
     with threadpool_limits(1), _layer(road_mask) as layer:
         data = load_arrays(dsm, dtm, layer, chain["load"], road_values)
         if data.roads and road_values:

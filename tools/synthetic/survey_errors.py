@@ -1,7 +1,8 @@
 """Differences between the rasters of a survey and the true ground, besides noise and objects.
 
-Changes between two surveys (new road surfaces, new kerbs, excavations), low vegetation that a scan does not
-penetrate, mixed cells at edges and walls, errors of a terrain model under houses, and cells without a height:
+These are changes between two surveys (new road surfaces, new kerbs, excavations), and low vegetation that a
+scan does not penetrate. Others are mixed cells at edges and walls, errors of a terrain model under houses,
+and cells without a height:
 
 - ground hidden by crowns. The survey sees a crown from one image, so the ground at its far side is hidden.
   More ground is hidden if the crown is nearer to the image's edge;

@@ -277,7 +277,7 @@ def _split(pieces: Sequence[Block], options: TrainOptions) -> Split:
     _check_labels(pieces, options)
     if len(pieces) == 1:
         raise ConfigError(
-            f"only tile {pieces[0].tile.id} has labels, none is left for validation: label another one, or "
+            f"only tile {pieces[0].tile.id} has labels, none is left for validation: label another tile, or "
             "make a catalog of this tile alone, which is then split in two"
         )
     sides = split(pieces, options.validation, options.gap_m, options.seed)

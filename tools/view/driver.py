@@ -158,7 +158,7 @@ def _claim(out: Location, run: Run) -> None:
     """Take the folder for this run's viewer: remove an earlier page, and store the run's path."""
     for place in (run.path, run.store, run.path / "tiles"):
         if absolute(out) == absolute(place) or absolute(out) in absolute(place).parents:
-            raise ConfigError(f"{out} is a folder of the run or above it; choose another one with -o")
+            raise ConfigError(f"{out} is a folder of the run or above it; choose another folder with -o")
     for place in (run.store, run.path / "tiles"):
         if absolute(place) in absolute(out).parents:
             raise ConfigError(f"{out} lies in {place}, which belongs to the run; choose another with -o")

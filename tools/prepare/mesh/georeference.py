@@ -37,7 +37,7 @@ class Georeference:
     offset: Offset | None = None
 
     def with_fallback(self, other: Georeference) -> Georeference:
-        """Return a copy with missing values taken from another one."""
+        """Return a copy with missing values taken from another georeference."""
         return Georeference(
             other.crs if self.crs is None else self.crs, other.offset if self.offset is None else self.offset
         )

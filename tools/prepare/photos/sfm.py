@@ -48,7 +48,7 @@ class Options(base.Options):
     )
     features: int = Field(8192, ge=500, description="largest number of features per photograph")
     neighbours: int = Field(
-        12, ge=2, description="each photograph is matched with this number of nearest ones"
+        12, ge=2, description="each photograph is matched with this number of nearest photographs"
     )
     calibrate: Literal["auto", "held", "free"] = Field(
         "auto",

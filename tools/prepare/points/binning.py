@@ -103,9 +103,9 @@ def highest(cells: Cells, height: Floats, shape: tuple[int, int]) -> Floats:
 def spikes(cells: Cells, height: Floats, shape: tuple[int, int], despike_m: float) -> NDArray[np.int64]:
     """Return the indices of single points far above all points around them, ``(k,)``.
 
-    The highest point of a cell is a spike if it is more than ``despike_m`` above the second highest point of
-    its cell and above the highest points of all 8 neighbours. A pole or a crown with two points is not a
-    spike. A point without any points around it is not a spike. A cell has at most one spike.
+    The highest point of a cell is a spike if it is more than ``despike_m`` above two heights: the second
+    highest point of its cell, and the highest points of all 8 neighbours. A pole or a crown with two points
+    is not a spike. A point without any points around it is not a spike. A cell has at most one spike.
     """
     top, second, index = _two_highest(cells, height, shape[0] * shape[1])
     around = ndimage.maximum_filter(top.reshape(shape), footprint=AROUND, mode="constant", cval=-np.inf)

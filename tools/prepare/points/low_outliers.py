@@ -155,7 +155,7 @@ def _sorted(x: Floats, y: Floats, z: Floats, shape: tuple[int, int], side: float
 
 @compiled()
 def span(position: float, reach: float, side: float, count: int) -> tuple[int, int]:
-    """Return the first bucket within reach of a coordinate, and the last one plus 1."""
+    """Return the first bucket within reach of a coordinate, and the last bucket plus 1."""
     first = math.floor((position - reach - SLACK_M) / side)
     last = math.floor((position + reach + SLACK_M) / side)
     return max(first, 0), min(last, count - 1) + 1

@@ -56,7 +56,7 @@ MEANINGS = {
     ),
     "patch": _Meaning(
         "{value} m² of road in one piece are far from both DSM and DTM (limit {limit} m²)",
-        "look for a bridge (`flexroad catalog check` maps unnamed ones), a tree or a gap in the data{there}",
+        "look for a bridge (`flexroad catalog check` maps bridges), a tree or a gap in the data{there}",
     ),
     "spike": _Meaning(
         "the surface bends more than a road can ({value} 1/m, limit {limit} 1/m)",
@@ -72,7 +72,7 @@ MEANINGS = {
     ),
     "off-dtm": _Meaning(
         "{value} of the road lie off the DTM (limit {limit})",
-        "a bridge is right (`flexroad catalog check` maps unnamed ones); otherwise the DTM is wrong or "
+        "a bridge is right (`flexroad catalog check` maps bridges); otherwise the DTM is wrong or "
         "older{there}",
         percent=True,
     ),
@@ -100,7 +100,7 @@ MEANINGS = {
         "a culvert is right; otherwise check the level and the outline of this road",
     ),
     NO_ABUTMENT: _Meaning(
-        "at a deck no road of level 0 goes on",
+        "no road of level 0 continues a deck",
         "check the level of the roads at its ends, and gaps there; level 0 ends by itself",
     ),
     NO_ROAD: _Meaning(
@@ -228,7 +228,7 @@ def statements(content: Content, table: TileTable, failed: Mapping[str, str], ru
 
 def _last_run(content: Content, run: str) -> Iterator[_Statement]:
     if content.counts.refused:
-        yield _Statement("failed", f"The last run could not go on: {printable(content.counts.refused)}")
+        yield _Statement("failed", f"The last run could not continue: {printable(content.counts.refused)}")
     if content.counts.interrupted:
         text = "The last run was interrupted; its tiles are kept."
         yield _Statement("pending", text, f"flexroad rerun {run}")
