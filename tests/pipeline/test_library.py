@@ -168,7 +168,7 @@ def test_fit_without_road_equals_run_and_is_flagged(tmp_path, rasters):
     run_tiles(Run.create(tmp_path / "run", load_config("production"), catalog), SerialExecutor())
     run = flexroad.open_run(tmp_path / "run")
     assert run.metrics["flags"].item() == "no-road"
-    with pytest.warns(UserWarning, match="road_mask has no road cell .* the surface is that of the terrain"):
+    with pytest.warns(UserWarning, match="road_mask has no road cell .* the surface is the terrain's"):
         fitted = flexroad.fit(rasters["dsm"], rasters["dtm"], rasters["road_mask"] * 0)
     assert fitted.flags == ("no-road",)
     assert "road: 0 cells given, 0 kept by the filter; no-road" in repr(fitted)
@@ -376,7 +376,7 @@ def rotated(array):
         ("dsm", lambda a: a.to_dataset(), "dsm is a Dataset; give an xarray.DataArray"),
         ("dsm", lambda a: xr.concat([a, a], "time"), r"dsm has dimensions \(time: 2, y: 60, x: 60\)"),
         ("dsm", lambda a: a.assign_attrs(units="m", scale_factor=0.01), "scale_factor 0.01"),
-        ("road_mask", lambda a: a.astype(str), "road_mask holds <U5, not numbers"),
+        ("road_mask", lambda a: a.astype(str), "road_mask has <U5, not numbers"),
         ("dsm", lambda a: a[:1], "dsm has 1 x 60 cells; give at least 2 x 2"),
     ],
 )  # fmt: skip
@@ -435,7 +435,7 @@ def test_fit_plane_and_raster_have_heights_but_no_file(scene, tmp_path):
         flat = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, "ablation", variant)
         assert repr(flat).startswith(f"<flexroad.Surface: {kind}, config ablation>")
         assert np.isfinite(flat.height(*CENTRE))
-        with pytest.raises(flexroad.TaskError, match="no NURBS surface"):
+        with pytest.raises(flexroad.TaskError, match="not a NURBS surface"):
             flat.save(tmp_path / "flat.npz")
 
 
