@@ -68,16 +68,12 @@ def test_other_addresses_are_never_allowed(tmp_path, file):
             check(tile_catalog, tmp_path, ["/", file])
 
 
-def test_path_longer_than_any_file_is_cut_in_the_message(tmp_path):
+def test_root_is_not_trusted_and_long_paths_are_cut_in_the_message(tmp_path):
+    with pytest.raises(CatalogError, match="--allow /etc"):
+        check(catalog("passwd", root="/etc"), tmp_path)
     with pytest.raises(CatalogError, match="a path of 20,0.. characters outside the catalog") as caught:
         check(catalog("/" + "9" * 20_000, root=tmp_path), tmp_path)
     assert len(str(caught.value)) < 500
-
-
-def test_root_in_catalog_does_not_allow_files(tmp_path):
-    """The root of tiles is read from the catalog and must not be trusted."""
-    with pytest.raises(CatalogError, match="--allow /etc"):
-        check(catalog("passwd", root="/etc"), tmp_path)
 
 
 @pytest.mark.parametrize("file", ["dsm/a.tif", "link.tif", "dsm/../data/a.tif"])

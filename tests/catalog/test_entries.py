@@ -33,20 +33,16 @@ def known(tiles):
     return [(tile.id, tile.grid, tile.fault) for tile in tiles]
 
 
-def write(path, entries, schema):
-    if path.suffix == ".json":
-        bad_entries.write_json(path, entries)
-    else:
-        bad_entries.write_parquet(path, entries, schema)
-
-
 @pytest.mark.parametrize(("kind", "change"), list(cases()), ids=lambda value: getattr(value, "name", value))
 def test_bad_entry_becomes_a_tile_with_a_fault(kind, change, valid, schema, tmp_path):
     entries = bad_entries.features(valid)
     good = Catalog.read(valid).tiles
     entries[1] = change.apply(entries[1])
     path = tmp_path / f"survey.{kind}"
-    write(path, entries, schema)
+    if kind == "json":
+        bad_entries.write_json(path, entries)
+    else:
+        bad_entries.write_parquet(path, entries, schema)
     tiles = Catalog.read(path).tiles
     assert known([tiles[0], *tiles[2:]]) == known([good[0], *good[2:]])
     (bad,) = (tile for tile in tiles if tile.fault)
@@ -150,19 +146,20 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_bad_file_gives_one_line(name, tmp_path, flexroad):
+def test_bad_file_gives_one_line(name, tmp_path):
     (tmp_path / name).write_bytes(FILES[name])
     with pytest.raises(CatalogError, match=f"{name} is not a FlexRoad catalog: ") as caught:
         Catalog.read(tmp_path / name)
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 700
-    for command in (
-        ["catalog", "show", tmp_path / name],
-        ["catalog", "check", tmp_path / name],
-        ["run", "--config", "paper", "--catalog", tmp_path / name, "--out", tmp_path / "run"],
-    ):
-        said = flexroad(*command).expected(2)
-        assert len(said.errors) == 1
+
+
+@pytest.mark.parametrize("words", [["catalog", "show"], ["catalog", "check"], ["run", "--catalog"]])
+def test_command_over_a_bad_file_ends_with_one_line(words, tmp_path, flexroad, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "deep.json").write_bytes(FILES["deep.json"])
+    said = flexroad(*words, "deep.json", *(["--out", "run"] if words[0] == "run" else [])).expected(2)
+    assert len(said.errors) == 1
 
 
 def test_many_bad_entries_are_no_catalog(tmp_path, monkeypatch):
@@ -182,11 +179,11 @@ def test_large_file_is_not_read(tmp_path):
 
 def test_table_that_unpacks_to_much_is_not_read(tmp_path, monkeypatch):
     path = tmp_path / "c.parquet"
-    column = pa.array(["a" * 1_000_000] * 300)
+    column = pa.array(["a" * 1_000_000] * 100)
     pq.write_table(pa.table({"id": column}), path, compression="zstd", use_dictionary=False)
     assert path.stat().st_size < 1_000_000
-    monkeypatch.setattr("flexroad.catalog.geoparquet.MAX_UNPACKED", 2**28)
-    with pytest.raises(CatalogError, match=r"it has 300 rows, which unpack to 0\.3 GiB"):
+    monkeypatch.setattr("flexroad.catalog.geoparquet.MAX_UNPACKED", 2**26)
+    with pytest.raises(CatalogError, match=r"it has 100 rows, which unpack to 0\.1 GiB"):
         Catalog.read(path)
 
 

@@ -17,7 +17,7 @@ from flexroad.catalog.guard.open_vector import vector_name
 from flexroad.catalog.sources.rasters import index
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.load import Options, load
-from tests.command_line import PROCESS
+from tests.command_line import PROCESS, call
 from tests.make_rasters import damage, write
 
 LINE = "ignored {}: set for the GDAL and PROJ of another program; unset it to avoid this line"
@@ -91,18 +91,15 @@ def test_damaged_block_fails_though_gdal_is_told_to_ignore_errors(tmp_path):
 def test_command_fails_a_damaged_block_whatever_environment_and_file_say(tmp_path):
     """The configuration file also tells GDAL not to look at the environment."""
     damaged(tmp_path)
-    file = tmp_path / "gdalrc"
+    file, catalog = tmp_path / "gdalrc", tmp_path / "a.json"
     file.write_text("[directives]\nignore-env-vars=yes\n[configoptions]\nGTIFF_IGNORE_READ_ERRORS=YES\n")
-    words = ["catalog", "check", str(tmp_path / "a.json")]
-    make = ["catalog", "rasters", str(tmp_path), "--dsm", "dsm.tif", "--dtm", "dtm.tif"]
-    make += ["--tile-size", "60", "-o", str(tmp_path / "a.json")]
-    subprocess.run([*PROCESS, *make], check=True, capture_output=True)
-    said = []
-    for more in ({}, {"GTIFF_IGNORE_READ_ERRORS": "YES"}, {FILE: str(file)}):
-        ended = subprocess.run([*PROCESS, *words], env=os.environ | more, capture_output=True, text=True)
-        said.append((ended.returncode, ended.stdout))
-    assert said[0][0] == 1
-    assert said[1:] == said[:1] * 2
+    words = ("--dsm", "dsm.tif", "--dtm", "dtm.tif", "--tile-size", 60, "-o", catalog)
+    call("catalog", "rasters", tmp_path, *words).expected(0)
+    expected = call("catalog", "check", catalog).expected(1).out
+    for more in ({"GTIFF_IGNORE_READ_ERRORS": "YES"}, {FILE: str(file)}):
+        check = [*PROCESS, "catalog", "check", str(catalog)]
+        ended = subprocess.run(check, env=os.environ | more, capture_output=True, text=True)
+        assert (ended.returncode, ended.stdout) == (1, expected)
 
 
 def test_ascii_grid_keeps_decimals_though_a_variable_wants_whole_numbers(tmp_path):

@@ -1,18 +1,16 @@
 import gzip
-import os
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from affine import Affine
 from hypothesis import given
 from hypothesis import strategies as st
 
 from flexroad.catalog import CatalogError
 from flexroad.catalog.sources.nrw import index, parse
 from flexroad.tasks.load import Options, load
+from tests.make_clouds import write_cloud
 from tests.make_rasters import UTM, write, write_xyz
 
 WEST, NORTH = 356000, 5700000
@@ -20,14 +18,6 @@ WEST, NORTH = 356000, 5700000
 
 def heights(rows=500, columns=500):
     return np.random.default_rng(0).uniform(87, 168, (rows, columns)).astype(np.float32)
-
-
-def packed(path: Path, values, west=WEST, north=NORTH) -> Path:
-    """Write a gzipped XYZ file, as the state delivers it."""
-    plain = write_xyz(path.with_suffix(""), values, west, north)
-    path.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
-    plain.unlink()
-    return path
 
 
 @pytest.mark.parametrize(
@@ -70,13 +60,11 @@ def test_index_square_gives_tiles_of_250_m(tmp_path):
     """DSM as GeoTIFF, DTM as gzipped XYZ without a CRS, DOP as JP2 of four bands."""
     dom, dgm = heights(), heights() - 10
     write(tmp_path / "dom" / "dom1_32_356_5699_1_nw_2020.tif", dom, WEST, NORTH)
-    packed(tmp_path / "dgm1_32_356_5699_1_nw.xyz.gz", dgm)
-    rgbi = np.random.default_rng(1).integers(0, 255, (4, 500, 500), dtype=np.uint8)
-    form = {"count": 4, "dtype": "uint8", "width": 500, "height": 500, "crs": UTM}
-    place = Affine(1, 0, WEST, 0, -1, NORTH)
+    plain = write_xyz(tmp_path / "dgm1_32_356_5699_1_nw.xyz", dgm, WEST, NORTH)
+    Path(f"{plain}.gz").write_bytes(gzip.compress(plain.read_bytes()))
+    plain.unlink()
     photo = tmp_path / "dop10rgbi_32_356_5699_1_nw_2021.jp2"
-    with rasterio.open(photo, "w", driver="JP2OpenJPEG", transform=place, **form) as dst:
-        dst.write(rgbi)
+    write(photo, np.ones((500, 500), np.uint8), WEST, NORTH, driver="JP2OpenJPEG", count=4)
     (tmp_path / "dom" / "dom1_nw.csv").write_text("metadata")
     before = sorted(tmp_path.rglob("*"))
     result = index(tmp_path)
@@ -112,16 +100,6 @@ def test_index_several_years_uses_newest(tmp_path):
         "dsm: 3 pairs of files cover the same ground; by the dates in their names, "
         "dom1_32_356_5699_1_nw_2022.tif is used before "
     )
-
-
-def test_index_files_of_unknown_age_that_differ_are_refused(tmp_path):
-    for folder, height in (("a", 20.0), ("b", 21.0)):
-        path = tmp_path / folder / "dom1_32_356_5699_1_nw.tif"
-        write(path, np.full((250, 250), height), WEST, NORTH)
-        os.utime(path, (1.7e9, 1.7e9))
-    write(tmp_path / "dgm1_32_356_5699_1_nw_2016.tif", np.zeros((250, 250)), WEST, NORTH)
-    with pytest.raises(CatalogError, match="dsm: a/dom1_32_356_5699_1_nw.tif and b/.* cover the same ground"):
-        index(tmp_path)
 
 
 def test_index_date_tag_in_year_of_name_is_used(tmp_path):
@@ -171,19 +149,6 @@ def test_index_folder_without_dsm_raises_error(tmp_path):
         index(tmp_path / "nowhere")
 
 
-def cloud(path: Path, x, y, z, classes) -> Path:
-    """Write a classified point cloud in centimetres, as the state delivers it."""
-    import laspy
-
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales, header.offsets = [0.01] * 3, [WEST, NORTH - 1000, 0]
-    points = laspy.LasData(header)
-    points.x, points.y, points.z = (np.asarray(axis) for axis in (x, y, z))
-    points.classification = np.asarray(classes, np.uint8)
-    points.write(path)
-    return path
-
-
 def test_index_bridge_points_extend_reference(tmp_path):
     """The reference is the DTM with the mean of class 17 per cell; the DTM itself does not change."""
     root, derived = tmp_path / "nrw", tmp_path / "derived"
@@ -192,7 +157,8 @@ def test_index_bridge_points_extend_reference(tmp_path):
     write(root / "dgm1_32_356_5699_1_nw_2020.tif", dgm, WEST, NORTH)
     x = WEST + np.array([10.2, 10.8, 20.5, 30.5])
     y = NORTH - np.array([5.5, 5.5, 7.5, 8.5])
-    cloud(root / "3dm_32_356_5699_1_nw.laz", x, y, [200.0, 201.0, 202.0, 203.0], [17, 17, 2, 17])
+    points = np.stack([x, y, [200.0, 201.0, 202.0, 203.0]], axis=1)
+    write_cloud(root / "3dm_32_356_5699_1_nw.laz", points, [17, 17, 2, 17])
     result = index(root, derived=derived)
     assert result.notes == ()
     (tile,) = result.tiles
@@ -211,7 +177,7 @@ def test_index_bridge_points_extend_reference(tmp_path):
 def test_index_cloud_without_bridges_or_broken_keeps_tile(tmp_path):
     write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     write(tmp_path / "dgm1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
-    cloud(tmp_path / "3dm_32_356_5699_1_nw_2020.laz", [WEST + 1.0], [NORTH - 1.0], [100.0], [2])
+    write_cloud(tmp_path / "3dm_32_356_5699_1_nw_2020.laz", [WEST + 1.0, NORTH - 1.0, 100.0], 2)
     bad = tmp_path / "3dm_32_356_5699_1_nw_2021.laz"
     bad.write_bytes(b"points")
     result = index(tmp_path, derived=tmp_path / "derived")
