@@ -63,6 +63,7 @@ def test_layer_in_another_crs_needs_reproject(mixed, name):
     [
         ("EPSG:2263", (985_000, 200_000), 3, "EPSG:32618", "^dsm.tif .*US survey feet; "),
         ("EPSG:3857", (1_113_000, 6_621_000), 1, "EPSG:32632", "^dsm.tif: a metre of EPSG:3857 is 0.629 m "),
+        ("EPSG:4326", (6.1, 50.8), 1e-5, "EPSG:32632", "^dsm.tif is in EPSG:4326, whose unit is degrees; "),
     ],
 )
 def test_dsm_not_in_metres_is_refused_with_the_options_that_accept_it(

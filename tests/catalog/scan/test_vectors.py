@@ -11,7 +11,7 @@ from shapely import LineString, box
 
 from flexroad.catalog import Catalog, CatalogError
 from flexroad.catalog.scan.vectors import MARGIN_M, VectorFile, layers, with_roads
-from flexroad.catalog.sources import nrw, rasters
+from flexroad.catalog.sources import rasters
 from flexroad.catalog.tile import REACH_M
 from flexroad.tasks.io.vectors import Query, read_near
 from tests.make_rasters import write
@@ -130,13 +130,6 @@ def test_file_of_several_layers_needs_the_choice_of_one(survey):
     for name in ("c.parquet", "c.json"):
         Catalog(result.tiles).write(survey / name)
         assert Catalog.read(survey / name).tiles[0].layer("roads").sublayer == "ways"
-
-
-def test_nrw_index_accepts_roads(tmp_path):
-    for product in ("dom1", "dgm1"):
-        write(tmp_path / f"{product}_32_356_5699_1_nw_2020.tif", HEIGHTS[:, :250], 356_000, 5_700_000)
-    write_roads(tmp_path / "r.gpkg", [box(356_000, 5_699_800, 356_100, 5_699_900)])
-    assert named(nrw.index(tmp_path, roads="r.gpkg").tiles) == [["r.gpkg"]]
 
 
 FAR = "reaches no tile; check its CRS and its extent: it lies at {} in EPSG:{}, the tiles at 295500 56.*"

@@ -155,42 +155,39 @@ def test_vrt_is_left_out_with_the_remedy_and_a_folder_is_passed_over(survey):
     assert len(result.tiles) == 9
 
 
+@contextlib.contextmanager
+def forbidden(folder: Path, mode: int = 0):
+    """Take all permissions of a folder away, or leave those of ``mode``."""
+    folder.chmod(mode)
+    with permissions_enforced():
+        yield
+    folder.chmod(0o755)
+
+
 @pytest.mark.parametrize("pattern", ["dsm/*.tif", "dsm/**/*.tif", "*sm/*.tif"])
 def test_file_and_folder_without_permission_are_left_out(survey, pattern):
-    (survey / "dsm" / BAD).chmod(0)
     patterns = {**PATTERNS, "dsm": pattern}
-    with permissions_enforced():
+    with forbidden(survey / "dsm" / BAD):
         result = index(survey, patterns, tile_size_m=SIDE)
-        assert result.left_out == (f"skipped dsm/{BAD} (dsm): it cannot be read: Permission denied",)
-        assert len(result.tiles) == 8
-        with forbidden(survey / "dsm"), pytest.raises(CatalogError, match="folder dsm .* Permission denied"):
-            index(survey, patterns, tile_size_m=SIDE)
+    assert result.left_out == (f"skipped dsm/{BAD} (dsm): it cannot be read: Permission denied",)
+    assert len(result.tiles) == 8
+    with forbidden(survey / "dsm"), pytest.raises(CatalogError, match="folder dsm .* Permission denied"):
+        index(survey, patterns, tile_size_m=SIDE)
 
 
-def test_one_of_two_folders_without_permission_is_left_out(survey):
+@pytest.mark.parametrize(("mode", "what"), [(0o000, "folder more "), (0o600, "more/0.tif, more/1.tif ")])
+def test_one_of_two_folders_without_permission_is_left_out(survey, mode, what):
     (survey / "more").mkdir()
     for number in (0, 1):
         (survey / "dsm" / f"{number}.tif").rename(survey / "more" / f"{number}.tif")
     patterns = {**PATTERNS, "dsm": "[dm][so]*/*.tif"}
     assert len(index(survey, patterns, tile_size_m=SIDE).tiles) == 9
-    with permissions_enforced():
-        for mode in (0o000, 0o600):
-            with forbidden(survey / "more", mode):
-                result = index(survey, patterns, tile_size_m=SIDE)
-            assert len(result.tiles) == 7
-            (line,) = result.left_out
-            assert line.startswith("skipped folder more " if not mode else "skipped more/0.tif, more/1.tif ")
-            assert line.endswith("it cannot be read: Permission denied")
-
-
-@contextlib.contextmanager
-def forbidden(folder: Path, mode: int = 0):
-    """Take all permissions of a folder away, or leave those of ``mode``."""
-    folder.chmod(mode)
-    try:
-        yield
-    finally:
-        folder.chmod(0o755)
+    with forbidden(survey / "more", mode):
+        result = index(survey, patterns, tile_size_m=SIDE)
+    assert len(result.tiles) == 7
+    (line,) = result.left_out
+    assert line.startswith(f"skipped {what}")
+    assert line.endswith("it cannot be read: Permission denied")
 
 
 def test_damaged_file_of_roads_is_left_out(survey):

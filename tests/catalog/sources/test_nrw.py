@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from shapely import box
 
 from flexroad.catalog import CatalogError
 from flexroad.catalog.sources.nrw import index, parse
 from flexroad.tasks.load import Options, load
 from tests.make_clouds import write_cloud
 from tests.make_rasters import UTM, write, write_xyz
+from tests.make_roads import write as write_roads
 
 WEST, NORTH = 356000, 5700000
 
@@ -87,21 +89,6 @@ def test_index_square_gives_tiles_of_250_m(tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_index_several_years_uses_newest(tmp_path):
-    for year in (2016, 2022, 2019):
-        write(tmp_path / f"dom1_32_356_5699_1_nw_{year}.tif", np.full((250, 250), year - 2000.0), WEST, NORTH)
-    write(tmp_path / "dgm1_32_356_5699_1_nw_2016.tif", np.zeros((250, 250)), WEST, NORTH)
-    result = index(tmp_path)
-    (tile,) = result.tiles
-    assert tile.datetime.year == 2022
-    assert (load(tile, Options()).dsm == 22).all()
-    (note,) = (note for note in result.notes if "same ground" in note)
-    assert note.startswith(
-        "dsm: 3 pairs of files cover the same ground; by the dates in their names, "
-        "dom1_32_356_5699_1_nw_2022.tif is used before "
-    )
-
-
 def test_index_date_tag_in_year_of_name_is_used(tmp_path):
     square = np.zeros((250, 250), np.float32)
     name = "dom1_32_356_5699_1_nw_2020.tif"
@@ -130,11 +117,13 @@ def test_index_unusable_files_are_left_out(tmp_path):
     assert result.tiles[0].layer("dsm").files == ("dom1_32_356_5699_1_nw_2020.tif",)
 
 
-def test_index_road_mask_pattern_adds_layer(tmp_path):
+def test_index_road_mask_and_roads_add_layers(tmp_path):
     write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     write(tmp_path / "atkis.tif", np.full((250, 250), 3, np.uint8), WEST, NORTH)
     mask = index(tmp_path, road_mask="atkis.tif", road_values=(3, 4)).tiles[0].layer("road_mask")
     assert (mask.files, mask.values) == (("atkis.tif",), (3, 4))
+    write_roads(tmp_path / "r.gpkg", [box(WEST, NORTH - 200, WEST + 100, NORTH - 100)], UTM)
+    assert index(tmp_path, roads="r.gpkg").tiles[0].layer("roads").files == ("r.gpkg",)
     with pytest.raises(CatalogError, match="no file matches --road-mask 'osm.tif'"):
         index(tmp_path, road_mask="osm.tif")
 

@@ -117,6 +117,7 @@ def test_newest_file_stays_first_on_ground_along_a_border(tmp_path):
     for name in ("dom1_32_295_5629_1_nw_2018", "dom1_32_295_5629_1_nw_2020"):
         write(tmp_path / f"{name}.tif", np.ones((500, 500), np.float32))
     tiles = nrw.index(tmp_path, min_cover=0).tiles
+    assert tiles[0].datetime.year == 2020
     (dsm,) = tiles[0].around(Grid(UTM, 295740.0, 5629260.0, 1.0, 20, 20), (0, 0, 1, 1)).layers
     assert dsm.files == ("dom1_32_295_5629_1_nw_2020.tif", "dom1_32_295_5629_1_nw_2018.tif")
 
@@ -227,20 +228,6 @@ def test_crs_without_code_is_stored_as_wkt_and_a_compound_one_in_plan(tmp_path):
     assert CRS.from_user_input(tile.grid.crs).equals(own, ignore_axis_order=True)
     write(tmp_path / "a.tif", FLAT, crs="EPSG:5555")
     assert index(tmp_path, {"dsm": "a.tif"}).tiles[0].grid.crs == UTM
-
-
-@pytest.mark.parametrize(
-    ("crs", "west", "north", "cell", "message"),
-    [
-        ("EPSG:2227", 6040000, 2120000, 1.0, "US survey feet; .* gdalwarp -t_srs EPSG:32610"),
-        ("EPSG:2994", 650000, 880000, 1.0, "feet"),
-        ("EPSG:4326", 6.1, 50.8, 1e-5, "degrees; .* gdalwarp -t_srs EPSG:32632"),
-    ],
-)
-def test_crs_not_in_metres_raises_error(tmp_path, crs, west, north, cell, message):
-    write(tmp_path / "a.tif", FLAT, west, north, cell=cell, crs=crs)
-    with pytest.raises(CatalogError, match=f"a.tif is in {crs}, whose unit is .*{message}"):
-        index(tmp_path, {"dsm": "a.tif"})
 
 
 def test_index_broken_file_is_left_out_with_line(tmp_path):

@@ -70,12 +70,17 @@ def test_entries_of_bucket_equal_files_written(bucket):
 
 
 @pytest.mark.slow
-def test_stat_cache_of_bucket_equals_stat(bucket):
+def test_stat_cache_of_bucket_equals_stat_and_lists_a_folder_once(bucket, storage):
     for name in ("a/b", "a/c", "d"):
         paths.write(bucket / name, name.encode())
     stat_of = StatCache()
     for name in ("a/b", "a/c", "d", "a/none", "none/a"):
         assert stat_of(bucket / name) == paths.stat(bucket / name)
+    storage.requests()
+    stat_of = StatCache()
+    assert stat_of(bucket / "a" / "b")
+    assert stat_of(bucket / "a" / "c")
+    assert len(storage.requests()) == 1
 
 
 @pytest.mark.parametrize(

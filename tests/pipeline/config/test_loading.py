@@ -14,12 +14,6 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.filter import planar
 
 
-def test_shipped_configurations_are_valid():
-    assert {"paper", "production"} <= set(shipped())
-    for name in shipped():
-        assert load_config(name).chains
-
-
 def test_paper_configuration_has_parameters_of_the_paper():
     chains = load_config("paper").chains
     assert list(chains) == ["plane", "rgt", "flexroad"]
@@ -37,12 +31,15 @@ def test_paper_configuration_has_parameters_of_the_paper():
 def test_override_with_same_method_keeps_base_options():
     raw = {
         "fit": {"method": "nurbs", "degree": 5},
-        "variants": {"a": {"fit": {"iterations": 7}}, "b": {"fit": "plane"}, "c": None},
+        "ecsrc": "planar",
+        "variants": {"a": {"fit": {"iterations": 7}}, "b": {"fit": "plane", "ecsrc": "off"}, "c": None},
     }
     chains = compose(raw, "x").chains
     assert (chains["a"]["fit"].degree, chains["a"]["fit"].iterations) == (5, 7)
     assert chains["b"]["fit"].method == "plane"
     assert chains["c"]["fit"].degree == 5
+    assert chains["c"]["ecsrc"] == planar.Options()
+    assert chains["b"]["ecsrc"] == load_config("ablation").chains["wo_ecsrc"]["ecsrc"]
 
 
 def test_extends_merges_over_parent(tmp_path):
@@ -74,6 +71,7 @@ def test_extends_defaults_has_the_defaults_of_the_options(tmp_path):
 @pytest.mark.parametrize("name", shipped())
 def test_configuration_of_a_run_is_complete(name, tmp_path):
     config = load_config(name)
+    assert config.chains
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config.raw, sort_keys=False))
     again = load_config(tmp_path / "config.yaml")
     assert (again.chains, again.export, again.dataset) == (config.chains, config.export, config.dataset)
@@ -99,14 +97,6 @@ def test_file_keeps_the_options_that_it_leaves_out(tmp_path):
     assert config.dataset == {"crs": "EPSG:25832", "layers": {"dsm": "c.tif"}}
 
 
-def test_override_with_other_filter_uses_its_defaults(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text("extends: paper\necsrc: planar\nvariants: {flexroad: {}, bare: {ecsrc: off}}\n")
-    chains = load_config(path).chains
-    assert chains["flexroad"]["ecsrc"] == planar.Options()
-    assert chains["bare"]["ecsrc"] == load_config("ablation").chains["wo_ecsrc"]["ecsrc"]
-
-
 @pytest.mark.parametrize(
     ("raw", "message"),
     [
@@ -115,10 +105,6 @@ def test_override_with_other_filter_uses_its_defaults(tmp_path):
         ({"segment": {"method": "vector", "wher": ""}}, "x: segment.wher: unknown key; did you mean where?"),
         ({"fit": {"degre": 2}}, "x: fit.degre: unknown key; did you mean degree?"),
         ({"ecsrc": {"theta_z_m": -1}}, "x: ecsrc.theta_z_m: input should be greater than"),
-        (
-            {"ecsrc": {"method": "planar", "roughness_m": 0}},
-            "x: ecsrc.roughness_m: input should be greater than",
-        ),
         ({"fit": {"degree": "three"}}, "x: fit.degree: input should be a valid integer"),
         ({"fit": "nurb"}, "x: fit: "),
         (
@@ -158,21 +144,17 @@ def test_compose_export_without_variants_takes_the_main_one():
 
 
 def test_load_config_unusable_file_raises(tmp_path):
-    with pytest.raises(ConfigError, match="did you mean paper"):
-        load_config("papr")
     bad = tmp_path / "bad.yaml"
     bad.write_text("fit: {degree: 3")
-    with pytest.raises(ConfigError, match=r"bad.yaml: not readable as YAML"):
-        load_config(bad)
+    assert "bad.yaml: not readable as YAML" in refusal(bad)
     bad.write_text("- a\n- b\n")
-    with pytest.raises(ConfigError, match="expected a mapping"):
-        load_config(bad)
+    assert "expected a mapping" in refusal(bad)
     os.mkfifo(tmp_path / "pipe.yaml")
     for special in (tmp_path / "pipe.yaml", tmp_path):
-        with pytest.raises(ConfigError, match="is not a regular file; name a YAML file"):
-            load_config(special)
-    with pytest.raises(ConfigError, match="File name too long"):
-        load_config("a" * 5000)
+        assert "is not a regular file; name a YAML file" in refusal(special)
+    assert "File name too long" in refusal("a" * 5000)
+    for name, meant in (("prod", "production"), ("papr", "paper")):
+        assert refusal(name).endswith(f"neither a file nor a shipped name; did you mean {meant}?")
 
 
 def refusal(path) -> str:
@@ -204,11 +186,6 @@ def test_extends_reads_no_file_but_yaml_and_shows_nothing_of_it(tmp_path):
         assert message in refusal(mine)
         assert "hash" not in refusal(mine)
         assert "password" not in refusal(mine)
-
-
-@pytest.mark.parametrize(("name", "meant"), [("prod", "production"), ("papr", "paper")])
-def test_unknown_name_suggests_a_shipped_one(name, meant):
-    assert refusal(name).endswith(f"neither a file nor a shipped name; did you mean {meant}?")
 
 
 def test_extends_endless_chain_raises(tmp_path):
