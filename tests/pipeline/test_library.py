@@ -286,18 +286,15 @@ def test_fit_unusable_table_of_roads_raises(scene, streets, change, options, mes
         flexroad.fit(scene.dsm, scene.dtm, change(streets), **options)
 
 
-def test_fit_table_without_a_road_here_is_flagged(scene, streets):
-    with pytest.warns(UserWarning, match="no road of roads.gpkg lies on this tile"):
-        fitted = flexroad.fit(scene.dsm, scene.dtm, streets.translate(1000).to_frame("geometry"))
-    assert fitted.flags == ("no-road",)
-
-
-def test_fit_whose_road_the_filter_drops_is_flagged(scene, surface):
+def test_fit_whose_road_the_filter_drops_or_that_has_none_is_flagged(scene, surface, streets):
     assert surface.flags == ()
     # Less than the smallest area that the filter keeps.
     speck = scene.road_mask & (scene.road_mask.cumsum("x").cumsum("y") <= 5)
     assert 0 < speck.sum() <= 25
     assert flexroad.fit(scene.dsm, scene.dtm, speck).flags == ("no-road",)
+    with pytest.warns(UserWarning, match="no road of roads.gpkg lies on this tile"):
+        fitted = flexroad.fit(scene.dsm, scene.dtm, streets.translate(1000).to_frame("geometry"))
+    assert fitted.flags == ("no-road",)
 
 
 def test_fit_dask_arrays_with_nodata_equals_nan(scene, surface):

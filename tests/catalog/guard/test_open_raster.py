@@ -90,40 +90,36 @@ def test_files_of_no_known_format_are_named_as_such(tmp_path, name, content, mat
     check_refused(tmp_path / name, match)
 
 
-def overviews(url):
-    return (
-        '<PAMDataset><Metadata domain="OVERVIEWS">'
-        f'<MDI key="&#79;VERVIEW_FILE">/vsicurl/{url}/o.tif</MDI></Metadata></PAMDataset>'
-    )
+VRT_ELSEWHERE = vrt("/vsicurl/WEB/x.tif")
+OVERVIEWS = (
+    '<PAMDataset><Metadata domain="OVERVIEWS"><MDI key="&#79;VERVIEW_FILE">/vsicurl/WEB/o.tif</MDI>'
+    "</Metadata></PAMDataset>"
+)
 
 
-def test_side_cars_that_lead_elsewhere_are_refused(tmp_path, web):
-    raster = write(tmp_path / "a.tif", FLAT)
-    for name, content in {
-        "a.tif.ovr": vrt(f"/vsicurl/{web.url}/x.tif"),
-        "a.tif.msk": vrt(f"/vsicurl/{web.url}/x.tif"),
-        "a.tif.aux.xml": overviews(web.url),
-        "a.aux": "EHFA_HEADER_TAG",
-    }.items():
-        side = tmp_path / name
-        side.write_text(content)
-        check_refused(raster, "side-car file|overviews")
-        side.unlink()
-    assert (read(raster)[0] == 7).all()
-    with rasterio.open(raster, "r+") as src:
-        src.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"/vsicurl/{web.url}/x.tif")
-    check_refused(raster, "names another file as its overviews")
-    assert web.requests == []
-
-
-def test_overviews_of_overviews_are_checked(tmp_path, web):
+@pytest.mark.parametrize(
+    ("name", "content", "match"),
+    [
+        ("a.tif.ovr", VRT_ELSEWHERE, "side-car file"),
+        ("a.tif.msk", VRT_ELSEWHERE, "side-car file"),
+        ("a.tif.aux.xml", OVERVIEWS, "side-car file|overviews"),
+        ("a.aux", "EHFA_HEADER_TAG", "side-car file"),
+        ("a.tif.ovr.aux.xml", OVERVIEWS, "a.tif.ovr, which names another file"),
+        ("a.tif.ovr.ovr", VRT_ELSEWHERE, "a.tif.ovr, which has the side-car file a.tif.ovr.ovr, which is no"),
+        ("", "", "names another file as its overviews"),
+    ],
+)
+def test_side_cars_that_lead_elsewhere_are_refused(tmp_path, web, name, content, match):
     path = write(tmp_path / "a.tif", FLAT)
-    write(tmp_path / "a.tif.ovr", FLAT[:16, :16], driver="GTiff")
-    (tmp_path / "a.tif.ovr.aux.xml").write_text(overviews(web.url))
-    check_refused(path, "a.tif.ovr, which names another file")
-    (tmp_path / "a.tif.ovr.aux.xml").unlink()
-    (tmp_path / "a.tif.ovr.ovr").write_text(vrt(f"/vsicurl/{web.url}/x.tif"))
-    check_refused(path, "a.tif.ovr, which has the side-car file a.tif.ovr.ovr, which is no TIFF")
+    if name.startswith("a.tif.ovr."):
+        write(tmp_path / "a.tif.ovr", FLAT[:16, :16], driver="GTiff")
+    assert (read(path)[0] == 7).all()
+    if name:
+        (tmp_path / name).write_text(content.replace("WEB", web.url))
+    else:
+        with rasterio.open(path, "r+") as src:
+            src.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"/vsicurl/{web.url}/x.tif")
+    check_refused(path, match)
     assert web.requests == []
 
 

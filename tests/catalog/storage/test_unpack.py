@@ -101,13 +101,14 @@ def test_wrong_archive_is_one_line_and_leaves_nothing(tmp_path, damage, publishe
     assert [path.name for path in tmp_path.iterdir()] in ([], ["GeRoD.zip"])
 
 
-def test_archive_larger_than_the_free_disk_is_refused_before_its_checksum(tmp_path, monkeypatch):
+def test_archive_too_large_for_the_disk_or_of_many_files_is_refused_first(tmp_path, monkeypatch):
     archive = zipped(tmp_path / "GeRoD.zip")
     usage = namedtuple("usage", "free")(100)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(
-        CatalogError, match=r"needs 0.00 GB, but only 0.00 GB are free in .*; move it to a larger"
-    ):
+    with pytest.raises(CatalogError, match=r"needs 0.00 GB, but only 0.00 GB are free in .*; move it to a"):
+        unpack(archive, "0000", quietly, lambda line: None)
+    monkeypatch.setattr(module, "MAX_FILES", 1)
+    with pytest.raises(CatalogError, match="in 2 files"):
         unpack(archive, "0000", quietly, lambda line: None)
 
 
@@ -117,10 +118,3 @@ def test_part_of_a_killed_command_is_replaced(tmp_path):
     (tmp_path / ".GeRoD.part" / "old").write_text("old")
     assert files(unpack(archive, sha256(archive), quietly, lambda line: None)) == CONTENT
     assert not (tmp_path / ".GeRoD.part").exists()
-
-
-def test_many_files_are_no_dataset(tmp_path, monkeypatch):
-    archive = zipped(tmp_path / "GeRoD.zip")
-    monkeypatch.setattr(module, "MAX_FILES", 1)
-    with pytest.raises(CatalogError, match="in 2 files"):
-        unpack(archive, sha256(archive), quietly, lambda line: None)

@@ -259,17 +259,7 @@ def test_photo_changes_fingerprint_of_tile_only_as_its_texture(survey, checksum)
     assert prints(TEXTURED)[0] != newer[0]
 
 
-def test_options_of_texture_change_fingerprint_only_with_a_texture(survey):
-    tile = Catalog.read(survey).tiles[0]
-
-    def fingerprint(**export):
-        return graph_of(tile, {**PAPER, "export": export}).fingerprint
-
-    assert fingerprint(texture_px=512) == fingerprint()
-    assert fingerprint(texture=True, texture_px=512) != fingerprint(texture=True)
-
-
-def test_photo_of_texture_is_read_for_products_and_by_no_stage(survey):
+def test_photo_and_options_of_texture_count_only_for_products_with_a_texture(survey):
     tile = with_photo(Catalog.read(survey).tiles[0], survey.parent, "own.tif")
     graph = graph_of(tile, TEXTURED)
     assert "dop" in graph.reads & layers_read(compose(TEXTURED, "x"))
@@ -277,6 +267,12 @@ def test_photo_of_texture_is_read_for_products_and_by_no_stage(survey):
     (survey.parent / "own.tif").unlink()
     assert own_files_missing(graph_of(tile, TEXTURED)) == [str(survey.parent / "own.tif")]
     assert own_files_missing(graph_of(tile)) == []
+
+    def fingerprint(**export):
+        return graph_of(tile, {**PAPER, "export": export}).fingerprint
+
+    assert fingerprint(texture_px=512) == fingerprint()
+    assert fingerprint(texture=True, texture_px=512) != fingerprint(texture=True)
 
 
 def test_tile_of_a_raster_catalog_depends_on_files_that_reach_it(tmp_path):
