@@ -1,6 +1,8 @@
 """Small objects of the program for tests: grids, tiles, masks, clusters, surfaces and finished runs."""
 
+import os
 import shutil
+import socket
 from pathlib import Path
 from typing import Any, Literal
 
@@ -94,3 +96,23 @@ def copy_run(made: Run, survey: Path, folder: Path) -> Run:
     ids = {tile.id for tile in made.catalog.tiles}
     tiles = [tile for tile in Catalog.read(own / "catalog.parquet").tiles if tile.id in ids]
     return Run.create(folder / "run", made.config, Catalog(tuple(tiles)))
+
+
+def make_special(path: Path, kind: str) -> None:
+    """Put something that is no regular file at a path; never a real device."""
+    path.unlink(missing_ok=True)
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "link to itself":
+        path.symlink_to(path)
+    elif kind == "link to a pipe":
+        os.mkfifo(path.with_name("pipe"))
+        path.symlink_to(path.with_name("pipe"))
+    elif kind == "socket":
+        # The name of a socket may have about 100 characters.
+        folder = os.open(path.parent, os.O_RDONLY)
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(f"/proc/self/fd/{folder}/{path.name}")
+        os.close(folder)
+    else:
+        os.mkfifo(path)

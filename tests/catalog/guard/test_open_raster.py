@@ -1,14 +1,12 @@
 """Source rasters are opened only in known formats; neither they nor their side-cars lead to other files."""
 
-import os
-import socket
-
 import numpy as np
 import pytest
 import rasterio
 
 from flexroad.catalog.guard.open_raster import open_raster
 from flexroad.catalog.guard.source_files import InputRejected
+from tests.builders import make_special
 from tests.make_rasters import UTM, write, write_xyz
 
 FLAT = np.full((32, 32), 7.0, np.float32)
@@ -134,29 +132,11 @@ def test_harmless_side_cars_are_used(tmp_path):
         assert (src.transform.c, src.crs) == (295500, UTM)
 
 
-def irregular(path, kind):
-    """Put something at a path that is no regular file."""
-    path.unlink(missing_ok=True)
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "link to a pipe":
-        os.mkfifo(path.with_name("pipe"))
-        path.symlink_to(path.with_name("pipe"))
-    elif kind == "socket":
-        with socket.socket(socket.AF_UNIX) as made:
-            # The name of a socket may have about 100 characters.
-            here = os.open(path.parent, os.O_RDONLY)
-            made.bind(f"/proc/self/fd/{here}/{path.name}")
-            os.close(here)
-    else:
-        os.mkfifo(path)
-
-
 @pytest.mark.parametrize("kind", ["folder", "pipe", "link to a pipe", "socket"])
 @pytest.mark.parametrize("name", ["a.tif", "a.tif.aux.xml", "a.tfw", "a.tif.msk", "a.prj"])
 def test_only_regular_files_are_opened(tmp_path, kind, name):
     path = write(tmp_path / "a.tif", FLAT)
-    irregular(tmp_path / name, kind)
+    make_special(tmp_path / name, kind)
     check_refused(path, "is not a regular file")
 
 

@@ -56,16 +56,9 @@ def test_raster_without_heights_is_refused(tmp_path, count, more, match):
     refused(tmp_path, "a.tif", match)
 
 
-def test_alpha_band_and_mask_are_no_heights(tmp_path):
+def test_alpha_band_is_no_height_and_bands_described_as_road_height_are_heights(tmp_path):
     write(tmp_path / "dtm.tif", HEIGHTS)
-    bands(tmp_path / "a.tif", 2, "uint8", photometric="MINISBLACK", alpha="YES")
-    (tile,) = rasters.index(tmp_path, {"dsm": "a.tif", "dtm": "dtm.tif"}, tile_size_m=20, min_cover=0).tiles
-    assert tile.layer("dsm").files == ("a.tif",)
-
-
-def test_bands_described_as_road_height_have_heights(tmp_path):
-    for name in ("dsm.tif", "dtm.tif"):
-        write(tmp_path / name, HEIGHTS)
+    bands(tmp_path / "dsm.tif", 2, "uint8", photometric="MINISBLACK", alpha="YES")
     bands(tmp_path / "road_height.tif", 3, "float32")
     patterns = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_height": "road_height.tif"}
     with pytest.raises(CatalogError, match="road_height.*has 3 bands"):

@@ -34,10 +34,6 @@ def road(west, east):
     return LineString([(west, 5_629_300), (east, 5_629_300)])
 
 
-def in_degrees(path, line):
-    return write_roads(path, list(GeoSeries([line], crs="EPSG:25832").to_crs("EPSG:4326")), "EPSG:4326")
-
-
 def indexed(root, roads, crs=None):
     return rasters.index(root, {"dsm": "dsm.tif", "dtm": "dtm.tif", "roads": str(roads)}, crs=crs).tiles
 
@@ -80,7 +76,8 @@ def test_roads_file_with_columns_in_another_encoding_than_declared_is_listed(sur
 
 def test_roads_file_outside_folder_in_other_crs_is_used(survey, tmp_path):
     (tmp_path / "elsewhere").mkdir()
-    path = in_degrees(tmp_path / "elsewhere" / "r.geojson", road(295_400, 295_600))
+    lines = GeoSeries([road(295_400, 295_600)], crs="EPSG:25832").to_crs("EPSG:4326")
+    path = write_roads(tmp_path / "elsewhere" / "r.geojson", lines, "EPSG:4326")
     tiles = indexed(survey, path, crs="EPSG:25832")
     # The second tile is 150 m away.
     assert named(tiles) == [["r.geojson"], ["r.geojson"], []]

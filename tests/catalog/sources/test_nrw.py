@@ -133,7 +133,7 @@ def test_index_folder_without_dsm_raises_error(tmp_path):
 
 
 def test_index_bridge_points_extend_reference(tmp_path):
-    """The reference is the DTM with the mean of class 17 per cell; the DTM itself does not change."""
+    """The reference is the DTM with the newest mean of class 17 per cell; the DTM itself does not change."""
     root, derived = tmp_path / "nrw", tmp_path / "derived"
     dgm = heights(250, 250)
     write(root / "dom1_32_356_5699_1_nw_2020.tif", dgm + 5, WEST, NORTH)
@@ -141,12 +141,13 @@ def test_index_bridge_points_extend_reference(tmp_path):
     x = WEST + np.array([10.2, 10.8, 20.5, 30.5])
     y = NORTH - np.array([5.5, 5.5, 7.5, 8.5])
     points = np.stack([x, y, [200.0, 201.0, 202.0, 203.0]], axis=1)
-    write_cloud(root / "3dm_32_356_5699_1_nw.laz", points, [17, 17, 2, 17])
+    write_cloud(root / "3dm_32_356_5699_1_nw.laz", points + np.array([0, 0, 9]), [17, 17, 2, 17])
+    write_cloud(root / "3dm_32_356_5699_1_nw_2022.laz", points, [17, 17, 2, 17])
     result = index(root, derived=derived)
     assert result.notes == ()
     (tile,) = result.tiles
-    raster = derived / "3dm_32_356_5699_1_nw_bridges.tif"
-    assert tile.layer("bridges").files == (str(raster),)
+    raster = derived / "3dm_32_356_5699_1_nw_2022_bridges.tif"
+    assert tile.layer("bridges").files == (str(raster), str(derived / "3dm_32_356_5699_1_nw_bridges.tif"))
     data = load(tile, Options())
     truth = dgm.astype(np.float64)
     truth[5, 10], truth[8, 30] = 200.5, 203.0

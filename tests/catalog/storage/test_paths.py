@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import socket
 import sys
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.buckets import StatCache
 from flexroad.catalog.storage.outputs import made_folder
 from flexroad.catalog.storage.paths import contained, parse_location
+from tests.builders import make_special
 from tests.s3_server import Fault
 
 
@@ -138,30 +138,17 @@ def test_storage_always_fails_error_names_bucket(bucket, storage, answer):
         assert isinstance(caught.value, PermissionError) == (answer == "denied")
 
 
-def special(kind, name):
-    """Make something that is no regular file; never a real device."""
-    if kind == "pipe":
-        os.mkfifo(name)
-    elif kind == "folder":
-        name.mkdir()
-    elif kind == "loop":
-        name.symlink_to(name)
-    else:
-        with socket.socket(socket.AF_UNIX) as server:
-            server.bind(str(name))
-
-
 @pytest.mark.parametrize(
     ("kind", "reason"),
     [
         ("pipe", "is a device, pipe or socket and is not replaced"),
         ("socket", "is a device, pipe or socket and is not replaced"),
         ("folder", "Is a directory"),
-        ("loop", "Too many levels of symbolic links"),
+        ("link to itself", "Too many levels of symbolic links"),
     ],
 )
 def test_write_does_not_replace_special_file(kind, reason, tmp_path):
-    special(kind, name := tmp_path / "there")
+    make_special(name := tmp_path / "there", kind)
     before = name.lstat()
     with pytest.raises(OSError, match=reason) as caught:
         paths.write(name, b"new")

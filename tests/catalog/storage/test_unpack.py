@@ -11,6 +11,7 @@ import pytest
 from flexroad.catalog import CatalogError
 from flexroad.catalog.storage import unpack as module
 from flexroad.catalog.storage.unpack import unpack
+from tests.builders import make_special
 
 CONTENT = {"GeRoD/readme.txt": b"heights " * 40, "GeRoD/dsm/a.tif": bytes(range(256)) * 20}
 
@@ -59,11 +60,6 @@ def flipped(path):
     path.write_bytes(data)
 
 
-def piped(path):
-    path.unlink()
-    os.mkfifo(path)
-
-
 OUTSIDE = "has a file outside its folder: {}; download it again"
 
 
@@ -86,7 +82,7 @@ OUTSIDE = "has a file outside its folder: {}; download it again"
         (lambda path: zipped(path, {"GeRoD/a": b"a", "../b": b"b"}), "0000", OUTSIDE.format("../b")),
         (lambda path: zipped(path, {"/etc/b": b"b"}), "0000", OUTSIDE.format("/etc/b")),
         (lambda path: path.unlink(), "0000", "cannot be read: No such file or directory"),
-        (piped, "0000", "is not a regular file; replace it by one"),
+        (lambda path: make_special(path, "pipe"), "0000", "is not a regular file; replace it by one"),
     ],
 )
 def test_wrong_archive_is_one_line_and_leaves_nothing(tmp_path, damage, published, line):
