@@ -37,6 +37,7 @@ def test_layer_in_another_crs_needs_reproject(mixed, name):
     texts = []
     for conversion, end in (
         (Conversion(), "tiles there will fail; --reproject warps such files when they are read"),
+        (Conversion(True), "reprojected when it is read, bilinearly"),
         (Conversion(True, height_unit="metre"), "reprojected when it is read, bilinearly"),
     ):
         result = index(mixed, PATTERNS, conversion=conversion)
@@ -52,7 +53,7 @@ def test_layer_in_another_crs_needs_reproject(mixed, name):
         assert refused != conversion.reproject
         texts.append(json.loads(SourceFiles(tile, lambda path: None, checksum=False).text(tile.layer("dtm"))))
     assert len(texts[0]) == 4
-    assert texts[1] == [*texts[0], ["reproject", True, "metre"]]
+    assert texts[1:] == [[*texts[0], ["reproject", True, unit]] for unit in (None, "metre")]
     data = load.load(tile, load.Options())
     assert (data.dsm == 100).all()
     np.testing.assert_allclose(data.dtm, 99)

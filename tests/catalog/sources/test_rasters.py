@@ -41,14 +41,20 @@ def test_index_file_of_a_kilometre_gives_sixteen_tiles(tmp_path):
     assert result.notes == ()
 
 
-def test_height_that_many_cells_share_is_noted(tmp_path):
+def test_voids_in_heights_and_other_values_of_masks_are_noted(tmp_path):
     heights = np.arange(6400.0).reshape(80, 80)
-    write(tmp_path / "dsm.tif", heights)
     heights[:8] = -9999
-    write(tmp_path / "dtm.tif", heights)
-    result = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=40, date=datetime(2020, 5, 1))
-    (note,) = result.notes
-    assert note.startswith("dtm: many cells have the exact height -9999: dtm.tif (10.0%); if they are voids")
+    for name, values in (("dsm", heights), ("road_mask", np.full((80, 80), 5, np.uint8))):
+        write(tmp_path / f"{name}.tif", values)
+    layers = {"dsm": "dsm.tif", "road_mask": "road_mask.tif", "reference_road": "road_mask.tif"}
+    result = index(tmp_path, layers, road_values=(99,), tile_size_m=40)
+    values = [(layer.name, layer.values) for layer in result.tiles[0].layers]
+    assert values == [("dsm", ()), ("road_mask", (99,)), ("reference_road", (99,))]
+    for start in (
+        "dsm: many cells have the exact height -9999: dsm.tif (10.0%); if they are voids",
+        "road_mask: no cell has --road-value 99 but 5, in the parts read of road_mask.tif",
+    ):
+        assert any(note.startswith(start) for note in result.notes)
 
 
 def test_tile_lists_every_file_in_reach(tmp_path):
@@ -114,11 +120,16 @@ def test_ground_along_a_border_has_the_same_files_from_both_sides(tmp_path):
 
 
 def test_newest_file_stays_first_on_ground_along_a_border(tmp_path):
-    for name in ("dom1_32_295_5629_1_nw_2018", "dom1_32_295_5629_1_nw_2020"):
-        write(tmp_path / f"{name}.tif", np.ones((500, 500), np.float32))
-    tiles = nrw.index(tmp_path, min_cover=0).tiles
-    assert tiles[0].datetime.year == 2020
-    (dsm,) = tiles[0].around(Grid(UTM, 295740.0, 5629260.0, 1.0, 20, 20), (0, 0, 1, 1)).layers
+    for year in (2018, 2020):
+        heights = np.full((500, 500), year - 2000, np.float32)
+        write(tmp_path / f"dom1_32_295_5629_1_nw_{year}.tif", heights)
+    result = nrw.index(tmp_path, min_cover=0)
+    assert result.tiles[0].datetime.year == 2020
+    assert [note.partition(";")[0] for note in result.notes if "same ground" in note] == [
+        "dsm: 1 pair of files cover the same ground"
+    ]
+    strip = Grid(UTM, 295740.0, 5629260.0, 1.0, 20, 20)
+    (dsm,) = result.tiles[0].around(strip, (0, 0, 1, 1)).layers
     assert dsm.files == ("dom1_32_295_5629_1_nw_2020.tif", "dom1_32_295_5629_1_nw_2018.tif")
 
 
@@ -132,8 +143,12 @@ def test_tiles_below_min_cover_are_left_out_with_note(tmp_path):
         "295750_5629250"
     )
     assert len(index(tmp_path, {"dsm": "a.tif"}, min_cover=0).tiles) == 2
+    # Overlapping files count once.
+    for name in ("a.tif", "b.tif"):
+        write(tmp_path / name, FLAT[:, :100])
     with pytest.raises(CatalogError, match=r"no tile is left: .*--min-cover 0 keeps"):
-        index(tmp_path, {"dsm": "a.tif"}, min_cover=1.1)
+        index(tmp_path, {"dsm": "*.tif"}, min_cover=0.5)
+    assert len(index(tmp_path, {"dsm": "*.tif"}, min_cover=0.4).tiles) == 1
 
 
 @pytest.mark.parametrize("declared", [-9999.0, None])
@@ -155,14 +170,6 @@ def test_cover_counts_cells_with_heights_and_not_extents(declared, tmp_path):
     write(tmp_path / "a.tif", heights[:, 500:], nodata=declared)
     with pytest.raises(CatalogError, match="no tile is left: left out 1 tile where the DSM has only nodata"):
         index(tmp_path, {"dsm": "a.tif"})
-
-
-def test_cover_counts_overlapping_files_once(tmp_path):
-    write(tmp_path / "a.tif", FLAT[:, :100])
-    write(tmp_path / "b.tif", FLAT[:, :100])
-    with pytest.raises(CatalogError, match="no tile is left"):
-        index(tmp_path, {"dsm": "*.tif"}, min_cover=0.5)
-    assert len(index(tmp_path, {"dsm": "*.tif"}, min_cover=0.4).tiles) == 1
 
 
 @settings(max_examples=25)
