@@ -1,4 +1,4 @@
-"""Small objects of the program for tests: grids, tiles, masks, clusters, surfaces and finished runs."""
+"""Small objects for tests: grids, tiles, masks, clusters, surfaces, finished runs and special files."""
 
 import os
 import shutil

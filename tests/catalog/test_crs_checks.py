@@ -1,4 +1,4 @@
-"""Coordinates that cannot be in the CRS that a file declares, and metres that are none on the ground."""
+"""Parts and names of a CRS, coordinates that cannot be in it, and metres that are none on the ground."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Rasters without heights or without a place are named, by `flexroad catalog` and by the tile's load."""
+"""Rasters without heights or a place are named by `flexroad catalog` and by `load`; messages of GDAL."""
 
 import subprocess
 import sys
