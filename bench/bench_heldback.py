@@ -13,7 +13,7 @@ Small places have few such squares, so they are run with several draws of them (
 Usage: ``python bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...] [--draw NUMBER]``;
 each NAME is a further configuration, production with options: ``--set soft=fit.bending_m3=20``. Another
 number of the first draw gives other squares and other synthetic scenes. Real places need FLEXROAD_REAL_DATA.
-Intervals are 95% intervals of a bootstrap over the squares, those of MAD and T over the tiles.
+Intervals are 95% intervals of a bootstrap over the squares, for MAD and T over the tiles.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class Case:
     road: RoadMask
     clusters: RoadClusters
     ground: Floats
-    """Heights to fit on the tile's core, ``(H, W)``, m; NaN where there are none."""
+    """Heights to fit on the tile's core, ``(H, W)``, m; NaN where there is no height."""
 
     @property
     def core(self) -> Grid:

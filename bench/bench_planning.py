@@ -1,6 +1,6 @@
 """What commands cost that look at every tile of a finished survey: CPU time and memory of each process.
 
-The tiles are those of `production`, with borders, 250 m wide with cells of 5 m, on four layers of rasters in
+The tiles are as with `production`: with borders, 250 m wide with cells of 5 m, on four layers of rasters in
 sheets of 1 km. They have no products: writing and reading of meshes is not measured. CPU time counts, not the
 time on the wall.
 

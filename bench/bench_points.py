@@ -1,6 +1,6 @@
 """``prepare`` of points beside the decoding of its file: with classes, with the slope filter, by workers.
 
-CPU seconds of complete commands: the lowest of some rounds, with those of their worker processes. A synthetic
+CPU seconds of complete commands: the lowest of some rounds, with their worker processes. A synthetic
 scan always; with FLEXROAD_REAL_DATA also the north of Autzen, whose ground the slope filter then classifies.
 
 Usage: ``python bench/bench_points.py [--rounds 3] [--million 5] [--workers 1 2]``
@@ -57,7 +57,7 @@ def main() -> None:
         # Written in the first round, as the installation of a package does.
         os.environ["PYTHONPYCACHEPREFIX"] = str(folder / "bytecode")
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-        # In a process of its own: Linux counts the memory of this one as that of the commands it starts.
+        # In a process of its own: Linux counts the memory of this process for the commands that it starts.
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
             files = pool.submit(clouds, folder, round(options.million * 1e6)).result()
         for file in files:

@@ -1,6 +1,8 @@
-"""Small objects of the program for tests: grids, tiles, masks, clusters, surfaces and finished runs."""
+"""Small objects for tests: grids, tiles, masks, clusters, surfaces, finished runs and special files."""
 
+import os
 import shutil
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -151,3 +153,23 @@ def make_street(
     road = np.zeros(truth.shape, bool)
     road[height // 2 - 5 : height // 2 + 5] = True
     return make_tile(dsm, dtm), make_clusters(road), truth
+
+
+def make_special(path: Path, kind: str) -> None:
+    """Put something that is no regular file at a path; never a real device."""
+    path.unlink(missing_ok=True)
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "link to itself":
+        path.symlink_to(path)
+    elif kind == "link to a pipe":
+        os.mkfifo(path.with_name("pipe"))
+        path.symlink_to(path.with_name("pipe"))
+    elif kind == "socket":
+        # The name of a socket may have about 100 characters.
+        folder = os.open(path.parent, os.O_RDONLY)
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(f"/proc/self/fd/{folder}/{path.name}")
+        os.close(folder)
+    else:
+        os.mkfifo(path)

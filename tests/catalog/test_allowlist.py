@@ -68,16 +68,12 @@ def test_other_addresses_are_never_allowed(tmp_path, file):
             check(tile_catalog, tmp_path, ["/", file])
 
 
-def test_path_longer_than_any_file_is_cut_in_the_message(tmp_path):
+def test_root_is_not_trusted_and_long_paths_are_cut_in_the_message(tmp_path):
+    with pytest.raises(CatalogError, match="--allow /etc"):
+        check(catalog("passwd", root="/etc"), tmp_path)
     with pytest.raises(CatalogError, match="a path of 20,0.. characters outside the catalog") as caught:
         check(catalog("/" + "9" * 20_000, root=tmp_path), tmp_path)
     assert len(str(caught.value)) < 500
-
-
-def test_root_in_catalog_does_not_allow_files(tmp_path):
-    """The root of tiles is read from the catalog and must not be trusted."""
-    with pytest.raises(CatalogError, match="--allow /etc"):
-        check(catalog("passwd", root="/etc"), tmp_path)
 
 
 @pytest.mark.parametrize("file", ["dsm/a.tif", "link.tif", "dsm/../data/a.tif"])
@@ -110,17 +106,6 @@ def test_folder_given_by_a_link_is_the_folder_itself(tmp_path):
     names = [home, tmp_path / "alias", tmp_path / "mounted" / "home"]
     for given, root in product(names, names):
         check(catalog("a.tif", "b.tif", f"{root}/a.tif", root=root), given)
-
-
-def test_paths_of_links_are_checked_before_they_are_read(tmp_path):
-    path = tmp_path / "home" / "catalog.json"
-    catalog("a.tif", root=path.parent).write(path)
-    secret = tmp_path / "secret.tif"
-    secret.touch()
-    (path.parent / "a.tif").symlink_to(secret)
-    (tile,) = Catalog.read(path).tiles
-    with pytest.raises(CatalogError, match=f"by a link {secret}, outside .* --allow {tmp_path}"):
-        tile.paths(tile.layers[0])
 
 
 @pytest.mark.slow
@@ -159,10 +144,14 @@ def test_paths_of_a_read_catalog_are_checked(tmp_path):
     with pytest.raises(CatalogError, match="tile one: dsm names /elsewhere/out.tif.* --allow /elsewhere"):
         tile.paths(tile.layers[0])
     (tile,) = Catalog.read(path, ["/elsewhere"]).tiles
-    assert [str(file) for file in tile.paths(tile.layers[0])] == [
-        f"{path.parent}/dsm/in.tif",
-        "/elsewhere/out.tif",
-    ]
+    names = [str(file) for file in tile.paths(tile.layers[0])]
+    assert names == [f"{path.parent}/dsm/in.tif", "/elsewhere/out.tif"]
+    (tmp_path / "secret.tif").touch()
+    (path.parent / "link.tif").symlink_to(tmp_path / "secret.tif")
+    catalog("link.tif", root=path.parent).write(path)
+    (tile,) = Catalog.read(path).tiles
+    with pytest.raises(CatalogError, match=f"by a link {tmp_path}/secret.tif, outside .* --allow {tmp_path}"):
+        tile.paths(tile.layers[0])
 
 
 def test_relative_root_does_not_become_a_prefix_of_gdal(tmp_path, monkeypatch):

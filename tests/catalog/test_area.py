@@ -1,6 +1,7 @@
 """Areas select the tiles that their polygons overlap, in any CRS and format."""
 
 import json
+from itertools import product
 
 import geopandas
 import numpy as np
@@ -26,11 +27,14 @@ def written(path, *shapes, crs="EPSG:25832", **options):
     return path
 
 
-@pytest.mark.parametrize("suffix", [".gpkg", ".geojson", ".shp", ".fgb"])
-@pytest.mark.parametrize("crs", ["EPSG:25832", "EPSG:4326", "EPSG:3857"])
+CRSS = ("EPSG:25832", "EPSG:4326", "EPSG:3857")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "crs"),
+    [(".geojson", "EPSG:4326"), *product((".gpkg", ".shp", ".fgb"), CRSS)],
+)
 def test_area_of_each_format_and_crs_touches_the_tiles_under_it(tmp_path, suffix, crs):
-    if suffix == ".geojson" and crs != "EPSG:4326":
-        pytest.skip("GeoJSON has longitude and latitude")
     path = written(tmp_path / f"area{suffix}", rectangle(150, 250), rectangle(401, 420), crs=crs)
     assert Area.read(path).touched(GRIDS) == [False, True, True, False, True]
 
@@ -42,18 +46,25 @@ def test_area_with_columns_in_another_encoding_than_declared_is_read(tmp_path, s
     assert Area.read(path).touched(GRIDS) == [False, True, True, False, False]
 
 
-def test_area_that_ends_on_an_edge_does_not_touch_the_tile_beyond_it(tmp_path):
-    """As with --bbox; also if transformed coordinates are off by rounding."""
-    for crs in ("EPSG:25832", "EPSG:4326"):
-        path = written(tmp_path / f"{crs[5:]}.gpkg", rectangle(100, 200), crs=crs)
-        assert Area.read(path).touched(GRIDS) == [False, True, False, False, False]
-    path = written(tmp_path / "over.gpkg", rectangle(99.99, 200.01))
-    assert Area.read(path).touched(GRIDS) == [True, True, True, False, False]
+RING = rectangle(0, 500, 5599900, 5600200) - rectangle(150, 350, 5599950, 5600150)
+BOW = shapely.Polygon([(500000, 5600000), (500000, 5600100), (500150, 5600000), (500150, 5600100)])
 
 
-def test_area_with_a_hole_does_not_touch_the_tile_in_it(tmp_path):
-    ring = rectangle(0, 500, 5599900, 5600200) - rectangle(150, 350, 5599950, 5600150)
-    assert Area.read(written(tmp_path / "a.gpkg", ring)).touched(GRIDS) == [True, True, False, True, True]
+@pytest.mark.parametrize(
+    ("shape", "crs", "touched"),
+    [
+        # As with --bbox; also if transformed coordinates are off by rounding.
+        (rectangle(100, 200), "EPSG:25832", [1]),
+        (rectangle(100, 200), "EPSG:4326", [1]),
+        (rectangle(99.99, 200.01), "EPSG:25832", [0, 1, 2]),
+        (RING, "EPSG:25832", [0, 1, 3, 4]),
+        (BOW, "EPSG:25832", [0, 1]),
+    ],
+    ids=["ends on an edge", "in degrees", "ends beyond an edge", "has a hole", "crosses itself"],
+)
+def test_area_touches_the_tiles_that_it_overlaps(tmp_path, shape, crs, touched):
+    area = Area.read(written(tmp_path / "a.gpkg", shape, crs=crs))
+    assert [number for number, touches in enumerate(area.touched(GRIDS)) if touches] == touched
 
 
 def test_area_of_degrees_has_straight_sides_in_degrees(tmp_path):
@@ -80,15 +91,9 @@ def test_layer_is_chosen_by_name(tmp_path):
         Area.read(f"{path}|layername=north")
 
 
-def test_polygon_that_crosses_itself_is_used(tmp_path):
-    bow = shapely.Polygon([(500000, 5600000), (500000, 5600100), (500150, 5600000), (500150, 5600100)])
-    assert Area.read(written(tmp_path / "a.gpkg", bow)).touched(GRIDS) == [True, True, False, False, False]
-
-
-def test_tile_that_cannot_be_placed_in_the_crs_of_the_area_is_not_touched(tmp_path):
-    path = written(tmp_path / "a.gpkg", rectangle(0, 50))
+def test_tile_that_cannot_be_placed_in_the_crs_of_the_area_is_not_touched():
     far = Grid("EPSG:25832", 1e9, 1e9, 1.0, 100, 100)
-    area = Area(str(path), "EPSG:3857", np.array([shapely.box(-1e9, -1e9, 1e9, 1e9)]))
+    area = Area("a.gpkg", "EPSG:3857", np.array([shapely.box(-1e9, -1e9, 1e9, 1e9)]))
     assert area.touched([far]) == [False]
 
 

@@ -1,10 +1,12 @@
-"""Coordinates that cannot be in the CRS that a file declares, and metres that are none on the ground."""
+"""Parts and names of a CRS, coordinates that cannot be in it, and metres that are none on the ground."""
 
 import math
 
 import pytest
+from pyproj import CRS
 
 from flexroad.catalog import CatalogError
+from flexroad.catalog.crs import code, compound, datum, esri, in_plan, name, vertical
 from flexroad.catalog.crs_checks import angle_fault, crs_of, elsewhere, require_scale
 
 UNKNOWN = (math.nan,) * 4
@@ -92,51 +94,72 @@ def test_angle_fault_names_the_value_that_is_no_angle(crs, bounds, expected):
     assert angle_fault(crs, bounds) == expected
 
 
-GROUND = (500_000.0, 5_600_000.0, 500_250.0, 5_600_250.0)
-TILES = "the tiles at 500000 5600000 500250 5600250 in EPSG:25832"
+SHIFTED = "its eastings differ by {}32000000, the number of a zone: {}"
+SWAPPED = "its axes are swapped: give easting before northing"
 
 
 @pytest.mark.parametrize(
-    ("crs", "bounds", "place", "why"),
+    ("crs", "x", "y", "side", "why"),
     [
-        (
-            "EPSG:25832",
-            (32_500_000.0, 5_600_000.0, 32_500_100.0, 5_600_100.0),
-            "32500000 5600000 32500100 5600100",
-            "its eastings differ by 32000000, the number of a zone: declare EPSG:4647",
-        ),
-        (
-            "EPSG:4647",
-            (500_000.0, 5_600_000.0, 500_100.0, 5_600_100.0),
-            "500000 5600000 500100 5600100",
-            "its eastings differ by -32000000, the number of a zone: move it by 32000000 m",
-        ),
-        (
-            "EPSG:25832",
-            (5_600_000.0, 500_000.0, 5_600_100.0, 500_100.0),
-            "5600000 500000 5600100 500100",
-            "its axes are swapped: give easting before northing",
-        ),
-        (
-            "EPSG:4326",
-            (50.551, 9.0, 50.552, 9.001),
-            "50.551 9 50.552 9.001",
-            "its axes are swapped: give easting before northing",
-        ),
-        (
-            "EPSG:25832",
-            (9.0, 50.551, 9.001, 50.552),
-            "9 50.551 9.001 50.552",
-            "its coordinates are degrees: declare EPSG:4326",
-        ),
-        (
-            "EPSG:25832",
-            (600_000.0, 5_600_000.0, 600_100.0, 5_600_100.0),
-            "600000 5600000 600100 5600100",
-            "correct its CRS",
-        ),
+        ("EPSG:25832", 32_500_000, 5_600_000, 100, SHIFTED.format("", "declare EPSG:4647")),
+        ("EPSG:4647", 500_000, 5_600_000, 100, SHIFTED.format("-", "move it by 32000000 m")),
+        ("EPSG:25832", 5_600_000, 500_000, 100, SWAPPED),
+        ("EPSG:4326", 50.551, 9, 0.001, SWAPPED),
+        ("EPSG:25832", 9, 50.551, 0.001, "its coordinates are degrees: declare EPSG:4326"),
+        ("EPSG:25832", 600_000, 5_600_000, 100, "correct its CRS"),
     ],
 )
-def test_layer_elsewhere_is_named_with_both_places_and_the_known_mistake(crs, bounds, place, why):
-    text = elsewhere(crs, bounds, "EPSG:25832", GROUND, 200.0)
-    assert text == f"lies at {place} in {crs}, {TILES}; {why}"
+def test_layer_elsewhere_is_named_with_both_places_and_the_known_mistake(crs, x, y, side, why):
+    bounds = (x, y, x + side, y + side)
+    text = elsewhere(crs, bounds, "EPSG:25832", (500_000.0, 5_600_000.0, 500_250.0, 5_600_250.0), 200.0)
+    place = " ".join(f"{value:.10g}" for value in bounds)
+    tiles = "the tiles at 500000 5600000 500250 5600250 in EPSG:25832"
+    assert text == f"lies at {place} in {crs}, {tiles}; {why}"
+
+
+@pytest.mark.parametrize(
+    ("crs", "expected"),
+    [
+        ("EPSG:25832", None),
+        ("EPSG:25832+7837", "EPSG:7837"),
+        ("EPSG:2994+6360", "EPSG:5703"),  # NAVD88 in US survey feet: the same datum in metres
+        (compound("EPSG:25832", "EPSG:7837"), "EPSG:7837"),
+        ("EPSG:25832+5715", None),  # depths
+    ],
+)
+def test_vertical_is_the_datum_of_heights_in_metres(crs, expected):
+    assert vertical(crs) == expected
+
+
+def test_vertical_without_a_code_is_wkt_in_metres():
+    definition = CRS("EPSG:6360").to_json_dict() | {"name": "heights of a site (ftUS)"}
+    definition.pop("id")
+    found = CRS(vertical(compound("EPSG:25832", CRS.from_json_dict(definition).to_wkt())))
+    assert found.name == "heights of a site"
+    assert found.axis_info[0].unit_name == "metre"
+
+
+@pytest.mark.parametrize(
+    ("crs", "expected"),
+    [
+        ("EPSG:25832", "25832"),
+        (compound("EPSG:25832", "EPSG:5783"), "5555"),  # registered as a whole
+        (compound("EPSG:25832", "EPSG:7837"), None),
+        (CRS("EPSG:25832").to_wkt(), "25832"),
+    ],
+)
+def test_code_is_that_of_the_whole_crs(crs, expected):
+    assert code(crs) == expected
+
+
+def test_parts_name_and_datum_are_those_of_the_register():
+    assert in_plan(compound("EPSG:25832", "EPSG:7837")) == "EPSG:25832"
+    assert (name("EPSG:27700"), name("EPSG:7837")) == ("OSGB36 / British National Grid", "DHHN2016 height")
+    assert datum("EPSG:7837") == "Deutsches Haupthoehennetz 2016"
+
+
+def test_esri_is_read_as_the_same_crs():
+    text = esri("EPSG:25832")
+    assert "\n" not in text
+    assert text.startswith('PROJCS["ETRS_1989_UTM_Zone_32N"')
+    assert CRS(text).to_epsg(20) == 25832

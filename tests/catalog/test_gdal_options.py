@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 
-import geopandas
 import numpy as np
 import pyogrio
 import pytest
@@ -17,8 +16,16 @@ from flexroad.catalog.guard.open_vector import vector_name
 from flexroad.catalog.sources.rasters import index
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.load import Options, load
-from tests.command_line import PROCESS
+from tests.command_line import PROCESS, call
 from tests.make_rasters import damage, write
+from tests.make_roads import write as write_roads
+
+
+def printed(code, **variables):
+    """Return what a program says that has variables of its environment."""
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=os.environ | variables, capture_output=True, text=True, check=True)
+
 
 LINE = "ignored {}: set for the GDAL and PROJ of another program; unset it to avoid this line"
 
@@ -91,18 +98,15 @@ def test_damaged_block_fails_though_gdal_is_told_to_ignore_errors(tmp_path):
 def test_command_fails_a_damaged_block_whatever_environment_and_file_say(tmp_path):
     """The configuration file also tells GDAL not to look at the environment."""
     damaged(tmp_path)
-    file = tmp_path / "gdalrc"
+    file, catalog = tmp_path / "gdalrc", tmp_path / "a.json"
     file.write_text("[directives]\nignore-env-vars=yes\n[configoptions]\nGTIFF_IGNORE_READ_ERRORS=YES\n")
-    words = ["catalog", "check", str(tmp_path / "a.json")]
-    make = ["catalog", "rasters", str(tmp_path), "--dsm", "dsm.tif", "--dtm", "dtm.tif"]
-    make += ["--tile-size", "60", "-o", str(tmp_path / "a.json")]
-    subprocess.run([*PROCESS, *make], check=True, capture_output=True)
-    said = []
-    for more in ({}, {"GTIFF_IGNORE_READ_ERRORS": "YES"}, {FILE: str(file)}):
-        ended = subprocess.run([*PROCESS, *words], env=os.environ | more, capture_output=True, text=True)
-        said.append((ended.returncode, ended.stdout))
-    assert said[0][0] == 1
-    assert said[1:] == said[:1] * 2
+    words = ("--dsm", "dsm.tif", "--dtm", "dtm.tif", "--tile-size", 60, "-o", catalog)
+    call("catalog", "rasters", tmp_path, *words).expected(0)
+    expected = call("catalog", "check", catalog).expected(1).out
+    for more in ({"GTIFF_IGNORE_READ_ERRORS": "YES"}, {FILE: str(file)}):
+        check = [*PROCESS, "catalog", "check", str(catalog)]
+        ended = subprocess.run(check, env=os.environ | more, capture_output=True, text=True)
+        assert (ended.returncode, ended.stdout) == (1, expected)
 
 
 def test_ascii_grid_keeps_decimals_though_a_variable_wants_whole_numbers(tmp_path):
@@ -114,16 +118,11 @@ def test_ascii_grid_keeps_decimals_though_a_variable_wants_whole_numbers(tmp_pat
         "from flexroad.catalog.guard.open_raster import open_raster\n"
         f"with quiet(), open_raster(Path({str(tmp_path / 'a.asc')!r})) as raster: print(raster.read(1)[0])"
     )
-    environment = os.environ | {"AAIGRID_DATATYPE": "Int32"}
-    ended = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
-    assert ended.stdout.strip() == "[1.75 1.5  1.25]"
+    assert printed(code, AAIGRID_DATATYPE="Int32").stdout.strip() == "[1.75 1.5  1.25]"
 
 
 def test_vector_file_is_read_with_own_values_of_options(tmp_path):
-    path = tmp_path / "roads.geojson"
-    geopandas.GeoDataFrame({"w": [4.0]}, geometry=[LineString([(7, 51), (7.1, 51)])], crs=4326).to_file(path)
+    path = write_roads(tmp_path / "roads.geojson", [LineString([(7, 51), (7.1, 51)])], "EPSG:4326", w=[4.0])
     pyogrio.set_gdal_config_options({"ATTRIBUTES_SKIP": "YES"})
     try:
         assert list(pyogrio.read_dataframe(vector_name(path)).w) == [4.0]
@@ -133,13 +132,7 @@ def test_vector_file_is_read_with_own_values_of_options(tmp_path):
 
 def test_library_warns_of_a_variable_that_it_ignores(tmp_path):
     code = "import flexroad; flexroad.run; flexroad.fit; import os; print('SHAPE_ENCODING' in os.environ)"
-    ended = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"SHAPE_ENCODING": "latin1"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    ended = printed(code, SHAPE_ENCODING="latin1")
     assert ended.stdout == "False\n"
     assert ended.stderr.count("UserWarning: ignored SHAPE_ENCODING=latin1") == 1
 

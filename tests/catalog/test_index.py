@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pystac
 import pytest
 import shapely
+from pyproj import CRS
 
 from flexroad.catalog import LAYERS, Catalog, CatalogError, Grid, Layer, Tile, geoparquet
 from flexroad.catalog.area import Area
@@ -38,9 +39,11 @@ def tile(east: int, root, layers=("dsm", "dtm"), crs="EPSG:25832") -> Tile:
 
 @pytest.mark.parametrize("name", ["catalog.parquet", "catalog.json", "catalog.geojson"])
 def test_catalog_round_trip_keeps_tiles(tmp_path, name):
-    tiles = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS))
-    Catalog(tiles).write(tmp_path / name)
-    assert Catalog.read(tmp_path / name).tiles == tiles
+    wkt = CRS("+proj=tmerc +lat_0=1 +lon_0=7 +x_0=300000 +y_0=5000000 +ellps=GRS80 +units=m").to_wkt()
+    whole = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS), tile(296000, tmp_path, crs=wkt))
+    for tiles in (whole, ()):
+        Catalog(tiles).write(tmp_path / name)
+        assert Catalog.read(tmp_path / name).tiles == tiles
 
 
 def with_extents(made: Tile) -> Tile:
@@ -57,34 +60,40 @@ def test_catalog_round_trip_keeps_extents_and_nearby_layers(tmp_path, name):
     (_, beyond) = photo.extents
     photo = replace(photo, files=photo.files[1:], extents=(beyond,))
     first = replace(first, layers=tuple(layers), nearby=(photo,))
+    # A road is wider than the line in its file: roads beyond a tile cover it.
+    dsm, roads = with_extents(tile(296250, tmp_path / "data", layers=("dsm", "roads"))).layers
+    roads = replace(roads, files=roads.files[1:], extents=roads.extents[1:])
+    beside = replace(tile(296250, tmp_path / "data"), layers=(dsm, roads))
     # Layers of known and of unknown extents, and no layers.
-    tiles = (first, tile(295750, tmp_path / "data"), with_extents(tile(296000, tmp_path / "data", layers=())))
+    without = with_extents(tile(296000, tmp_path / "data", layers=()))
+    tiles = (first, tile(295750, tmp_path / "data"), without, beside)
     Catalog(tiles).write(tmp_path / "run" / name, movable=False)
     assert Catalog.read(tmp_path / "run" / name).tiles == tiles
+    assert str(tmp_path / "data" / "dsm" / "a.tif").encode() in (tmp_path / "run" / name).read_bytes()
     Catalog(tiles).write(tmp_path / name)
     moved = Catalog.read(tmp_path / name).select(ids=["295500_5629250"]).tiles[0]
     assert moved.nearby == (replace(photo, files=("data/dop/b.tif",)),)
     assert moved.layers[0].extents == first.layers[0].extents
 
 
-def test_catalog_in_parts_is_the_same(tmp_path, monkeypatch):
+def test_catalog_in_parts_and_row_groups_is_the_same(tmp_path, monkeypatch):
     """Objects are made of a part of the rows at a time."""
     tiles = tuple(with_extents(tile(295500 + 250 * k, tmp_path, layers=LAYERS[: k + 1])) for k in range(7))
-    Catalog(tiles).write(tmp_path / "a.parquet")
+    path = tmp_path / "a.parquet"
+    Catalog(tiles).write(path)
+    whole, schema = path.read_bytes(), pq.read_schema(path)
     for rows in (1, 3, 7):
         monkeypatch.setattr(geoparquet, "AT_ONCE", rows)
-        Catalog(tiles).write(tmp_path / "b.parquet")
-        assert (tmp_path / "b.parquet").read_bytes() == (tmp_path / "a.parquet").read_bytes()
-        assert Catalog.read(tmp_path / "b.parquet").tiles == tiles
-
-
-def test_catalog_in_row_groups_is_the_same(tmp_path, monkeypatch):
-    tiles = tuple(with_extents(tile(295500 + 250 * k, tmp_path, layers=LAYERS[: k + 1])) for k in range(7))
+        Catalog(tiles).write(path)
+        assert path.read_bytes() == whole
+        assert Catalog.read(path).tiles == tiles
     monkeypatch.setattr(geoparquet, "GROUP", 4)
     monkeypatch.setattr(geoparquet, "AT_ONCE", 3)
-    Catalog(tiles).write(path := tmp_path / "a.parquet")
+    Catalog(tiles).write(path)
     assert pq.ParquetFile(path).metadata.num_row_groups == 2
     assert Catalog.read(path).tiles == tiles
+    Catalog(tiles[:1]).write(path)
+    assert pq.read_schema(path).equals(schema)
 
 
 def test_damage_in_a_later_row_group_names_the_catalog(tmp_path, monkeypatch):
@@ -131,89 +140,41 @@ def test_objects_exist_of_a_part_of_the_rows_at_a_time(tmp_path, monkeypatch):
     assert parts[1] < whole[1] / 1.5
 
 
-def test_roads_beyond_the_tile_cover_it(tmp_path):
-    """A road is wider than the line in its file."""
-    made = with_extents(tile(295500, tmp_path, layers=("dsm", "roads")))
-    dsm, roads = made.layers
-    made = replace(made, layers=(dsm, replace(roads, files=roads.files[1:], extents=roads.extents[1:])))
-    Catalog((made,)).write(tmp_path / "c.json")
-    assert Catalog.read(tmp_path / "c.json").tiles == (made,)
-
-
-def test_read_catalog_without_extents_gives_unknown_ones(tmp_path):
+def test_catalog_of_another_program_may_lack_extents_and_dataset(tmp_path):
     tiles = (tile(295500, tmp_path, layers=LAYERS), tile(295750, tmp_path))
-    Catalog(tiles).write(tmp_path / "c.parquet")
-    table = pq.read_table(tmp_path / "c.parquet").to_pylist()
-    kinds = pq.read_schema(tmp_path / "c.parquet")
-    for asset in (asset for row in table for asset in row["assets"].values() if asset):
+    Catalog(tuple(map(with_extents, tiles))).write(tmp_path / "c.json")
+    items = json.loads((tmp_path / "c.json").read_text())
+    for item in items["features"]:
+        del item["properties"]["flexroad:dataset"]
+        for asset in item["assets"].values():
+            del asset["flexroad:extents"]
+    (tmp_path / "c.json").write_text(json.dumps(items))
+    expected = tuple(replace(one, dataset="") for one in tiles)
+    assert Catalog.read(tmp_path / "c.json").tiles == expected
+    Catalog(expected).write(tmp_path / "c.parquet")
+    table = pq.read_table(tmp_path / "c.parquet")
+    kinds, at = table.schema, table.schema.get_field_index("assets")
+    rows = table.to_pylist()
+    for asset in (asset for row in rows for asset in row["assets"].values() if asset):
         del asset["flexroad:extents"]
     assets = pa.struct(
         (kind.name, pa.struct([field for field in kind.type if field.name != "flexroad:extents"]))
-        for kind in kinds.field("assets").type
+        for kind in kinds.field(at).type
     )
-    older = kinds.set(kinds.get_field_index("assets"), pa.field("assets", assets))
-    pq.write_table(pa.Table.from_pylist(table, older), tmp_path / "c.parquet")
-    assert "flexroad:extents" not in str(pq.read_schema(tmp_path / "c.parquet").field("assets").type)
-    assert Catalog.read(tmp_path / "c.parquet").tiles == tiles
-    Catalog(tiles).write(tmp_path / "c.json")
-    items = json.loads((tmp_path / "c.json").read_text())
-    for asset in (asset for item in items["features"] for asset in item["assets"].values()):
-        del asset["flexroad:extents"]
-    (tmp_path / "c.json").write_text(json.dumps(items))
-    assert Catalog.read(tmp_path / "c.json").tiles == tiles
+    pq.write_table(
+        pa.Table.from_pylist(rows, kinds.set(at, pa.field("assets", assets))), tmp_path / "c.parquet"
+    )
+    assert Catalog.read(tmp_path / "c.parquet").tiles == expected
 
 
-def test_catalog_without_tiles_round_trip(tmp_path):
-    Catalog(()).write(tmp_path / "c.parquet")
-    assert Catalog.read(tmp_path / "c.parquet").tiles == ()
-
-
-def test_read_catalog_without_dataset_gives_empty_dataset(tmp_path):
-    Catalog((tile(295500, tmp_path),)).write(tmp_path / "c.json")
-    items = json.loads((tmp_path / "c.json").read_text())
-    del items["features"][0]["properties"]["flexroad:dataset"]
-    (tmp_path / "c.json").write_text(json.dumps(items))
-    assert Catalog.read(tmp_path / "c.json").tiles == (replace(tile(295500, tmp_path), dataset=""),)
-
-
-def test_crs_without_code_round_trip_keeps_wkt(tmp_path):
-    from pyproj import CRS
-
-    wkt = CRS("+proj=tmerc +lat_0=1 +lon_0=7 +x_0=300000 +y_0=5000000 +ellps=GRS80 +units=m").to_wkt()
-    tiles = (tile(295500, tmp_path, crs=wkt),)
-    Catalog(tiles).write(tmp_path / "c.parquet")
-    assert Catalog.read(tmp_path / "c.parquet").tiles == tiles
-
-
-def test_parquet_schema_is_same_for_every_catalog(tmp_path):
-    Catalog((tile(295500, tmp_path, layers=("dsm",)),)).write(tmp_path / "a.parquet")
-    Catalog((tile(295500, tmp_path, layers=LAYERS),)).write(tmp_path / "b.parquet")
-    assert pq.read_schema(tmp_path / "a.parquet").equals(pq.read_schema(tmp_path / "b.parquet"))
-
-
-def test_files_below_catalog_move_with_it(tmp_path):
-    home = tmp_path / "home"
-    Catalog((tile(295500, home),)).write(home / "c.json")
+def test_files_below_catalog_move_with_it_and_others_are_absolute(tmp_path):
+    home, outside = tmp_path / "home", tile(295750, tmp_path / "data")
+    Catalog((tile(295500, home), outside)).write(home / "c.json")
     shutil.move(home, tmp_path / "away")
-    (moved,) = Catalog.read(tmp_path / "away" / "c.json").tiles
-    layer = moved.layer("dsm")
-    assert layer is not None
-    assert layer.files == ("dsm/a.tif", "dsm/b.tif")
-    assert moved.paths(layer)[0] == tmp_path / "away" / "dsm" / "a.tif"
-
-
-def test_files_outside_catalog_folder_are_absolute(tmp_path):
-    Catalog((tile(295500, tmp_path / "data"),)).write(tmp_path / "catalogs" / "c.json")
-    (read,) = Catalog.read(tmp_path / "catalogs" / "c.json").tiles
-    assert read.layers[0].files[0] == str(tmp_path / "data" / "dsm" / "a.tif")
-
-
-def test_write_not_movable_keeps_file_names(tmp_path):
-    tiles = (tile(295500, tmp_path / "data"),)
-    Catalog(tiles).write(tmp_path / "run" / "c.json", movable=False)
-    assert Catalog.read(tmp_path / "run" / "c.json").tiles == tiles
-    (feature,) = json.loads((tmp_path / "run" / "c.json").read_text())["features"]
-    assert feature["assets"]["dsm"]["href"] == str(tmp_path / "data" / "dsm" / "a.tif")
+    moved, other = Catalog.read(tmp_path / "away" / "c.json").tiles
+    assert moved.layer("dsm").files == ("dsm/a.tif", "dsm/b.tif")
+    assert moved.paths(moved.layer("dsm"))[0] == tmp_path / "away" / "dsm" / "a.tif"
+    assert other.layer("dsm").files[0] == str(tmp_path / "data" / "dsm" / "a.tif")
 
 
 def test_catalog_is_valid_stac_and_geoparquet(tmp_path):
@@ -236,8 +197,6 @@ def test_select_by_id_and_bbox_returns_matching_tiles(tmp_path):
     assert [t.id for t in catalog.select(bbox=(295600, 5629300, 295750, 5629310)).tiles] == ["295500_5629250"]
     with pytest.raises(CatalogError, match="did you mean 295750_5629250"):
         catalog.select(ids=["295751_5629250"])
-    with pytest.raises(CatalogError, match="no tile touches --bbox 0 0 1 1"):
-        catalog.select(bbox=(0, 0, 1, 1))
     within = "the tiles lie within 295500 5629250 296250 5629500 in EPSG:25832"
     with pytest.raises(CatalogError, match=rf"no tile touches --bbox 0 0 1 1; {within}$"):
         catalog.select(bbox=(0, 0, 1, 1))
@@ -261,19 +220,11 @@ def test_select_by_area_returns_the_tiles_on_it(tmp_path):
         )
 
 
-def test_read_missing_or_broken_file_names_it(tmp_path):
+def test_unusable_catalog_is_named(tmp_path):
     with pytest.raises(CatalogError, match="missing.parquet does not exist"):
         Catalog.read(tmp_path / "missing.parquet")
-    (tmp_path / "bad.parquet").write_bytes(b"not parquet at all")
-    (tmp_path / "bad.json").write_text('{"features": [{}]}')
-    for name in ("bad.parquet", "bad.json"):
-        with pytest.raises(CatalogError, match=f"{name} is not a FlexRoad catalog"):
-            Catalog.read(tmp_path / name)
     with pytest.raises(CatalogError, match=r"ends in .parquet"):
         Catalog(()).write(tmp_path / "catalog.csv")
-
-
-def test_duplicate_ids_raise_error(tmp_path):
     with pytest.raises(CatalogError, match="295500_5629250 occur more than once"):
         Catalog((tile(295500, tmp_path), tile(295500, tmp_path)))
 

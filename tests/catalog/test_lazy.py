@@ -20,43 +20,29 @@ def test_library_is_imported_at_its_first_use():
     assert done.stdout.split() == ["False", "True"]
 
 
-def test_submodule_is_found_below_its_library():
+def test_library_is_used_like_the_module_itself(monkeypatch):
     assert lazy("xml").etree.ElementTree.fromstring("<a/>").tag == "a"
-
-
-def test_unknown_name_raises_the_error_of_the_module():
-    with pytest.raises(AttributeError, match="module 'wave' has no attribute 'nothing'"):
-        _ = lazy("wave").nothing
-
-
-def test_missing_library_is_named_at_its_first_use():
-    library = lazy("no_such_library")
-    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
-        _ = library.name
-
-
-def test_missing_import_of_a_submodule_is_not_hidden(tmp_path, monkeypatch):
-    (tmp_path / "outer_package").mkdir()
-    (tmp_path / "outer_package" / "__init__.py").touch()
-    (tmp_path / "outer_package" / "inner.py").write_text("import no_such_library")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
-        _ = lazy("outer_package").inner
-
-
-def test_names_are_set_in_the_library_itself(monkeypatch):
+    assert pickle.loads(pickle.dumps(lazy("wave"))).Error is wave.Error
     monkeypatch.setattr(lazy("wave"), "open", None)
     assert wave.open is None
     monkeypatch.undo()
     assert wave.open is not None
-
-
-def test_pickled_library_is_imported_where_it_is_used():
-    assert pickle.loads(pickle.dumps(lazy("wave"))).Error is wave.Error
-
-
-def test_tools_that_look_for_marks_do_not_import():
+    # Tools that look for such marks do not import the library.
     assert not hasattr(lazy("no_such_library"), "__wrapped__")
+
+
+def test_missing_name_or_library_is_named(tmp_path, monkeypatch):
+    (tmp_path / "outer_package").mkdir()
+    (tmp_path / "outer_package" / "__init__.py").touch()
+    (tmp_path / "outer_package" / "inner.py").write_text("import no_such_library")
+    monkeypatch.syspath_prepend(tmp_path)
+    for library, error, match in (
+        ("wave", AttributeError, "module 'wave' has no attribute 'inner'"),
+        ("no_such_library", ModuleNotFoundError, "no_such_library"),
+        ("outer_package", ModuleNotFoundError, "no_such_library"),
+    ):
+        with pytest.raises(error, match=match):
+            _ = lazy(library).inner
 
 
 def test_garbage_is_not_collected_during_an_import(tmp_path, monkeypatch):

@@ -33,18 +33,15 @@ def named(name, layer=THREE, **changes) -> Layer:
         ((0.0, 0.0, 100.01, 100.0), ("own", "east")),
         ((99.0, 99.0, 260.0, 200.0), ("own", "east", "far")),
         ((260.0, 10.0, 270.0, 20.0), ("far",)),
+        ((0.0, 100.0, 300.0, 200.0), ()),
     ],
 )
-def test_reaching_keeps_files_that_overlap(bounds, files):
+def test_reaching_keeps_files_that_overlap_and_all_of_unknown_extents(bounds, files):
     kept = THREE.reaching(bounds)
-    assert kept.files == files
-    assert kept.extents == tuple(THREE.extents[THREE.files.index(file)] for file in files)
-
-
-def test_reaching_nothing_gives_none_and_unknown_extents_keep_all():
-    assert THREE.reaching((0.0, 100.0, 300.0, 200.0)) is None
+    extents = tuple(THREE.extents[THREE.files.index(file)] for file in files)
+    assert kept == (replace(THREE, files=files, extents=extents) if files else None)
     unknown = replace(THREE, extents=())
-    assert unknown.reaching((0.0, 100.0, 300.0, 200.0)) is unknown
+    assert unknown.reaching(bounds) is unknown
 
 
 def test_loaded_layers_are_those_that_load_reads():

@@ -31,77 +31,67 @@ def mixed(tmp_path):
     return tmp_path
 
 
-def test_layer_in_another_crs_needs_reproject(mixed):
-    result = index(mixed, PATTERNS)
-    assert result.notes[0] == (
-        "dtm is in EPSG:25833, not EPSG:25832, in dtm.tif: tiles there will fail; "
-        "--reproject warps such files when they are read"
-    )
-    assert not any(layer.reproject for tile in result.tiles for layer in tile.layers)
-    result = index(mixed, PATTERNS, conversion=Conversion(reproject=True))
-    assert result.notes[0] == (
-        "dtm is in EPSG:25833, not EPSG:25832, in dtm.tif: reprojected when it is read, bilinearly"
-    )
-    assert [tile.id for tile in result.tiles] == ["700000_5700000"]
-    layers = {layer.name: layer.reproject for layer in result.tiles[0].layers}
-    assert layers == {"dsm": False, "dtm": True}
-    data = load.load(result.tiles[0], load.Options())
+@pytest.mark.parametrize("name", ["c.parquet", "c.json"])
+def test_layer_in_another_crs_needs_reproject(mixed, name):
+    """The decision is in the catalog, in fingerprints and in what the check says."""
+    texts = []
+    for conversion, end in (
+        (Conversion(), "tiles there will fail; --reproject warps such files when they are read"),
+        (Conversion(True), "reprojected when it is read, bilinearly"),
+        (Conversion(True, height_unit="metre"), "reprojected when it is read, bilinearly"),
+    ):
+        result = index(mixed, PATTERNS, conversion=conversion)
+        assert result.notes[0] == f"dtm is in EPSG:25833, not EPSG:25832, in dtm.tif: {end}"
+        assert [tile.id for tile in result.tiles] == ["700000_5700000"]
+        Catalog(result.tiles).write(mixed / name)
+        (tile,) = Catalog.read(mixed / name).tiles
+        read = [(layer.name, layer.reproject, layer.height_unit) for layer in tile.layers]
+        unit = conversion.height_unit
+        assert read == [("dsm", False, unit), ("dtm", conversion.reproject, unit)]
+        findings = [one.text for one in expected_failures([tile], load_config("paper"), ("dsm", "dtm"))]
+        refused = any("dtm is in EPSG:25833, not EPSG:25832" in text for text in findings)
+        assert refused != conversion.reproject
+        texts.append(json.loads(SourceFiles(tile, lambda path: None, checksum=False).text(tile.layer("dtm"))))
+    assert len(texts[0]) == 4
+    assert texts[1:] == [[*texts[0], ["reproject", True, unit]] for unit in (None, "metre")]
+    data = load.load(tile, load.Options())
     assert (data.dsm == 100).all()
     np.testing.assert_allclose(data.dtm, 99)
 
 
-@pytest.mark.parametrize("name", ["c.parquet", "c.json"])
-def test_decision_to_reproject_is_part_of_the_catalog(mixed, name):
-    conversion = Conversion(reproject=True, height_unit="metre")
-    tiles = index(mixed, PATTERNS, conversion=conversion).tiles
-    Catalog(tiles).write(mixed / name)
-    (read,) = Catalog.read(mixed / name).tiles
-    assert (read.layer("dtm").reproject, read.layer("dtm").height_unit) == (True, "metre")
-    assert (read.layer("dsm").reproject, read.layer("dsm").height_unit) == (False, "metre")
-    assert not list(expected_failures([read], load_config("paper"), ("dsm", "dtm")))[1:]
-    Catalog(index(mixed, PATTERNS).tiles).write(mixed / name)
-    (read,) = Catalog.read(mixed / name).tiles
-    assert not read.layer("dtm").reproject
-    findings = [finding.text for finding in expected_failures([read], load_config("paper"), ())]
-    assert any("dtm is in EPSG:25833, not EPSG:25832" in text for text in findings)
-
-
-def test_fingerprint_changes_with_the_decision_to_reproject(mixed):
-    plain, warped, feet = (
-        index(mixed, PATTERNS, conversion=conversion).tiles[0]
-        for conversion in (Conversion(), Conversion(True), Conversion(True, height_unit="foot"))
-    )
-    entries = [
-        json.loads(SourceFiles(tile, lambda path: None, checksum=False).text(tile.layer("dtm")))
-        for tile in (plain, warped, feet)
-    ]
-    assert len(entries[0]) == 4
-    assert entries[1][:4] == entries[0] != entries[1] != entries[2]
-
-
-def test_dsm_in_feet_is_refused_with_the_options_that_accept_it(tmp_path):
-    write(tmp_path / "dsm.tif", FLAT, 985_000, 200_000, cell=3, crs="EPSG:2263")
-    patterns = {"dsm": "dsm.tif"}
-    with pytest.raises(CatalogError, match=r"US survey feet; .* or use --reproject --to-crs EPSG:32618$"):
-        index(tmp_path, patterns)
-    # A target is never chosen silently.
-    with pytest.raises(CatalogError, match="--reproject --to-crs EPSG:32618$"):
-        index(tmp_path, patterns, conversion=Conversion(reproject=True))
-    result = index(tmp_path, patterns, conversion=Conversion(True, "EPSG:32618"))
-    assert {tile.grid.crs for tile in result.tiles} == {"EPSG:32618"}
+@pytest.mark.parametrize(
+    ("crs", "place", "cell", "target", "match"),
+    [
+        ("EPSG:2263", (985_000, 200_000), 3, "EPSG:32618", "^dsm.tif .*US survey feet; "),
+        ("EPSG:3857", (1_113_000, 6_621_000), 1, "EPSG:32632", "^dsm.tif: a metre of EPSG:3857 is 0.629 m "),
+        ("EPSG:4326", (6.1, 50.8), 1e-5, "EPSG:32632", "^dsm.tif is in EPSG:4326, whose unit is degrees; "),
+    ],
+)
+def test_dsm_not_in_metres_is_refused_with_the_options_that_accept_it(
+    tmp_path, crs, place, cell, target, match
+):
+    """One unit of Web Mercator at 51 degrees north is 0.63 m. A target is never chosen silently."""
+    write(tmp_path / "dsm.tif", FLAT, *place, cell=cell, crs=crs)
+    for conversion in (Conversion(), Conversion(reproject=True)):
+        with pytest.raises(CatalogError, match=f"{match}.*--reproject --to-crs {target}$"):
+            index(tmp_path, {"dsm": "dsm.tif"}, conversion=conversion)
+    result = index(tmp_path, {"dsm": "dsm.tif"}, tile_size_m=20, conversion=Conversion(True, target))
+    assert {tile.grid.crs for tile in result.tiles} == {target}
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("reproject", "to_crs", "message"),
     [
-        ((False, "EPSG:25832"), "--to-crs EPSG:25832 needs --reproject"),
-        ((True, "EPSG:2263"), "is in US survey foot; give a projected CRS in metres"),
-        ((True, "EPSG:4326"), "is in degree; give a projected CRS in metres"),
+        (False, "EPSG:25832", "--to-crs EPSG:25832 needs --reproject"),
+        (True, "EPSG:2263", "is in US survey foot; give a projected CRS in metres"),
+        (True, "EPSG:4326", "is in degree; give a projected CRS in metres"),
+        (True, "EPSG:3395", "^--to-crs EPSG:3395: a metre .*; give --to-crs EPSG:32632$"),
     ],
 )
-def test_conversion_that_makes_no_metric_tiles_raises_error(options, message):
+def test_conversion_that_makes_no_metric_tiles_raises_error(tmp_path, reproject, to_crs, message):
+    write(tmp_path / "dsm.tif", FLAT, 1_113_000, 6_621_000, crs="EPSG:3857")
     with pytest.raises(CatalogError, match=message):
-        Conversion(*options)
+        index(tmp_path, {"dsm": "dsm.tif"}, conversion=Conversion(reproject, to_crs))
 
 
 @pytest.mark.parametrize(
@@ -165,25 +155,19 @@ def test_archive_is_refused_with_the_remedy(tmp_path, layer, name):
         index(tmp_path, {"dsm": "dsm.tif", layer: "*.zip"})
 
 
-def test_dsm_in_web_mercator_is_refused_with_the_options_that_accept_it(tmp_path):
-    """One unit at 51 degrees north is 0.63 m."""
-    write(tmp_path / "dsm.tif", FLAT, 1_113_000, 6_621_000, crs="EPSG:3857")
-    patterns = {"dsm": "dsm.tif"}
-    match = r"^dsm.tif: a metre of EPSG:3857 is 0.629 m .* or use --reproject --to-crs EPSG:32632$"
-    with pytest.raises(CatalogError, match=match):
-        index(tmp_path, patterns)
-    with pytest.raises(CatalogError, match="^--to-crs EPSG:3395: a metre .*; give --to-crs EPSG:32632$"):
-        index(tmp_path, patterns, conversion=Conversion(True, "EPSG:3395"))
-    result = index(tmp_path, patterns, tile_size_m=20, conversion=Conversion(True, "EPSG:32632"))
-    assert {tile.grid.crs for tile in result.tiles} == {"EPSG:32632"}
-
-
-def test_given_crs_that_is_no_metric_one_is_refused(tmp_path):
+def test_given_crs_must_be_a_metric_one(tmp_path):
     write(tmp_path / "dsm.tif", FLAT, 1_113_000, 6_621_000, crs=None)
     with pytest.raises(CatalogError, match=r"^dsm.tif: a metre of EPSG:3857 is 0.629 m on the ground"):
         index(tmp_path, {"dsm": "dsm.tif"}, crs="EPSG:3857")
     with pytest.raises(CatalogError, match=r"it has the CRS EPSG:4326, but 111\d+ is no longitude"):
         index(tmp_path, {"dsm": "dsm.tif"}, crs="EPSG:4326")
+
+
+def test_raster_layer_elsewhere_is_named(tmp_path):
+    write(tmp_path / "dsm.tif", FLAT)
+    write(tmp_path / "mask.tif", FLAT, 32_295_500)
+    with pytest.raises(CatalogError, match="^road_mask reaches no tile: mask.tif lies at 32295500 .*:4647$"):
+        index(tmp_path, {"dsm": "dsm.tif", "road_mask": "mask.tif"}, tile_size_m=20)
 
 
 def test_crs_replaces_degrees_that_are_metres_in_catalog_and_load(tmp_path):
@@ -196,16 +180,6 @@ def test_crs_replaces_degrees_that_are_metres_in_catalog_and_load(tmp_path):
     assert (tile.layer("dsm").crs, tile.layer("dtm").crs) == (None, "EPSG:25832")
     np.testing.assert_array_equal(load.load(tile, load.Options()).dtm, FLAT[:20, :20])
     assert not [f for f in expected_failures([tile], load_config("paper"), ()) if "EPSG" in f.text]
-
-
-def test_raster_layer_elsewhere_is_named_with_both_places(tmp_path):
-    write(tmp_path / "dsm.tif", FLAT)
-    write(tmp_path / "mask.tif", FLAT, 32_295_500)
-    with pytest.raises(CatalogError) as error:
-        index(tmp_path, {"dsm": "dsm.tif", "road_mask": "mask.tif"}, tile_size_m=20)
-    assert "road_mask reaches no tile: mask.tif lies at 32295500 " in str(error.value)
-    assert "in EPSG:25832, the tiles at 295500 " in str(error.value)
-    assert str(error.value).endswith("the number of a zone: declare EPSG:4647")
 
 
 def test_tiles_list_the_files_within_reach_whatever_number_is_looked_up_at_a_time(tmp_path, monkeypatch):

@@ -101,21 +101,21 @@ def test_docs_library_page_runs(city, tmp_path, monkeypatch, flexroad):
     assert {"road.npz", "road.glb", "height.tif", "height.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_import_loads_no_heavy_library():
-    heavy = "numpy numba scipy rasterio pandas xarray torch dask pydantic".split()
-    code = f"import sys, flexroad; dir(flexroad); print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout.strip() == "[]"
+LOADED = "; print([name for name in '{}'.split() if name in sys.modules])"
+HEAVY = {
+    "import sys, flexroad; dir(flexroad)": "numpy numba scipy rasterio pandas xarray torch dask pydantic",
+    "import sys; from flexroad.pipeline.config import loading; loading.load_config('production')": (
+        "numba pandas xarray torch dask scipy.ndimage scipy.sparse scipy.spatial scipy.special"
+    ),
+}
+SAME = "import os, numba; a = dict(os.environ); import flexroad; flexroad.fit; print(a == dict(os.environ))"
+CODES = [*((code + LOADED.format(names), "[]") for code, names in HEAVY.items()), (SAME, "True")]
 
 
-def test_reading_a_config_loads_no_numerical_library():
-    heavy = "numba pandas xarray torch dask scipy.ndimage scipy.sparse scipy.spatial scipy.special".split()
-    code = (
-        "import sys; from flexroad.pipeline.config.loading import load_config; load_config('production'); "
-        f"print([m for m in {heavy} if m in sys.modules])"
-    )
+@pytest.mark.parametrize(("code", "expected"), CODES, ids=["import", "configuration", "environment"])
+def test_import_loads_no_heavy_library_and_changes_no_environment(code, expected):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.strip() == expected
 
 
 def test_public_names_exist():
@@ -124,33 +124,25 @@ def test_public_names_exist():
     assert not hasattr(flexroad, "unknown")
 
 
-def test_example_size_out_of_range_raises():
-    with pytest.raises(flexroad.ConfigError, match="size_m 10: give"):
-        flexroad.example(size_m=10)
+def run_of_one(folder, change=lambda survey: None) -> flexroad.RunView:
+    """Run production over one tile: with neighbours the run would know more ground than its rasters."""
+    catalog = Catalog.read(write_scenes(folder / "survey", 1, seed=0, size_m=60))
+    change(folder / "survey")
+    run_tiles(Run.create(folder / "run", load_config("production"), catalog), SerialExecutor())
+    return flexroad.open_run(folder / "run")
 
 
-def test_import_after_numpy_leaves_environment_unchanged():
-    code = (
-        "import os, numpy, numba; before = dict(os.environ); import flexroad; flexroad.fit; "
-        "print(before == dict(os.environ))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout.strip() == "True"
+def places(bounds):
+    return np.random.default_rng(0).uniform(bounds[:2], bounds[2:], (500, 2)).T
 
 
 def test_fit_equals_run_over_same_rasters(tmp_path, rasters):
-    """The run has one tile: with neighbours it would know more ground than the rasters."""
-    fitted = flexroad.fit(**rasters)
-    catalog = Catalog.read(write_scenes(tmp_path / "survey", 1, seed=0, size_m=60))
-    run_tiles(Run.create(tmp_path / "run", load_config("production"), catalog), SerialExecutor())
-    run = flexroad.open_run(tmp_path / "run")
-    west, south, east, north = fitted.bounds
-    x, y = np.random.default_rng(0).uniform((west, south), (east, north), (500, 2)).T
+    fitted, run = flexroad.fit(**rasters), run_of_one(tmp_path)
+    x, y = places(fitted.bounds)
     np.testing.assert_allclose(fitted.height(x, y), run.height(x, y), rtol=0, atol=1e-9)
     np.testing.assert_allclose(fitted.normal(x, y), run.normal(x, y), rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(
-        fitted.clusters.mask[50:-50, 50:-50], run.tile("499980_5599980").road_filtered
-    )
+    kept = fitted.clusters.mask[50:-50, 50:-50]
+    np.testing.assert_array_equal(kept, run.tile("499980_5599980").road_filtered)
     products = tmp_path / "run" / "tiles" / "499980_5599980"
     stored = flexroad.open_surface(products / "499980_5599980_flexroad_surface.npz")
     np.testing.assert_allclose(stored.height(x, y), fitted.height(x, y), rtol=0, atol=1e-9)
@@ -161,19 +153,18 @@ def test_fit_equals_run_over_same_rasters(tmp_path, rasters):
 
 
 def test_fit_without_road_equals_run_and_is_flagged(tmp_path, rasters):
-    catalog = Catalog.read(write_scenes(tmp_path / "survey", 1, seed=0, size_m=60))
-    for layer in ("road_mask", "reference_road"):
-        with rasterio.open(tmp_path / "survey" / layer / "499980_5599980.tif", "r+") as file:
-            file.write(np.zeros((1, *file.shape), file.dtypes[0]))
-    run_tiles(Run.create(tmp_path / "run", load_config("production"), catalog), SerialExecutor())
-    run = flexroad.open_run(tmp_path / "run")
+    def remove_roads(survey):
+        for layer in ("road_mask", "reference_road"):
+            with rasterio.open(survey / layer / "499980_5599980.tif", "r+") as file:
+                file.write(np.zeros((1, *file.shape), file.dtypes[0]))
+
+    run = run_of_one(tmp_path, remove_roads)
     assert run.metrics["flags"].item() == "no-road"
-    with pytest.warns(UserWarning, match="road_mask has no road cell .* the surface is that of the terrain"):
+    with pytest.warns(UserWarning, match="road_mask has no road cell .* the surface is the terrain's"):
         fitted = flexroad.fit(rasters["dsm"], rasters["dtm"], rasters["road_mask"] * 0)
     assert fitted.flags == ("no-road",)
     assert "road: 0 cells given, 0 kept by the filter; no-road" in repr(fitted)
-    west, south, east, north = fitted.bounds
-    x, y = np.random.default_rng(0).uniform((west, south), (east, north), (500, 2)).T
+    x, y = places(fitted.bounds)
     np.testing.assert_allclose(fitted.height(x, y), run.height(x, y), rtol=0, atol=1e-9)
     assert not fitted.to_mesh().face_attributes["road"].any()
     fitted.save(tmp_path / "terrain.npz")
@@ -185,11 +176,40 @@ def classes(scene) -> xr.DataArray:
     return xr.where(scene.road_mask, 1, 2).rio.write_crs(scene.rio.crs)
 
 
-def test_fit_road_values_equals_mask_of_these(scene, surface):
-    fitted = flexroad.fit(scene.dsm, scene.dtm, classes(scene), road_values=[1])
-    x, y = np.random.default_rng(0).uniform((500200, 5600000), (500260, 5600060), (500, 2)).T
-    np.testing.assert_array_equal(fitted.height(x, y), surface.height(x, y))
+def land_cover(scene):
+    """A comparison is a mask of bool with the nodata of the land cover, 255, as an attribute."""
+    with xr.set_options(keep_attrs=True):
+        mask = scene.road_mask.astype("uint8").rio.write_nodata(255) == 1
+    assert mask.dtype == bool
+    return {**scene, "road_mask": mask}
+
+
+def reversed_axes(scene):
+    turned = scene.isel(y=slice(None, None, -1), x=slice(None, None, -1)).transpose("x", "y")
+    return {**scene, "dsm": turned.dsm, "road_mask": turned.road_mask.astype("uint8").expand_dims("band")}
+
+
+def transform_only(scene):
+    return dict(scene.rio.write_transform().drop_vars(["x", "y"]))
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda scene: {**scene, "road_mask": classes(scene), "road_values": [1]},
+        land_cover,
+        reversed_axes,
+        transform_only,
+    ],
+    ids=["road_values", "land cover", "reversed axes", "transform only"],
+)
+def test_fit_of_the_same_ground_in_another_form_is_equal(scene, surface, form):
+    arrays = form(scene)
+    names = ("dsm", "dtm", "road_mask", "road_values")
+    fitted = flexroad.fit(**{name: arrays[name] for name in names if name in arrays})
+    np.testing.assert_array_equal(fitted.fitted.A, surface.fitted.A)
     np.testing.assert_array_equal(fitted.road.mask, surface.road.mask)
+    assert fitted.road.core == surface.road.core
 
 
 @pytest.mark.parametrize(
@@ -198,7 +218,7 @@ def test_fit_road_values_equals_mask_of_these(scene, surface):
         (
             classes,
             (),
-            "road_mask: values are 1, 2, and all but 0 count as road; name the roads' with road_val",
+            "road_mask: values are 1, 2, and all but 0 count as road; name the",
         ),
         (classes, (7,), "road_mask: no cell has road_values 7 but 1, 2"),
         (lambda scene: scene.road_mask | True, (), "road_mask: every cell counts as road, with the value 1"),
@@ -210,18 +230,10 @@ def test_fit_mask_that_is_no_mask_of_roads_warns(scene, change, values, message)
         flexroad.fit(scene.dsm, scene.dtm, change(scene).rio.write_crs(25832), road_values=values)
 
 
-def test_fit_probabilities_raise(scene):
-    probable = (scene.road_mask * 0.6 + 0.2).rio.write_crs(25832)
-    with pytest.raises(flexroad.TaskError, match=r"road_mask: values are 0.2, 0.8, as of probabilities"):
-        flexroad.fit(scene.dsm, scene.dtm, probable)
-
-
-def test_fit_settings_as_texts_and_as_dict_are_equal_and_named(scene):
-    one = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, settings=["fit.spacing_m=10"])
-    other = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, settings={"fit": {"spacing_m": 10}})
-    assert one.fitted.A.shape == other.fitted.A.shape == (9, 9)
-    assert one.height(*CENTRE) == other.height(*CENTRE)
-    assert "config production --set fit.spacing_m=10>" in repr(one)
+def test_fit_settings_are_used_and_named(scene):
+    fitted = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, settings={"fit": {"spacing_m": 10}})
+    assert fitted.fitted.A.shape == (9, 9)
+    assert "config production --set fit={spacing_m: 10}>" in repr(fitted)
     with pytest.raises(flexroad.ConfigError, match="fit.spacing: unknown key; did you mean spacing_m"):
         flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, settings={"fit.spacing": 10})
 
@@ -246,7 +258,7 @@ def test_fit_table_of_roads_equals_run_over_same_file(tmp_path, rasters, streets
     run = flexroad.run(catalog, "production_vector", out=tmp_path / "run", workers=1)
     for config in ("production", "production_vector"):
         fitted = flexroad.fit(rasters["dsm"], rasters["dtm"], streets, config)
-        x, y = np.random.default_rng(0).uniform((499980, 5599980), (500040, 5600040), (500, 2)).T
+        x, y = places(fitted.bounds)
         np.testing.assert_allclose(fitted.height(x, y), run.height(x, y), rtol=0, atol=1e-9)
     # A street of 8 m across 60 m.
     assert fitted.road.mask[50:-50, 50:-50].sum() == pytest.approx(8 * 60 * np.hypot(10, 4) / 10, rel=0.03)
@@ -255,62 +267,34 @@ def test_fit_table_of_roads_equals_run_over_same_file(tmp_path, rasters, streets
     np.testing.assert_array_equal(again.faces, fitted.to_mesh().faces)
 
 
+LEVELS = {"segment": {"method": "vector", "levels": True}}
+
+
 @pytest.mark.parametrize(
-    ("change", "options", "error", "message"),
+    ("change", "options", "message"),
     [
-        (
-            lambda roads: roads.set_crs(None, allow_override=True),
-            {},
-            flexroad.TaskError,
-            "the roads have no CRS",
-        ),
-        (
-            lambda roads: roads.assign(WIDTH=8),
-            {},
-            flexroad.TaskError,
-            "cannot be written as a GeoPack",
-        ),
-        (lambda roads: roads, {"road_values": [1]}, flexroad.ConfigError, "road_values are of a mask"),
-        (
-            lambda roads: roads,
-            {"settings": {"segment": {"method": "vector", "levels": True}}},
-            flexroad.ConfigError,
-            "segment.levels gives several surfaces",
-        ),
+        (lambda roads: roads.set_crs(None, allow_override=True), {}, "the roads have no CRS"),
+        (lambda roads: roads.assign(WIDTH=8), {}, "cannot be written as a GeoPack"),
+        (lambda roads: roads, {"road_values": [1]}, "road_values are of a mask"),
+        (lambda roads: roads, {"settings": LEVELS}, "segment.levels gives several surfaces"),
     ],
     ids=["no CRS", "equal columns", "road_values", "levels"],
 )
-def test_fit_unusable_table_of_roads_raises(scene, streets, change, options, error, message):
+def test_fit_unusable_table_of_roads_raises(scene, streets, change, options, message):
+    error = flexroad.ConfigError if options else flexroad.TaskError
     with pytest.raises(error, match=message):
         flexroad.fit(scene.dsm, scene.dtm, change(streets), **options)
 
 
-def test_fit_table_without_a_road_here_is_flagged(scene, streets):
-    with pytest.warns(UserWarning, match="no road of roads.gpkg lies on this tile"):
-        fitted = flexroad.fit(scene.dsm, scene.dtm, streets.translate(1000).to_frame("geometry"))
-    assert fitted.flags == ("no-road",)
-
-
-def test_fit_whose_road_the_filter_drops_is_flagged(scene, surface):
+def test_fit_whose_road_the_filter_drops_or_that_has_none_is_flagged(scene, surface, streets):
     assert surface.flags == ()
     # Less than the smallest area that the filter keeps.
     speck = scene.road_mask & (scene.road_mask.cumsum("x").cumsum("y") <= 5)
     assert 0 < speck.sum() <= 25
     assert flexroad.fit(scene.dsm, scene.dtm, speck).flags == ("no-road",)
-
-
-def test_fit_with_reversed_coordinates_equals_original(scene, surface):
-    reversed_scene = scene.isel(y=slice(None, None, -1), x=slice(None, None, -1)).transpose("x", "y")
-    same = flexroad.fit(
-        reversed_scene.dsm, scene.dtm, reversed_scene.road_mask.astype("uint8").expand_dims("band")
-    )
-    assert same.height(*CENTRE) == surface.height(*CENTRE)
-    assert same.road.core == surface.road.core
-
-
-def test_fit_without_coordinates_uses_transform(scene, surface):
-    bare = scene.rio.write_transform().drop_vars(["x", "y"])
-    assert flexroad.fit(bare.dsm, bare.dtm, bare.road_mask).height(*CENTRE) == surface.height(*CENTRE)
+    with pytest.warns(UserWarning, match="no road of roads.gpkg lies on this tile"):
+        fitted = flexroad.fit(scene.dsm, scene.dtm, streets.translate(1000).to_frame("geometry"))
+    assert fitted.flags == ("no-road",)
 
 
 def test_fit_dask_arrays_with_nodata_equals_nan(scene, surface):
@@ -318,16 +302,6 @@ def test_fit_dask_arrays_with_nodata_equals_nan(scene, surface):
     lazy = flexroad.fit(with_nodata, scene.dtm, scene.road_mask)
     missing = flexroad.fit(scene.dsm.where(scene.x > 500202), scene.dtm, scene.road_mask)
     assert lazy.height(*CENTRE) == missing.height(*CENTRE)
-
-
-def test_fit_mask_compared_with_a_class_keeps_its_rasters_nodata(scene, surface):
-    """``landcover == 1`` is a mask of bool with the nodata of the land cover, 255, as an attribute."""
-    cover = scene.road_mask.astype("uint8").rio.write_nodata(255)
-    with xr.set_options(keep_attrs=True):
-        mask = cover == 1
-    assert mask.dtype == bool
-    again = flexroad.fit(scene.dsm, scene.dtm, mask)
-    np.testing.assert_array_equal(again.fitted.A, surface.fitted.A)
 
 
 def test_fit_dtm_on_other_grid_is_resampled_with_warning(scene, surface):
@@ -340,10 +314,6 @@ def test_fit_dtm_on_other_grid_is_resampled_with_warning(scene, surface):
     ):
         coarse = flexroad.fit(scene.dsm, scene.dtm.coarsen(x=2, y=2).mean(), scene.road_mask)
     assert abs(coarse.height(*CENTRE) - surface.height(*CENTRE)) < 0.1
-
-
-def feet(array):
-    return array.assign_attrs(units="ft")
 
 
 def rotated(array):
@@ -361,7 +331,7 @@ def rotated(array):
         ("dsm", lambda a: a.rio.write_crs(2264), "dsm is in EPSG:2264, whose coordinates are in US"),
         ("dsm", lambda a: a.rio.write_crs(3857), "dsm: a metre of EPSG:3857 is 0.708 m on the ground"),
         ("dsm", lambda a: a.rio.write_crs("EPSG:25832+6360"), "heights in US survey foot; multiply"),
-        ("dtm", feet, "dtm has heights in ft; multiply it by 0.3048 and set dtm.attrs"),
+        ("dtm", lambda a: a.assign_attrs(units="ft"), "dtm has heights in ft; multiply it by 0.3048 and set"),
         ("dtm", lambda a: a.assign_attrs(units="K"), "dtm has units 'K'; give metres"),
         ("dsm", rotated, "dsm is rotated; turn it north up"),
         ("dsm", lambda a: a.assign_coords(y=5600060 - 2 * np.arange(60.0)), "dsm has pixels of 1 x 2 m"),
@@ -376,7 +346,8 @@ def rotated(array):
         ("dsm", lambda a: a.to_dataset(), "dsm is a Dataset; give an xarray.DataArray"),
         ("dsm", lambda a: xr.concat([a, a], "time"), r"dsm has dimensions \(time: 2, y: 60, x: 60\)"),
         ("dsm", lambda a: a.assign_attrs(units="m", scale_factor=0.01), "scale_factor 0.01"),
-        ("road_mask", lambda a: a.astype(str), "road_mask holds <U5, not numbers"),
+        ("road_mask", lambda a: a * 0.6 + 0.2, "road_mask: values are 0.2, 0.8, as of probabilities"),
+        ("road_mask", lambda a: a.astype(str), "road_mask has <U5, not numbers"),
         ("dsm", lambda a: a[:1], "dsm has 1 x 60 cells; give at least 2 x 2"),
     ],
 )  # fmt: skip
@@ -389,7 +360,9 @@ def test_fit_unusable_array_raises_one_line(scene, layer, change, message):
     assert "\n" not in str(error.value)
 
 
-def test_fit_unknown_configuration_or_variant_raises(scene):
+def test_unknown_configuration_variant_or_size_raises(scene):
+    with pytest.raises(flexroad.ConfigError, match="size_m 10: give"):
+        flexroad.example(size_m=10)
     with pytest.raises(flexroad.ConfigError, match="did you mean production"):
         flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, config="productio")
     with pytest.raises(flexroad.ConfigError, match="no variant 'plane'"):
@@ -404,19 +377,12 @@ def test_surface_to_xarray_has_height_and_road(surface):
     x, y = np.meshgrid(raster.x, raster.y)
     np.testing.assert_allclose(raster.height, surface.height(x, y), rtol=0, atol=1e-9)
     assert raster.road.sum() == surface.clusters.mask.sum()
+    assert np.isnan(raster.height.rio.nodata)
+    assert "_FillValue" not in raster.height.attrs  # xarray refuses to write such an attribute
     odd = surface.to_xarray(0.7)
     assert np.isfinite(odd.height.sel(x=slice(None, 500260), y=slice(None, 5600000))).all()
     with pytest.raises(flexroad.ConfigError, match="resolution 0 m"):
         surface.to_xarray(0)
-
-
-def test_to_xarray_of_surface_and_run_has_nodata(surface, city, tmp_path):
-    for raster in (surface.to_xarray(), flexroad.open_run(city / "runs" / "city").to_xarray()):
-        assert np.isnan(raster.height.rio.nodata)
-        raster.height.rio.to_raster(tmp_path / "height.tif")
-        with rasterio.open(tmp_path / "height.tif") as file:
-            assert np.isnan(file.nodata)
-        assert "_FillValue" not in raster.height.attrs  # xarray refuses to write such an attribute
 
 
 def test_surface_saved_and_opened_is_equal(surface, tmp_path):
@@ -435,7 +401,7 @@ def test_fit_plane_and_raster_have_heights_but_no_file(scene, tmp_path):
         flat = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, "ablation", variant)
         assert repr(flat).startswith(f"<flexroad.Surface: {kind}, config ablation>")
         assert np.isfinite(flat.height(*CENTRE))
-        with pytest.raises(flexroad.TaskError, match="no NURBS surface"):
+        with pytest.raises(flexroad.TaskError, match="not a NURBS surface"):
             flat.save(tmp_path / "flat.npz")
 
 
@@ -451,11 +417,14 @@ def test_surface_to_mesh_has_surface_heights(surface):
     assert (upright.face_normals[:, 1] > 0).all()
 
 
-def test_run_to_xarray_is_lazy_and_equals_heights(city):
+def test_run_to_xarray_is_lazy_and_equals_heights(city, tmp_path):
     run = flexroad.open_run(city / "runs" / "city")
     raster = run.to_xarray()
     assert raster.height.chunks == ((60,), (60, 60))
     assert raster.height.dtype == np.float32
+    raster.height.rio.to_raster(tmp_path / "height.tif")
+    with rasterio.open(tmp_path / "height.tif") as file:
+        assert np.isnan(file.nodata)
     done, pending = raster.isel(x=slice(0, 60)), raster.isel(x=slice(60, None))
     x, y = np.meshgrid(done.x, done.y)
     np.testing.assert_allclose(done.height, run.height(x, y), rtol=0, atol=1e-4)
@@ -472,9 +441,8 @@ def test_run_to_xarray_is_lazy_and_equals_heights(city):
 
 
 def test_run_to_xarray_without_geotiffs_raises(city, tmp_path):
-    (tmp_path / "light.yaml").write_text("extends: production\nexport: {formats: [npz]}\n")
     catalog = Catalog.read(city / "survey" / "catalog.parquet")
-    run = Run.create(tmp_path / "run", load_config(tmp_path / "light.yaml"), catalog)
+    run = Run.create(tmp_path / "run", load_config("production", ["export.formats=[npz]"]), catalog)
     with pytest.raises(flexroad.ConfigError, match="exports no GeoTIFF of flexroad"):
         flexroad.open_run(run.path).to_xarray()
 

@@ -1,5 +1,5 @@
-"""``flexroad init`` and ``catalog check``: what a folder or a catalog has, and what would fail.
+"""``flexroad init`` and ``catalog check``: the content of a folder or a catalog, and expected failures.
 
-For who has downloads and wants the right command, or a catalog before a long run. Start at `command.py`:
-`init` calls `downloads.look`, and `catalog check` calls `catalog.check`.
+For users who have downloads and look for the right command, or check a catalog before a long run. Start at
+`command.py`: `init` calls `downloads.look`, and `catalog check` calls `catalog.check`.
 """

@@ -1,7 +1,7 @@
-"""Check of a catalog: layers per tile, what would fail, shift of the photo, and decks that no road names.
+"""Check of a catalog: layers per tile, expected failures, shift of the photo, and decks without a level.
 
-A deck is level road above the DTM that goes on as street of the same height. The decks are written to a map,
-``decks.geojson``, to be checked.
+A deck is level road above the DTM that continues as a street of the same height. The decks are written to a
+map, ``decks.geojson``, for the user to check.
 """
 
 from __future__ import annotations
@@ -50,25 +50,25 @@ MAX_PHOTO_TILES = 12
 """Number of tiles whose photo is compared with the heights, spread evenly over the catalog."""
 FILE = "decks.geojson"
 MAKER = {"generator": "flexroad catalog check"}
-"""Members of the file that editors leave out when they write it: such a file is not replaced."""
+"""Members of the map that other programs do not write: a file without them is not replaced."""
 MOST_TILES = 200
-"""Number of tiles that are looked at, spread evenly over the catalog, unless all are asked for."""
+"""Number of tiles searched for decks, spread evenly over the catalog, unless all are requested."""
 LEAST_HALO_M = 50.0
-"""Ground around a tile that is read: a deck that reaches beyond the tile is seen as a whole (m)."""
+"""Width of the ground around a tile that is read (m), so that decks across its border are complete."""
 RISE_M, AREA_M2 = 1.5, 20.0
-"""Least height above the DTM, and least area, of what may be a deck."""
+"""Least height above the DTM (m) and least area (m2) of a deck."""
 ROUGHNESS_M, BEND = 0.15, 0.1
-"""Limits of flat patches (`flat_patches`): those of ``ecsrc: planar``."""
+"""Limits of flat patches, as in ``ecsrc: planar``."""
 STREET_M = 0.5
 """Largest difference of DSM and DTM on a street (m)."""
 END_M, END_M2 = 6.0, 4.0
 """A deck ends at a street of at least this area within this distance."""
 STEP_M, GRADE = 0.5, 0.1
-"""Largest difference in height of a street to a deck that ends there: a step, and a slope (m per m)."""
+"""Largest height difference between a deck and the street at its end: a step (m), and a slope (m/m)."""
 GAP_M = 1.5
-"""Places of streets that are this near to each other are one end (m)."""
+"""Places of streets that are closer to each other than this are one end (m)."""
 ENDS = 2
-"""What has fewer ends may also be a roof."""
+"""A place with fewer ends may also be a roof."""
 EVERY_WAY = np.ones((3, 3), bool)
 
 
@@ -81,7 +81,7 @@ class Deck:
     rise_m: float
     """Median height above the DTM."""
     ends: int
-    """Number of places where a street of the same height goes on."""
+    """Number of places where a street of the same height continues."""
 
     @property
     def is_sure(self) -> bool:
@@ -90,9 +90,9 @@ class Deck:
 
 
 def check(catalog: Catalog, config: Config, path: Path, every_deck: bool = False) -> Iterator[Finding]:
-    """Yield the contents of a catalog, what would fail in a run with a configuration, and unnamed decks.
+    """Yield the contents of a catalog, expected failures with a configuration, and decks without a level.
 
-    - `path`: file of the catalog: the map of decks is written beside it (`deck_findings`).
+    - `path`: file of the catalog: the map of decks is written next to it (`deck_findings`).
     - `every_deck`: whether to look for decks on all tiles of a large catalog.
     """
     check_allowed(catalog)
@@ -113,7 +113,7 @@ def check(catalog: Catalog, config: Config, path: Path, every_deck: bool = False
 
 
 def _plateaus(tiles: Sequence[Tile]) -> Iterator[Finding]:
-    """Name the files of heights of which many cells have one exact value."""
+    """Name the files of heights in which many cells have one exact value."""
     files: dict[str, dict[str, Location]] = defaultdict(dict)
     for tile in tiles:
         for layer in (layer for layer in tile.layers if layer.name in HEIGHTS):
@@ -165,14 +165,14 @@ def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Finding:
 
 
 def deck_findings(tiles: Sequence[Tile], config: Config, catalog: Path, every: bool) -> Iterator[Finding]:
-    """Yield how many decks no road names, and write them beside the catalog if all tiles were looked at.
+    """Yield the number of decks without a level; if all tiles were searched, write them next to the catalog.
 
-    An older map is replaced, or removed if there are none, unless another program has written it since.
+    An older map is replaced, or removed if no deck is found, unless another program has changed it.
 
     - `tiles`: usable tiles.
     - `config`: configuration of the run: its first chain has the roads.
     - `catalog`: file of the catalog.
-    - `every`: whether to look at all tiles, not at `MOST_TILES` at most.
+    - `every`: whether to search all tiles, not only `MOST_TILES`.
     """
     chain = next(iter(config.chains.values()))
     tiles = [tile for tile in tiles if tile.layer("road_mask") or tile.layer("roads")]
@@ -196,7 +196,7 @@ def _told(found: Sequence[tuple[Tile, Deck]]) -> str:
 
 
 def _written(path: Path, found: Sequence[tuple[Tile, Deck]]) -> Iterator[Finding]:
-    """Yield the line on some decks, and write their map."""
+    """Write the map of decks; yield the line on them."""
     try:
         is_old = exists(path)
         if is_old and not _is_own(path):
@@ -216,7 +216,7 @@ def _written(path: Path, found: Sequence[tuple[Tile, Deck]]) -> Iterator[Finding
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file is a map of decks as it was written."""
+    """Return whether a file is an unchanged map of decks."""
     try:
         content = json.loads(read(path))
     except ValueError:
@@ -255,7 +255,7 @@ def _in_degrees(tile: Tile, deck: Deck) -> shapely.Geometry:
 
 
 def _decks(tile: Tile, reading: load.Options, selection: Options) -> list[Deck]:
-    """Return the decks of a tile that no road names; none if the tile cannot be read."""
+    """Return the decks of a tile without a level; empty if the tile cannot be read."""
     options = selection if isinstance(selection, rasterise.Options) else rasterise.DEFAULTS
     reading = reading.model_copy(update={"halo_m": max(reading.halo_m, LEAST_HALO_M), "min_valid": 0.0})
     try:
@@ -268,10 +268,10 @@ def _decks(tile: Tile, reading: load.Options, selection: Options) -> list[Deck]:
         decks = likely_decks(data.dsm, data.dtm, road, data.grid)
         named = _named(data, options) if decks else np.empty(0, object)
     except TaskError:
-        # What a run could not read has a line of its own.
+        # A tile that cannot be read is reported by another finding.
         return []
     west, south, east, north = data.core.bounds
-    # A deck that reaches into several tiles is that of the one with its centre.
+    # A deck in several tiles belongs to the tile with its centre.
     return [
         deck
         for deck in decks
@@ -282,7 +282,7 @@ def _decks(tile: Tile, reading: load.Options, selection: Options) -> list[Deck]:
 
 
 def _named(data: TileData, options: rasterise.Options) -> NDArray[np.object_]:
-    """Return the roads of a tile that are above level 0, as areas, ``(n,)``; none without vectors."""
+    """Return the roads of a tile above level 0 as areas, ``(n,)``; empty without vectors."""
     source = data.roads
     if source is None:
         return np.empty(0, object)
@@ -301,8 +301,8 @@ def likely_decks(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> list[Deck
     """Return the places of road that look like decks.
 
     - `dsm`, `dtm`: heights (m), NaN where unknown.
-    - `road`: cells of roads, with those on decks.
-    - `grid`: the grid of all of them.
+    - `road`: cells of roads, also on decks.
+    - `grid`: the grid of all arrays.
     """
     points = road & np.isfinite(dsm)
     flat = flat_cells(dsm, points, grid.cell, ROUGHNESS_M, BEND) & points
@@ -313,7 +313,7 @@ def likely_decks(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> list[Deck
     decks = []
     for k, box in enumerate(scipy.ndimage.find_objects(parts), 1):
         if sizes[k] >= AREA_M2:
-            # Only what is near matters: a tile may have millions of cells.
+            # Only cells near the deck are used: a tile may have millions of cells.
             around = _grown(box, math.ceil(END_M / grid.cell) + 1, road.shape)
             own, here = parts[around] == k, grid.part(*around)
             ends = _ends(own, street[around], dsm[around], grid.cell)
@@ -322,7 +322,7 @@ def likely_decks(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> list[Deck
 
 
 def _grown(box: tuple[slice, ...], cells: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Return the rows and columns of a box, and so many cells on each side of it."""
+    """Return the rows and columns of a box, extended by a number of cells on each side."""
     rows, cols = (
         slice(max(side.start - cells, 0), min(side.stop + cells, length))
         for side, length in zip(box, shape, strict=True)
@@ -331,7 +331,7 @@ def _grown(box: tuple[slice, ...], cells: int, shape: tuple[int, ...]) -> tuple[
 
 
 def _ends(own: Bools, street: Bools, dsm: Floats, cell: float) -> int:
-    """Return the number of streets of the same height within `END_M` of some cells."""
+    """Return the number of streets of the same height within `END_M` of a deck's cells."""
     away, nearest = scipy.ndimage.distance_transform_edt(~own, sampling=cell, return_indices=True)
     off = np.abs(dsm - dsm[tuple(nearest)])
     level = street & (away <= END_M) & (off <= STEP_M + GRADE * away)
@@ -342,7 +342,7 @@ def _ends(own: Bools, street: Bools, dsm: Floats, cell: float) -> int:
 
 
 def _outline(cells: Bools, grid: Grid) -> shapely.Geometry:
-    """Return the outline of some cells, without the steps from cell to cell."""
+    """Return the simplified outline of cells, without the steps from cell to cell."""
     shapes = rasterio.features.shapes(cells.astype(np.uint8), mask=cells, transform=grid.transform)
     outline = shapely.union_all([shapely.geometry.shape(shape) for shape, _ in shapes])
     return shapely.simplify(outline, grid.cell)

@@ -1,4 +1,4 @@
-"""``flexroad init`` and ``catalog check``: what a folder or a catalog has, and what would fail."""
+"""The commands ``flexroad init`` and ``flexroad catalog check``."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ def init(
         typer.Option(metavar="FILE", help="Also write a small configuration; an existing file is kept."),
     ] = None,
 ) -> None:
-    """Say what a folder of downloads has, and which commands fit.
+    """List the downloads in a folder, and the commands for them.
 
-    Asks what is unclear. The commands make a catalog of the files and run it.
+    Unclear points are printed as questions. The commands make a catalog of the files and run it.
     """
     if published := gerod(folder):
         for line in published:
@@ -131,18 +131,18 @@ def catalog_check(
         str | None,
         typer.Option(
             metavar="NAME|FILE",
-            help="Configuration of the run; default: the one that fits the layers.",
+            help="Configuration of the run; default: the configuration that fits the layers.",
             rich_help_panel=INPUTS,
         ),
     ] = None,
     decks: Annotated[
-        bool, typer.Option("--decks", help="Look for decks on all tiles, not only on 200 of them.")
+        bool, typer.Option("--decks", help="Search for decks on all tiles, not only on 200 tiles.")
     ] = False,
 ) -> None:
     """Check a catalog before a long run.
 
-    Prints layers, what would fail in a run, the shift between photo and heights, and how many places look
-    like decks that no road names. These are written to decks.geojson beside the catalog.
+    Prints layers, expected failures of a run, the shift between photo and heights, and decks without a level.
+    These are written to decks.geojson next to the catalog.
     """
     catalog, faults = Catalog.read(path, options.allowed(ctx)), 0
     for remark in check(catalog, load_config(config or fitting_config(catalog)), path, decks):

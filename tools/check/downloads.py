@@ -1,4 +1,4 @@
-"""What the files of a folder of downloads look like, and the commands that make a catalog of them."""
+"""The kinds of files in a folder of downloads, and the commands that make a catalog of them."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from flexroad.catalog.sources import nrw
 from flexroad.catalog.text import count
 
 MAX_FILES = 5000
-"""Largest number of files that are looked at."""
+"""Largest number of files that are read."""
 GEROD_ZIP = r"gerod.*\.zip"
 """Name of the archive of the paper's dataset."""
 MAX_DEPTH = 8
-"""Largest depth of folders below the given one."""
+"""Largest depth of folders below the given folder."""
 PREVIEW = 256
-"""Side of the reduced raster that the range of values is read from (cells)."""
+"""Side of the reduced raster from which the range of values is read (cells)."""
 RUN_FILE = "run.json"
-"""Name of the file of a run's folder; `record.RECORD`, whose module would be slow to import."""
+"""Name of the file in a run's folder: a copy of `record.RECORD`, because that module is slow to import."""
 FEW_VALUES = 40
 """Largest number of distinct values of a mask or land cover."""
 
@@ -47,7 +47,7 @@ SUFFIXES = {
     "photo": (".jpg", ".jpeg"),
     "archive": (".zip", ".7z", ".tar", ".tgz", ".rar"),
 }
-"""Kind -> endings of its files; a raster's layer is then told by its name."""
+"""Kind -> endings of its files. The layer of a raster then follows from its name."""
 ROADS = r"road|street|stra(ss|ß)e|highway|carriage|route|centre.?line|center.?line|osm"
 """Words in names of vector files and their layers that mean roads."""
 QUESTIONS = {
@@ -55,48 +55,48 @@ QUESTIONS = {
     "raster": "is it a DSM (--dsm), a DTM (--dtm), an orthophoto (--dop) or a road mask (--road-mask)?",
     "archive": "unpack it first",
 }
-"""Kind of a file that no command takes as it is -> what the user must decide or do."""
+"""Kind of a file that no command accepts -> what the user must decide or do."""
 NO_CRS = "it has no CRS: which is it (--crs)?"
 
 
 LAYERS = ("dsm", "dtm", "road_height", "dop", "road_mask")
-"""Layers that rasters are given for."""
+"""Layers with rasters."""
 LAYER = "|layername=NAME to --roads, in quotes, with the layer of the roads"
 """What to add for a vector file of several layers."""
 
 
 @dataclass(frozen=True)
 class Download:
-    """One file and what it looks like."""
+    """One file and its probable kind."""
 
     path: Path
     kind: str
     """A layer of the catalog, or a key of `SUFFIXES` or `QUESTIONS`."""
     about: str = ""
-    """Bands, type, range of values, CRS, as far as the kind has them."""
+    """Bands, type, range of values, CRS, if the kind has them."""
     crs: str | None = None
-    """Of rasters and clouds: the short name of their CRS, None if the file has none."""
+    """For rasters and clouds: the short name of their CRS; None without a CRS."""
     question: str = ""
-    """What the user must decide; empty if nothing."""
+    """What the user must decide; may be empty."""
     metric: bool = True
     """False for a raster whose CRS is in feet or degrees."""
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A command that makes a catalog, and what is still open."""
+    """A command that makes a catalog, and its missing parts."""
 
     command: str
     catalog: Path
     """The catalog that it makes."""
     roads: str = ""
-    """The layer of roads that the catalog will have; empty if that is not known before."""
+    """The layer of roads that the catalog will have; empty if unknown."""
     open: str = ""
-    """What the user must add to the command; empty if nothing."""
+    """What the user must add to the command; may be empty."""
 
 
 def look(folder: Path) -> tuple[list[Download], bool]:
-    """Return the downloads below a folder, by path, and whether the folder has more files than looked at."""
+    """Return the downloads below a folder, by path, and whether the folder has more files than were read."""
     if not folder.is_dir():
         raise CatalogError(f"folder {folder} does not exist; name the folder of the downloads")
     kinds = {suffix: kind for kind, suffixes in SUFFIXES.items() for suffix in suffixes}
@@ -117,9 +117,9 @@ def look(folder: Path) -> tuple[list[Download], bool]:
 
 
 def gerod(folder: Path) -> list[str]:
-    """Return what a folder has of the paper's dataset, what it lacks, and the command that makes its catalog.
+    """Return the present and the missing parts of the paper's dataset, and the command for its catalog.
 
-    Empty if the folder has none of the tiles that the paper names, and no archive of the dataset.
+    Empty if the folder has no tile that the paper names, and no archive of the dataset.
     """
     archives = [path for path in sorted(folder.glob("*")) if re.fullmatch(GEROD_ZIP, path.name.lower())]
     found, _ = layouts.find(folder)
@@ -174,7 +174,7 @@ def _raster(path: Path, folder: Path) -> Iterator[Download]:
 
 
 def _of_mask(values: str) -> str:
-    """Return the question about a mask with these values; empty if every value but 0 can be road."""
+    """Return the question about a mask with these values; empty if every value except 0 can be road."""
     if not values:
         return "it is named like a mask, but has many values: is it one?"
     if len(set(values.split(", ")) - {"0"}) <= 1:
@@ -232,7 +232,7 @@ def proposals(folder: Path, found: Sequence[Download]) -> Iterator[Proposal]:
         lacking += [LAYER] if roads and by_kind["roads"][0].question else []
         lacking += ["--crs"] if kind == "points" and crs is None else []
         catalog = out / "catalog.parquet"
-        # Areas become a road mask, lines stay vectors: the command itself says what comes next.
+        # Areas become a road mask, lines stay vectors: the command prints the next step.
         yield Proposal(shlex.join(words), catalog, "", _listed(lacking))
 
 
@@ -241,7 +241,7 @@ def _title(folder: Path) -> str:
 
 
 def _roads(by_kind: Mapping[str, Sequence[Download]]) -> list[str]:
-    """Return the option that names the vector file of roads, if there is just one."""
+    """Return the option that names the vector file of roads, if there is only one."""
     files = by_kind["roads"]
     return ["--roads", str(files[0].path.absolute())] if len(files) == 1 else []
 
@@ -257,26 +257,26 @@ def _sources(
     for crs in dict.fromkeys(cloud.crs for cloud in clouds):
         files = [cloud.path for cloud in clouds if cloud.crs == crs]
         others = meshes | {cloud.path.parent for cloud in clouds if cloud.crs != crs}
-        # A folder stands for its files if they belong together.
+        # A folder is given instead of its files if they belong together.
         names = dict.fromkeys(file if file.parent in others else file.parent for file in files)
         yield "points", list(names), crs
     for mesh in by_kind["mesh"]:
         yield "mesh", [mesh.path], None
-    # Images beside points or a mesh are previews or textures.
+    # Images next to points or a mesh are previews or textures.
     beside = meshes | {cloud.path.parent for cloud in clouds}
     if photos := {photo.path.parent for photo in by_kind["photo"]} - beside:
         yield "photos", sorted(photos), None
 
 
 def _of_rasters(folder: Path, by_kind: Mapping[str, Sequence[Download]]) -> Iterator[Proposal]:
-    """Yield a command for the rasters of each CRS, or one for all if the surface models have the same.
+    """Yield a command for the rasters of each CRS, or one command if all surface models have the same CRS.
 
-    Downloads of Geobasis NRW have a command of their own.
+    Downloads of Geobasis NRW have a separate command.
     """
     rasters = [download for layer in LAYERS for download in by_kind[layer]]
     systems = dict.fromkeys(download.crs for download in rasters if download.kind in ("dsm", "dtm"))
     surfaces = dict.fromkeys(download.crs for download in by_kind["dsm"])
-    # A layer in another CRS is warped onto the only one of the surface models.
+    # A layer in another CRS is warped to the only CRS of the surface models.
     mixed = len(surfaces) == 1 and any(d.crs not in (None, *surfaces) for d in rasters)
     for number, crs in enumerate(surfaces if mixed else systems):
         chosen = [d for d in rasters if d.crs == crs or (mixed and d.crs is not None)]
@@ -315,14 +315,14 @@ def _listed(lacking: Sequence[str]) -> str:
 
 
 def _pattern(folder: Path, paths: Sequence[Path]) -> str | None:
-    """Return a pattern relative to a folder that matches these files and no others, None if there is none."""
+    """Return a pattern relative to a folder that matches exactly these files; None if no pattern does."""
     names = sorted(path.relative_to(folder).as_posix() for path in paths)
     if len(names) == 1:
         return glob.escape(names[0])
     start = os.path.commonprefix(names)  # noqa: RUF071 (of characters)
     end = os.path.commonprefix([name[::-1] for name in names])[::-1]  # noqa: RUF071
     above = start[: start.rfind("/") + 1]
-    # Whole names are replaced first: what next year's files have in common with these is not known.
+    # Whole names are replaced first: names of later files may have no part in common with these.
     for first, middle, last in (
         (above, "*", Path(names[0]).suffix),
         (start, "*", end),

@@ -61,19 +61,19 @@ else:
     pd = lazy("pandas")
 
 VERSION = 8
-"""Of the roads themselves: their division, lines, grids and errors."""
+"""Version of the division into roads, their lines, grids and errors."""
 INTERNAL = ["bounds", "lanes_assumed"]
 """Entries of a road's row that the report does not show."""
 SUMMARY = (
     *("crg_max_mm", "profiles_mean_mm", "profiles_max_mm", "elevation_mean_mm", "elevation_max_mm"),
     *("crg_steps_max_mm", "carriageway_steps_max_mm", "tile_steps_max_mm"),
 )
-"""Errors in the summary: means over the length of the roads, largest ones over all."""
+"""Errors in the summary: means over the length of the roads, and maxima over all roads."""
 REPORT = "roads.csv"
 MOST_NAMED = 3
 """Number of roads that a message names."""
 SHOWN_M = 10.0
-"""Length of centre lines left out from which the user is told (m); the ends of routes are always a bit."""
+"""The user is told if more of the centre lines is left out (m). Short ends of routes are always left out."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Work:
     vertical: str | None
     left_hand: bool = False
     crg: str | None = None
-    """Folder of the OpenCRG files, relative to the OpenDRIVE file; None if it refers to none."""
+    """Folder of the OpenCRG files, relative to the OpenDRIVE file; None if OpenCRG is not exported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class RouteUnit:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Name of its lines and of the surfaces below."""
+        """Hash of its lines and of the surfaces below."""
         text = sha256(repr(self.tiles).encode())
         for part in self.route.parts:
             text.update(repr((part.width_m, part.lanes, part.oneway, part.name)).encode())
@@ -128,7 +128,7 @@ class RouteUnit:
         """Return the largest step between the tiles below a road (m); 0 on one tile.
 
         - `v` ``(m,)``: distances from the line.
-        - `inside` ``(n, m)``: the places beside the line's points that count.
+        - `inside` ``(n, m)``: the places beside the line's points that are compared.
         """
         x, y = line.beside(v)
         index: NDArray[np.intp] = np.where(inside, np.arange(x.size).reshape(x.shape), -1)
@@ -152,11 +152,11 @@ class RouteUnit:
         return route_levels(self.route)
 
     def height(self, work: Work, steps: bool = False) -> HeightAt:
-        """Return, in the local frame, the surface without steps, or how much higher the one with steps is."""
+        """Return the surface in the local frame without steps, or only the height that the steps add."""
         return lambda x, y: self.sampler.on_road(*work.frame.to_run(x, y), self.levels(x, y), steps)
 
     def flags(self, line: ReferenceLine, work: Work) -> str:
-        """Return the flags that the carriageway of one of its roads passes, by name."""
+        """Return the names of the flags on the carriageway of a road."""
         v = across(line, 1.0, 0.0)
         x, y = line.beside(v)
         on = np.abs(v) <= line.width[:, None] / 2
@@ -165,12 +165,12 @@ class RouteUnit:
         return ", ".join(flag_names(bits))
 
     def road_id(self, part: int) -> int:
-        """Return the number of a road: OpenDRIVE's readers want whole numbers."""
+        """Return the number of a road; readers of OpenDRIVE need whole numbers."""
         return self.number * 1000 + part
 
 
 def units(roads: Network, tiles: Iterable[FinishedTile]) -> Iterator[RouteUnit]:
-    """Yield each route as soon as its last tile has passed."""
+    """Yield each route as soon as its last tile has been read."""
     waiting: defaultdict[int, list[int]] = defaultdict(list)
     passed: dict[int, GroundTile] = {}
     for number, touched in enumerate(roads.tiles):
@@ -200,7 +200,7 @@ def write_crg(
 def write_xodr(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
 ) -> dict[str, Any]:
-    """Write all roads as one OpenDRIVE file, which refers to the OpenCRG files if there are any."""
+    """Write all roads as one OpenDRIVE file. It refers to the OpenCRG files, if these are exported."""
     roads = network(source, options)
     crg = "../crg/" if "crg" in options.formats else None
     work = Work(roads.frame, source.vertical, options.left_hand, crg)
@@ -220,7 +220,7 @@ def write_xodr(
 
 
 def _without_crg(summary: Mapping[str, Any]) -> str:
-    """Return how far the profiles miss the surface, for the user; empty if that is not known."""
+    """Return a text for the user: the distance of the profiles from the surface; empty if unknown."""
     if summary["profiles_mean_mm"] is None:
         return ""
     errors = [
@@ -244,7 +244,7 @@ def write_units(
     folder: Location,
     executor: Executor,
 ) -> tuple[list[ManifestRow], str]:
-    """Write the files of each route; return their rows, in order, and a fingerprint of all of them."""
+    """Write the files of each route; return their rows, in order, and a fingerprint of all files."""
     whole = sha256(f"{version} {VERSION} {work}".encode())
 
     def counted() -> Iterator[RouteUnit]:
@@ -293,7 +293,7 @@ def _fragment(route: int) -> str:
 
 
 def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Profiles, ManifestRow]], str]:
-    """Return numbers, grids, profiles and rows of a route's roads, and why it has none."""
+    """Return numbers, grids, profiles and rows of a route's roads, or the reason why it has no road."""
     height, step = unit.height(work), unit.height(work, steps=True)
     line, problem = reference_line(unit)
     parts = [] if line is None else lines.usable(line, height(line.x, line.y))
@@ -307,7 +307,7 @@ def _roads(unit: RouteUnit, work: Work) -> tuple[list[tuple[int, HeightGrid, Pro
 
 
 def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
-    """Return the line of a route, or why it has none."""
+    """Return the line of a route, or the reason why it has no line."""
     try:
         line = lines.reference_line(unit.route)
     except TaskError as error:
@@ -316,7 +316,7 @@ def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
 
 
 def route_row(unit: RouteUnit, roads: list[ManifestRow], problem: str) -> ManifestRow:
-    """Return the row of a route: its roads, and why it has none."""
+    """Return the row of a route: its roads, or the reason why it has no road."""
     if not roads and not problem:
         problem = "no part of it has a surface for long enough"
     return {"route": unit.number, "roads": roads, "problem": problem}
@@ -327,13 +327,12 @@ def row(
 ) -> ManifestRow:
     """Return a road's row of the report.
 
-    - `height`, `step`: the surface without steps, and how much higher that with steps is, in the line's
-      coordinates.
+    - `height`, `step`: the surface without steps, and the height that steps add, in the line's coordinates.
     - `tile_step`: the largest step between the tiles below its carriageway (m).
     """
     line = grid.line
     (crg_median, crg_max), (mean, most) = grid_error(grid, height), profile_error(grid, fitted)
-    # CARLA and SUMO take the elevation alone, across a level road.
+    # CARLA and SUMO read only the elevation: their roads are level across.
     level_mean, level_most = profile_error(grid, Profiles(fitted.elevation, NONE))
     crg_steps, carriageway_steps = largest_steps(grid, step)
     half, lanes = float(line.width.max()) / 2, opendrive.lane_count(line)
@@ -367,12 +366,12 @@ def row(
 
 
 def millimetres(metres: float) -> float | None:
-    """Return a length in mm for JSON; None if it is not known."""
+    """Return a length in mm for JSON; None if unknown."""
     return round(metres * 1000, 3) if np.isfinite(metres) else None
 
 
 def report(folder: Location, rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
-    """Write the report of the roads, if it is new; return the summary for the manifest."""
+    """Write the report of the roads, if it has changed; return the summary for the manifest."""
     every = [road for row in rows for road in row["roads"]]
     table = pd.DataFrame(every, dtype=object).drop(columns=INTERNAL)
     data, file = csv_text(table).encode(), folder / REPORT
@@ -387,7 +386,7 @@ def report(folder: Location, rows: list[ManifestRow], roads: Network) -> dict[st
 
 
 def tile_faults(roads: list[ManifestRow]) -> list[str]:
-    """Return a line that names the roads on tiles that do not meet; empty if all tiles do."""
+    """Return a line that names the roads on tiles that do not meet; empty if all tiles meet."""
     name = "tile_steps_max_mm"
     apart = sorted(
         (road for road in roads if road[name] > 1000 * LARGEST_STEP_M), key=lambda road: -road[name]
@@ -405,7 +404,7 @@ def tile_faults(roads: list[ManifestRow]) -> list[str]:
 
 
 def lane_notes(rows: list[ManifestRow]) -> list[str]:
-    """Return notes on roads with lanes of unusual width, and on those divided into lanes by their width."""
+    """Return notes on roads with lanes of unusual width, and on roads divided into lanes by their width."""
     every = [road for row in rows for road in row["roads"]]
     assumed = [road for road in every if road["lanes_assumed"]]
     lane_m = [road["width_m"] / road["lanes"] for road in every]
@@ -427,7 +426,7 @@ def lane_notes(rows: list[ManifestRow]) -> list[str]:
 
 
 def totals(rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
-    """Return number, length and flags of the roads, and what was left out of centre lines on the tiles."""
+    """Return number, length and flags of the roads, and the length of centre lines left out on the tiles."""
     length = sum(road["length_m"] for row in rows for road in row["roads"])
     flagged = {str(road["id"]): road["flags"] for row in rows for road in row["roads"] if road["flags"]}
     return {
@@ -441,7 +440,7 @@ def totals(rows: list[ManifestRow], roads: Network) -> dict[str, Any]:
 
 
 def with_line(figures: Mapping[str, Any], error: str = "") -> dict[str, Any]:
-    """Return figures with a line for the user, the summary: number and length of the roads, their error."""
+    """Return figures with a summary line for the user: number and length of the roads, their error."""
     text = f"{count(figures['roads'], 'road')}, {figures['length_m'] / 1000:.2f} km"
     if figures["left_out_m"] >= SHOWN_M:
         text += f", {figures['left_out_m'] / 1000:.2f} km of centre lines left out"
@@ -451,7 +450,7 @@ def with_line(figures: Mapping[str, Any], error: str = "") -> dict[str, Any]:
 
 
 def _of_all(roads: list[ManifestRow], key: str) -> float | None:
-    """Return the mean over the length of the roads, or the largest value; None if it is not known."""
+    """Return the mean over the length of the roads, or the largest value; None if unknown."""
     known = [road for road in roads if road[key] is not None]
     if "_mean_" not in key:
         return max((road[key] for road in known), default=None)

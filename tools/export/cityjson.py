@@ -1,8 +1,7 @@
 """The meshes of a run as CityJSON text sequence (CityJSONSeq 2.0): a header line, then two lines per tile.
 
-A line is a feature with one city object, since a feature has one main object: ``Road``, a MultiSurface of
-triangles that are all traffic areas, or ``TINRelief``, a CompositeSurface. Vertices are whole millimetres
-from the origin in the header.
+A line is a feature with one city object. ``Road`` is a MultiSurface of triangles that are all traffic areas.
+``TINRelief`` is a CompositeSurface. Vertices are whole millimetres from the origin in the header.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ NAME = ".city.jsonl"
 SCALE_M = 0.001
 """Unit of the vertices (m): a coordinate is exact to half of it."""
 LOD = "2"
-"""Level of detail: geometry without furniture and lanes."""
+"""Level of detail: geometry without street furniture and lanes."""
 AUTHORITY = "https://www.opengis.net/def/crs/EPSG/0/"
 
 Whole = NDArray[np.int64]
@@ -32,8 +31,8 @@ Whole = NDArray[np.int64]
 def header(system: str, origin: tuple[float, float, float], vertical: str | None = None) -> bytes:
     """Return the first line: version, transform and CRS.
 
-    The CRS is the compound one if the EPSG register has it, else the horizontal one alone: CityJSON has no
-    place for two codes. The vertical CRS is then an attribute of the city objects.
+    The CRS is the compound CRS if the EPSG register has it, else the horizontal CRS: CityJSON allows only one
+    code. The vertical CRS is then an attribute of the city objects.
     """
     plan = crs.code(system)
     if plan is None:
@@ -56,12 +55,10 @@ def header(system: str, origin: tuple[float, float, float], vertical: str | None
 def features(
     tile_id: str, mesh: Mesh, origin: tuple[float, float, float], vertical: str | None = None
 ) -> bytes:
-    """Return the lines of one tile: its road and its terrain, or one of them if the other has no face.
+    """Return the lines of one tile: its road and its terrain; a class without faces has no line.
 
-    A deck is a bridge, and a tunnel a tunnel, with the number of its level as attribute.
-
-    Vertices that round to the same millimetres are one vertex, and faces that two of them share are left out:
-    they have no area.
+    Decks are bridges; they and tunnels have the number of their level as attribute. Vertices that round to
+    the same millimetres are one vertex. Faces that lose their area by that are left out.
 
     - `tile_id`: id of the tile, from which the ids of the city objects are made.
     """
@@ -94,7 +91,7 @@ def features(
 
 
 def _parts(whole: Whole, faces: NDArray[np.int32]) -> tuple[Whole, Whole]:
-    """Return the different vertices of faces with an area, and the faces in numbers of those vertices."""
+    """Return the different vertices of faces with an area, and these faces as indices of the vertices."""
     _, number = np.unique(whole, axis=0, return_inverse=True)
     a, b, c = number.reshape(-1)[faces].T
     kept = faces[(a != b) & (b != c) & (c != a)]

@@ -68,7 +68,7 @@ def export(
 ) -> None:
     """Write finished tiles in the formats of other programs.
 
-    The same command goes on after an interruption. FOLDER/export.json says what was written.
+    The same command continues after an interruption. FOLDER/export.json lists the written files.
     """
     chosen = replace(chosen, datum=None if vertical is None else Datum.of(vertical))
     folder = parse_location(output)

@@ -1,6 +1,6 @@
-"""Write exports of a run in several formats, and the manifest that says what they are.
+"""Write exports of a run in several formats, and the manifest that describes them.
 
-The folder lies outside the run, and one export at a time writes it; existing files of others stay.
+The folder lies outside the run. One export at a time writes it. Files that no export wrote stay.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from flexroad.tools.export.formats import FORMATS, Format
 from flexroad.tools.export.source import Options, Source
 
 SAME = ("variant", "crs", "tiles", "results")
-"""Entries of the manifest that two exports into one folder have in common if both are of the same results."""
+"""Entries of the manifest that are equal if two exports into one folder have the same results."""
 DATUM_REMEDY = (
     "needs heights above the ellipsoid of WGS 84, and the heights of a run are above a vertical datum; say "
     "which: --vertical EPSG:N (PROJ needs its grid), --vertical FILE (.gtx or .tif), or --vertical METRES"
 )
 MANIFEST = "export.json"
 BEGUN = ".flexroad-export"
-"""File with the formats of the folder: written first, so that an interrupted export is known, too."""
+"""File with the formats of the folder. It is written first, so that it also names interrupted exports."""
 
 
 def export(
@@ -58,7 +58,7 @@ def export(
     track: Track = untracked,
     notify: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Write the formats, each into a folder of its name, and the manifest last; return the manifest."""
+    """Write each format into a folder of its name, and the manifest last; return the manifest."""
     chosen = check_formats(formats, options)
     options = replace(options, formats=frozenset(chosen))
     if options.drape and all(tile.layer("dop") is None for tile in source.tiles):
@@ -137,7 +137,7 @@ def _head(source: Source, options: Options) -> dict[str, Any]:
 def _earlier(
     out: Location, source: Source, options: Options, chosen: Collection[str], notify: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Return what the manifest says of other formats in the folder, if they are of the same results."""
+    """Return the manifest's entries of other formats in the folder, if they are from the same results."""
     try:
         manifest = json.loads(read(out / MANIFEST))
         others = {name: dict(entry) for name, entry in manifest["formats"].items() if name not in chosen}
@@ -191,7 +191,7 @@ def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[st
 
 
 def _begun(out: Location, formats: Collection[str]) -> set[str]:
-    """Return the formats of the folder that this or an earlier export has written or begun."""
+    """Return the formats of the folder that this or an earlier export has begun."""
     begun = exists(out / BEGUN)
     if not begun and exists(out / MANIFEST):
         raise ConfigError(f"{out / MANIFEST} is not of an export; choose another folder with -o")
@@ -202,7 +202,7 @@ def _begun(out: Location, formats: Collection[str]) -> set[str]:
 
 
 def remove_unfinished(folder: Location, below: bool = False) -> None:
-    """Remove temporary files that an export which was killed has left in a folder; a bucket has none.
+    """Remove temporary files of a killed export from a folder; a bucket has no such files.
 
     - `below`: whether folders inside it are searched, too.
     """
@@ -213,5 +213,5 @@ def remove_unfinished(folder: Location, below: bool = False) -> None:
 
 
 def file_sizes(folder: Location) -> dict[str, int]:
-    """Return the size of each file of a format (bytes), without those that only an export reads."""
+    """Return the size of each file of a format (bytes), without files that only an export reads."""
     return {path: stat.size for path, stat in listing(folder).items() if not path.startswith(".")}

@@ -47,7 +47,7 @@ from flexroad.tools.export.tile_outputs import (
 MATERIALS = "materials.mtl"
 """Name of the file of materials that all OBJ files share."""
 BEYOND = "a part of the surface is beyond the survey (beyond_survey_m2)"
-OF_LEVEL_0 = "the surface is that of level 0, which within 20 m of abutments is not the road's"
+OF_LEVEL_0 = "the surface is the ground (level 0), which within 20 m of abutments is not the road's"
 CUT = "surface cut to the rectangle that the survey covers"
 NO_PHOTO = "no orthophoto, in plain colours"
 
@@ -67,7 +67,7 @@ def cityjson_part(tile: FinishedTile, place: Georeference) -> TileOutput:
 def obj_output(
     tile: FinishedTile, place: Georeference, materials: str = MATERIALS, photo: Bounds | None = None
 ) -> TileOutput:
-    """Return the mesh as OBJ, and its place as JSON and, for GIS programs, as ``.prj``."""
+    """Return the mesh as OBJ, and its place as JSON and as ``.prj`` for GIS programs."""
     mesh, name = tile.mesh, safe_name(tile.id)
     files = {
         f"{name}{obj.NAME}": obj.encode(mesh, materials, place, photo),
@@ -78,7 +78,7 @@ def obj_output(
 
 
 def draped_obj_output(tile: FinishedTile, place: Georeference) -> TileOutput:
-    """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
+    """Return the mesh as OBJ with its own materials, its place, and its photo if it has one."""
     image, name = texture_of(tile), safe_name(tile.id)
     materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
     output = obj_output(tile, place, materials, image.bounds if image else None)
@@ -92,10 +92,10 @@ def draped_obj_output(tile: FinishedTile, place: Georeference) -> TileOutput:
 def _error_m(tile: FinishedTile, unit_m: float) -> float:
     """Return the largest vertical distance of a file's vertices from the surface through the mesh's (m).
 
-    A coordinate that is rounded in plan may be in another cell, with another step. Between the two places the
-    surface therefore counts without its steps.
+    Rounding in plan may move a vertex to another cell with another step. So the heights at the exact and the
+    rounded place are compared without steps.
 
-    - `unit_m`: of this unit the coordinates of a file are multiples (m).
+    - `unit_m`: the coordinates of a file are multiples of this unit (m).
     """
     points = tile.mesh.vertices + tile.mesh.origin
     written = np.rint(points / unit_m) * unit_m
@@ -109,10 +109,10 @@ def _error_m(tile: FinishedTile, unit_m: float) -> float:
 
 
 def step_output(tile: FinishedTile, place: Georeference) -> TileOutput:
-    """Return the surface as STEP, cut to what the survey covers of the tile, and its place as JSON."""
+    """Return the surface as STEP, cut to the part that the survey covers, and its place as JSON."""
     surface, source, name = tile.surface, tile.tile, safe_name(tile.id)
     if not isinstance(surface, NurbsSurface):
-        raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
+        raise ConfigError("its surface is not a NURBS surface, as STEP needs; leave out step")
     bounds, beyond_m2 = step.covered(tile.road)
     steps_m = 0.0
     if isinstance(surface, SteppedSurface):
@@ -130,7 +130,7 @@ def step_output(tile: FinishedTile, place: Georeference) -> TileOutput:
 
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]
-"""Writes a format of the tiles into a folder; returns what the manifest says of it besides, if anything."""
+"""Writes a format of the tiles into a folder; returns more entries for the manifest, if any."""
 
 Check = Callable[[Source, Options], object]
 
@@ -143,15 +143,15 @@ class Format:
     write: Write
     version: int
     precision_m: float | None
-    """Largest distance of a point from the run's mesh or surface (m); None if its files or figures say it."""
+    """Largest distance of a point from the run's mesh or surface (m); None if its files give it."""
     needs_datum: bool = False
     """Whether heights above the ellipsoid are needed."""
     check: Check | None = None
-    """Raises an error, before anything is written, if the format cannot be."""
+    """Raises an error, before anything is written, if the format cannot be written."""
     of_meshes: bool = False
-    """Whether it has the run's meshes; the manifest then says how far they are from their surfaces."""
+    """Whether it has the run's meshes; then the manifest has their distances from the surfaces."""
     of_roads: bool = False
-    """Whether its files are roads; it then names those on tiles that do not meet."""
+    """Whether its files are roads; then roads on tiles that do not meet are named."""
 
 
 def write_landxml(
@@ -189,7 +189,7 @@ def write_cityjson(
 def write_obj(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
 ) -> dict[str, Any]:
-    """Write each mesh as OBJ: all with one file of materials, or each with its own and a photo."""
+    """Write each mesh as OBJ: with one file of materials for all, or each with its own file and a photo."""
     if not options.drape:
         write(folder / MATERIALS, obj.encode_materials())
         return _write_each(obj.VERSION, obj_output, source, tiles, folder, options, executor)
@@ -215,7 +215,7 @@ def _write_each(
     options: Options,
     executor: Executor,
 ) -> dict[str, Any]:
-    """Write a format that has files of its own for each tile."""
+    """Write a format with separate files for each tile."""
     return figures(write_outputs(tiles, folder, version, encode, source.place, executor))
 
 

@@ -1,4 +1,4 @@
-"""Coordinates of exported files: relative to an origin, in a local projection, and on the ellipsoid.
+"""Coordinates of exported files: relative to an origin, in a local projection, or on the ellipsoid.
 
 Simulators take coordinates as metres on the ground. UTM is 0.04% off, and its large numbers do not fit in
 float32. In the local projection of the road formats the central meridian runs through the area, and its scale
@@ -30,7 +30,7 @@ from flexroad.tasks.types import Floats
 DIGITS = 5
 """Digits of the origin's longitude and latitude (degrees): about 1 m."""
 ELLIPSOIDS = {"GRS 1980": "GRS80", "WGS 84": "WGS84"}
-"""Ellipsoids that programs take as that of GNSS, with PROJ's names."""
+"""Ellipsoids that programs take for the ellipsoid of GNSS, with PROJ's names."""
 GEOGRAPHIC, GEOCENTRIC = "EPSG:4979", "EPSG:4978"
 """WGS 84 as longitude, latitude and ellipsoidal height, and as coordinates from the Earth's centre."""
 
@@ -40,26 +40,26 @@ class Georeference:
     """The place of local coordinates, in metres."""
 
     crs: str
-    """CRS in metres: ``EPSG:25832``, or WKT where there is no code."""
+    """CRS in metres: ``EPSG:25832``, or WKT if it has no code."""
     origin: tuple[float, float, float]
     """Easting, northing and height that local coordinates are relative to (m)."""
     vertical: str | None = None
-    """CRS of the heights, or None if it is not known."""
+    """CRS of the heights; None if unknown."""
 
     def lines(self) -> list[str]:
-        """Return origin and CRSs as lines of ASCII text, for comments."""
+        """Return origin, CRS and vertical CRS as lines of ASCII text, for comments."""
         texts = [
             f"origin {' '.join(f'{v:.15g}' for v in self.origin)} (easting northing height, m)",
-            f"crs {' '.join(self.crs.split())}",  # WKT may hold line breaks, which would end a comment
+            f"crs {' '.join(self.crs.split())}",  # line breaks in WKT would end a comment
             f"vertical crs {' '.join(self.vertical.split()) if self.vertical else 'unknown'}",
         ]
         return [text.encode("ascii", "backslashreplace").decode() for text in texts]
 
     def sidecar(self, axes: str, **more: object) -> bytes:
-        """Return a JSON document with the place, the meaning of the axes, and other entries.
+        """Return the place as JSON, with the meaning of the axes and other entries.
 
         - `axes`: directions and units of the file's axes.
-        - `more`: other entries; values that JSON has.
+        - `more`: other entries, with values of JSON.
         """
         content = {
             "crs": self.crs,
@@ -72,19 +72,19 @@ class Georeference:
         return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False).encode() + b"\n"
 
     def prj(self) -> bytes:
-        """Return the horizontal CRS as ``.prj`` file: WKT as ESRI writes it."""
+        """Return the horizontal CRS as a ``.prj`` file: WKT as ESRI writes it."""
         return crs_of.esri(self.crs).encode() + b"\n"
 
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """x to the east, y to the north (m) from a point; heights stay as they are."""
+    """x to the east, y to the north (m) from a point; heights are unchanged."""
 
     crs: str
     """CRS of the run."""
     longitude: float
     latitude: float
-    """The origin (degrees), in the datum of the run or, if its ellipsoid is another, in WGS 84."""
+    """The origin (degrees), in the run's datum, or in WGS 84 if programs do not know the run's ellipsoid."""
 
     @classmethod
     def around(cls, crs: str, easting: float, northing: float) -> LocalFrame:
@@ -97,7 +97,7 @@ class LocalFrame:
     def proj(self) -> str:
         """The projection as a PROJ string.
 
-        CARLA reads ``lat_0`` and ``lon_0`` alone; esmini rejects ``+no_defs``.
+        CARLA reads only ``lat_0`` and ``lon_0``; esmini rejects ``+no_defs``.
         """
         geodetic = _geodetic(self.crs)
         assert geodetic.ellipsoid is not None
@@ -128,7 +128,7 @@ def _plan(crs: str) -> CRS:
 
 
 def _geodetic(crs: str) -> CRS:
-    """Return the run's geographic CRS, or WGS 84 if programs would mistake its ellipsoid."""
+    """Return the run's geographic CRS, or WGS 84 if programs do not know its ellipsoid."""
     geodetic = _plan(crs).geodetic_crs
     known = geodetic is not None and geodetic.ellipsoid is not None and geodetic.ellipsoid.name in ELLIPSOIDS
     return geodetic if known and geodetic is not None else CRS.from_epsg(4326)
@@ -144,7 +144,7 @@ class Datum:
 
     @classmethod
     def of(cls, text: str) -> Datum:
-        """Return the datum that a user names: by a number of metres, the file of a geoid, or a CRS."""
+        """Return the datum that a user gives: a number of metres, the file of a geoid, or a CRS."""
         try:
             return cls("offset", f"{float(text):g}")
         except ValueError:
@@ -154,7 +154,7 @@ class Datum:
         if self.kind == "geoid" and not Path(self.value).is_file():
             raise CatalogError(f"--vertical {self.value} does not exist")
         if self.kind == "offset" and not np.isfinite(float(self.value)):
-            raise CatalogError(f"--vertical {self.value} is no number of metres")
+            raise CatalogError(f"--vertical {self.value} is not a number of metres")
 
     @property
     def text(self) -> str:
@@ -191,7 +191,7 @@ class Datum:
 
 
 def geocentric(longitude: Floats, latitude: Floats, height: Floats) -> Floats:
-    """Return coordinates from the Earth's centre (m), ``(n, 3)``, of results of `Datum.geographic`."""
+    """Return geocentric coordinates (m), ``(n, 3)``, of results of `Datum.geographic`."""
     return np.stack(_transform(_exact(GEOGRAPHIC, GEOCENTRIC), longitude, latitude, height), axis=-1)
 
 
@@ -200,7 +200,7 @@ def _transform(transformer: Any, *axes: Floats) -> tuple[Floats, Floats, Floats]
     return x, y, z
 
 
-# A transformer takes longer to make than a tile to convert.
+# To make a transformer takes longer than to convert a tile.
 @lru_cache(maxsize=16)
 def _exact(source: str, target: str) -> Any:
     return Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)
@@ -208,7 +208,7 @@ def _exact(source: str, target: str) -> Any:
 
 @lru_cache(maxsize=16)
 def _geoid(file: str) -> Any:
-    """Return the conversion of a height above a geoid to one above the ellipsoid."""
+    """Return the conversion of heights above a geoid to heights above the ellipsoid."""
     return Transformer.from_pipeline(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
         f'+step +proj=vgridshift +grids="{Path(file).resolve()}" +multiplier=1 '

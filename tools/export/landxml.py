@@ -1,10 +1,10 @@
 """The meshes of a run as LandXML 1.2: two TIN surfaces, road and ground, for civil engineering programs.
 
-A file has one surface per class over all tiles, as such programs expect: with a surface per tile, 10,000 of
-them would have to be joined by hand. So the work has two steps: `part` makes what a single mesh gives, and
-`join` numbers the points of all parts. The points of a surface stand before its faces, so that both are
-collected in temporary files while the parts pass. The memory in use grows with the outline of the tiles
-written so far and not with their number: a vertex is remembered until the faces around it are complete.
+A file has one surface per class over all tiles: users would have to join surfaces of single tiles by hand.
+The work has two steps: `part` prepares a single mesh, and `join` numbers the points of all parts.
+In the file the points of a surface precede its faces. So both are first collected in temporary files.
+A vertex is kept in memory only until the faces around it are complete. So the memory grows with the outline
+of the tiles written so far, and not with their number.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ NAME = ".xml"
 NAME_COMPRESSED = ".xml.gz"
 
 DECIMALS = 4
-"""Decimals of coordinates (m): they are rounded to 0.05 mm."""
+"""Decimals of coordinates (m): the rounding error is at most 0.05 mm."""
 FULL_TURN = 2 * np.pi - 1e-6
-"""Sum of the angles around a vertex from which on its faces are complete (radians)."""
+"""The faces around a vertex are complete if the sum of their angles reaches this (radians)."""
 
 HEAD = """\
 <?xml version="1.0" encoding="UTF-8"?>
@@ -70,19 +70,19 @@ Place = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Project:
-    """What the head of a file says."""
+    """The head of a file."""
 
     name: str
     written: datetime
     """Date and time of the file, which the format requires."""
     vertical: str | None = None
-    """CRS of the heights, or None if it is not known."""
+    """CRS of the heights; None if unknown."""
     joined: bool = True
-    """Whether the meshes have common vertices at their borders, which the surfaces then share."""
+    """Whether neighbouring meshes have common vertices at their borders; then each is written once."""
 
 
 def part(mesh: Mesh, joined: bool = True) -> bytes:
-    """Return what a mesh gives to a file, all of it but the numbers of its points, as NumPy archive.
+    """Return the part of a mesh in a file, still without the numbers of its points, as NumPy archive.
 
     It has the arrays of `_part` of each level, named ``LEVEL.NAME``, and the CRS.
 
@@ -92,16 +92,16 @@ def part(mesh: Mesh, joined: bool = True) -> bytes:
     for level in mesh.numbers:
         arrays |= {f"{level}.{name}": values for name, values in _part(mesh.at(level), joined).items()}
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # its flags are named like no array
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # no array has the name of a flag
     return buffer.getvalue()
 
 
 def _part(mesh: Mesh, joined: bool) -> Arrays:
-    """Return what the mesh of one level gives to a file.
+    """Return the part of the mesh of one level in a file.
 
-    - `places` ``(R, 3)``: the vertices at its rim: easting, northing, height in units of the last decimal.
+    - `places` ``(R, 3)``: vertices at its rim: easting, northing, height in units of the last decimal.
     - `angles` ``(R,)``: sums of the angles in plan of the faces around them (radians).
-    - `points0`, `points1`: of road and of ground the end of the line of each point, from its northing on.
+    - `points0`, `points1`: for road and ground, the text of each point's line from the northing on.
     - `corners0`, `corners1` ``(k, 3)``: numbers of points, from 0.
     - `rim0`, `rim1` ``(r, 2)``: the number of each point at the rim, and its row in `places`.
     - `limits0`, `limits1` ``(2,)``: lowest and highest height (m).
@@ -139,10 +139,10 @@ def join(
     Points are "northing easting height", absolute, in metres, rounded to 0.05 mm. Faces are counter-clockwise
     from above. A class without faces has no surface. Equal inputs give equal bytes.
 
-    - `parts_of_meshes`: of `part`, in any order, all in one CRS; each is read once. Memory is least if
-      neighbours follow each other.
+    - `parts_of_meshes`: results of `part`, all in one CRS, in any order; each is read once. Least memory is
+      used if neighbours follow each other.
     - `folder`: folder of the temporary files, which need as much space as the uncompressed file; by default
-      that of the system.
+      the system's folder.
     """
     with ExitStack() as stack:
         surfaces = dict[int, list[_Surface]]()
@@ -174,7 +174,7 @@ def join(
 
 
 def _collect(parts_of_meshes: Iterable[bytes], surfaces_of: Callable[[int], list[_Surface]]) -> str:
-    """Add the faces of all parts to the surfaces of their level; return the meshes' CRS."""
+    """Add the faces of all parts to the surfaces of their level; return the CRS of the meshes."""
     system = ""
     open_vertices: dict[int, dict[Place, _OpenVertex]] = {}
     for data in parts_of_meshes:
@@ -218,7 +218,7 @@ class _OpenVertex:
     angle: float = 0.0
     """Sum of the angles in plan of its faces (radians)."""
     numbers: list[int] = field(default_factory=lambda: [0, 0])
-    """Its numbers in the surfaces of road and ground; 0 where it is not in them."""
+    """Its numbers in the surfaces of road and ground; 0 if it is not in the surface."""
 
 
 def _rim(mesh: Mesh) -> NDArray[np.intp]:
@@ -257,7 +257,7 @@ class _Surface:
     high: float = -np.inf
 
     def add(self, part: Arrays, number: int, at_rim: Sequence[_OpenVertex]) -> None:
-        """Write the faces of a part, and those of their points that no part before has written.
+        """Write the faces of a part, and their points that no earlier part has written.
 
         - `number`: 0 for the road, 1 for the ground.
         """
@@ -295,7 +295,7 @@ class _Surface:
 
 
 def _write_rows(file: IO[bytes], row: bytes, columns: Sequence[Sequence[Any]]) -> None:
-    """Write columns of values, each of their rows in the same format."""
+    """Write columns of values, all rows in the same format."""
     file.write(b"".join(map(row.__mod__, zip(*columns, strict=True))))
 
 
@@ -305,7 +305,7 @@ def _copy(source: IO[bytes], target: IO[bytes]) -> None:
 
 
 def _coordinate_system(plan: str, vertical: str | None) -> str:
-    """Return the attributes of CoordinateSystem: EPSG code, or WKT where there is none."""
+    """Return the attributes of CoordinateSystem: EPSG code, or WKT if there is no code."""
     attributes = {"name": crs.name(plan), "horizontalDatum": crs.datum(plan)}
     epsg = crs.code(plan)
     attributes |= {"epsgCode": epsg} if epsg else {"ogcWktCode": " ".join(plan.split())}

@@ -1,8 +1,8 @@
 """Heights, normals, road and height source of a run, each as one cloud-optimised GeoTIFF over all its tiles.
 
-Cells are sampled from the surface at their centres. The values are collected in a temporary raster without
-compression, of which only the blocks with tiles exist, and copied to the final files when all tiles are
-there: GDAL writes overviews before the data, so that a file cannot grow tile by tile.
+Cells are sampled from the surface at their centres. The values are first collected in a temporary raster
+without compression; it has only the blocks with tiles. It is copied to the final file at the end: GDAL writes
+overviews before the data, so a file cannot grow tile by tile.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ rasterio = lazy("rasterio")
 
 VERSION = 1
 NORMAL_STEPS = 32767
-"""Value of a component of length 1."""
+"""Encoded value of a component of 1."""
 NO_NORMAL = -32768
 NO_ROAD = 255
 """Value of the road mask where no tile is finished."""
@@ -47,7 +47,7 @@ PART_CELLS = 2**20
 CACHE_BYTES = 128 * 2**20
 """Blocks that GDAL keeps in memory; its own default grows with the machine."""
 SAME_CELL = 1e-6
-"""Part of a cell by which positions may differ because of rounding."""
+"""Tolerance of positions for rounding (cells)."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class _Layer:
     """Name of the file, without suffix."""
     bands: tuple[cog.Band, ...]
     overviews: str
-    """How cells of an overview follow from finer ones."""
+    """How cells of an overview are computed from finer cells."""
 
 
 LAYERS = (
@@ -81,10 +81,10 @@ LAYERS = (
 def write_mosaics(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
 ) -> dict[str, Any] | None:
-    """Write one raster per quantity over all tiles; with a level, return it for the manifest."""
+    """Write one raster per quantity over all tiles; return the level, if one is given, for the manifest."""
     grid = whole_grid([tile.grid for tile in source.tiles], options.resolution_m)
     level, number = options.level, 0
-    # Drafts need the most space: they are beside the files, or on the local disk for a bucket.
+    # Drafts need the most space: they are next to the files, or on the local disk for a bucket.
     with ScratchFolder(folder if isinstance(folder, Path) else None) as scratch:
         drafts = Path(scratch)
         limits = {"GDAL_CACHEMAX": CACHE_BYTES, "CPL_TMPDIR": str(drafts)}
@@ -107,7 +107,7 @@ def write_mosaics(
 
 @contextmanager
 def _gdal(target: Location, **limits: Any) -> Iterator[None]:
-    """Set GDAL's limits, and raise its errors as those of the system."""
+    """Set GDAL's limits, and raise its errors as errors of the system."""
     try:
         with rasterio.Env(**limits):
             yield
@@ -116,7 +116,7 @@ def _gdal(target: Location, **limits: Any) -> Iterator[None]:
 
 
 def whole_grid(grids: Sequence[Grid], cell: float | None) -> Grid:
-    """Return the grid over all grids: on their own lattice, or on multiples of a cell size (m)."""
+    """Return the grid over all grids, on their lattice or on multiples of a cell size (m)."""
     if cell is None:
         whole = Grid.holding(grids)
         if whole is None:
@@ -162,14 +162,14 @@ def _draft(folder: Path, layer: _Layer, grid: Grid, source: Source) -> Any:
 
 
 _Shown = tuple[Surface, Bools, NDArray[np.uint8], int]
-"""What the rasters show of a tile: surface, filtered road cells on the grid of its road mask, height source.
+"""The content of the rasters on a tile: surface, filtered road cells on the grid of its mask, height source.
 
-Last is the level if it is a deck or tunnel; 0 if it is shown everywhere.
+The last entry is the level of a deck or tunnel, or 0 if the surface is shown everywhere.
 """
 
 
 def _shown(tile: FinishedTile, level: int | None) -> _Shown | None:
-    """Return what is shown of a level, or of the highest one if it is None; None if the tile lacks it."""
+    """Return the content for a level, or for the highest level if it is None; None if the tile lacks it."""
     surface, clusters, quality = tile.surface, tile.clusters, tile.quality
     if level is None:
         core = tile.tile.grid
@@ -208,7 +208,7 @@ def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile, shown: _Shown) 
         )
         window = rasterio.windows.Window(column, line, part.width, part.height)
         for raster, new in zip(rasters, values, strict=True):
-            # Where tiles overlap, a later one does not hide an earlier one by nodata.
+            # Where tiles overlap, nodata of a later tile does not replace values of an earlier tile.
             nodata = np.isnan(new) if np.isnan(raster.nodata) else new == raster.nodata
             raster.write(np.where(nodata, raster.read(window=window), new), window=window)
 
@@ -222,7 +222,7 @@ def encoded_normals(normals: Floats) -> NDArray[np.int16]:
 def _parts(grid: Grid, bounds: Bounds) -> Iterator[tuple[Grid, int, int]]:
     """Yield the cells of a grid with their centre in bounds, by bands of rows, with first column and row.
 
-    A centre on the western or northern edge belongs to the bounds, one on the other edges does not.
+    Centres on the western or northern edge are included; centres on the other edges are not.
     """
     west, south, east, north = bounds
     columns = _first(west - grid.west, grid.cell), _first(east - grid.west, grid.cell)
@@ -237,12 +237,12 @@ def _parts(grid: Grid, bounds: Bounds) -> Iterator[tuple[Grid, int, int]]:
 
 
 def _first(distance: float, cell: float) -> int:
-    """Return the first cell with its centre at a distance (m) from the edge, or beyond it."""
+    """Return the first cell whose centre is at least a distance (m) from the edge."""
     return math.ceil(distance / cell - 0.5 - SAME_CELL)
 
 
 def _cells(grid: Grid, eastings: Floats, northings: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return rows and columns of a grid under every pair of coordinates, as an open mesh."""
+    """Return the rows and columns of a grid under all pairs of coordinates, as an open mesh (`np.ix_`)."""
     rows, _ = grid.cells(eastings[:1], northings)
     _, columns = grid.cells(eastings, northings[:1])
     return rows[:, None], columns[None, :]
@@ -251,7 +251,7 @@ def _cells(grid: Grid, eastings: Floats, northings: Floats) -> tuple[NDArray[np.
 def _finish(draft: Path, path: Path, layer: _Layer) -> None:
     """Copy a draft to a cloud-optimised GeoTIFF with overviews, and read it once.
 
-    GDAL does not report blocks that it cannot write when it closes a file: only reading them shows it.
+    When GDAL closes a file, it does not report blocks that it could not write. Only reading shows them.
     """
     rasterio.shutil.copy(
         draft,

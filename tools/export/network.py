@@ -30,15 +30,15 @@ from flexroad.tools.export.source import Options, Source
 BEYOND_M = 25.0
 """Centre lines are cut this far beyond the tiles (m), so that their smoothing at the limit is the same."""
 SIDE_M = 3.0
-"""Width beside a road for which surfaces are needed, beyond that of its lines and grids (m)."""
+"""Surfaces are needed up to this distance beyond the lines and grids of a road (m)."""
 NAMES = ("name", "fullname", "stt_naam", "nam", "ref")
 """Columns with a road's name or number: OSM, TIGER, NWB, ATKIS; the first with a value wins."""
 DIRECTIONS = ("oneway", "one_way", "rijrichtng")
 """Columns with the direction of traffic: OSM, other tables, NWB."""
 FORWARD = ("yes", "true", "1", "1.0", "f", "h", "ft")
-"""Values of traffic only from the first point to the last: OSM, its shapefiles (F), NWB (H)."""
+"""Values for traffic only from the first to the last point: OSM, its shapefiles (F), NWB (H)."""
 AGAINST = ("-1", "-1.0", "reverse", "t", "tf")
-"""Values of traffic only from the last point to the first; OSM's shapefiles and NWB have T."""
+"""Values for traffic only from the last to the first point; OSM's shapefiles and NWB have T."""
 ONE_WAY_CLASSES = ("motorway",)
 """Classes of OSM that are one-way unless a tag says otherwise."""
 JUNCTION, ROUNDABOUTS = "junction", ("roundabout", "circular")
@@ -50,7 +50,7 @@ class Network:
 
     frame: LocalFrame
     routes: tuple[Route, ...]
-    """In the frame."""
+    """Routes in the coordinates of the frame."""
     tiles: tuple[NDArray[np.intp], ...]
     """Per route, indices of the tiles that it touches, in the order of `Source.tiles`."""
     lengths: tuple[float, ...]
@@ -59,7 +59,7 @@ class Network:
     """Number of road polygons that were left out."""
     notes: tuple[str, ...]
     levels: bool = False
-    """Whether the run has levels, and one of the roads is on a deck or in a tunnel."""
+    """Whether the run has levels, and a road is on a deck or in a tunnel."""
 
 
 @lru_cache(maxsize=1)
@@ -159,7 +159,7 @@ def _clipped(lines: tuple[CentreLine, ...], ground: shapely.Geometry) -> list[Ce
 
 
 def _frame(source: Source) -> LocalFrame:
-    """Return the frame around the selected tiles, finished or not: it stays as tiles are finished."""
+    """Return the frame around the selected tiles. Unfinished tiles are used, too: so it does not change."""
     left_out = set(source.left_out)
     selected = [tile for tile in source.run.catalog.usable if tile.id in left_out]
     west, south, east, north = union([tile.grid.bounds for tile in (*source.tiles, *selected)])
@@ -172,7 +172,7 @@ class CentreLines:
 
     lines: tuple[CentreLine, ...]
     areas: int
-    """Number of road polygons, which have no centre line and are left out."""
+    """Number of road polygons; they are left out because they have no centre line."""
     notes: tuple[str, ...] = ()
 
 
@@ -181,7 +181,7 @@ def read_centre_lines(
 ) -> CentreLines:
     """Return the centre lines whose boxes touch an area.
 
-    - `places`: west, south, east and north (m, in ``crs``) by vector files; equal lines of several are one.
+    - `places`: bounds (m, in ``crs``) by vector file. A line that several files have is returned once.
     - `levels`: whether to read levels. Roads below level 0 are then kept, whatever ``options.tunnels`` says.
     """
     names = (*rasterise.columns(options), *NAMES, *DIRECTIONS, JUNCTION)
@@ -220,7 +220,7 @@ def from_table(table: Any, options: rasterise.Options, levels: bool = False) -> 
 
 
 def _direction(table: Any, classes: NDArray[np.object_]) -> NDArray[np.int8]:
-    """Return 1, -1 or 0 per row: traffic only along the line, only against it, or both."""
+    """Return 1, -1 or 0 per row: traffic along the line, against it, or both."""
     values = [value.lower() for value in _texts(table, DIRECTIONS)]
     implied = np.isin(classes, ONE_WAY_CLASSES)
     implied |= np.isin([value.lower() for value in _texts(table, (JUNCTION,))], ROUNDABOUTS)
@@ -230,7 +230,7 @@ def _direction(table: Any, classes: NDArray[np.object_]) -> NDArray[np.int8]:
 
 
 def _texts(table: Any, names: tuple[str, ...]) -> list[str]:
-    """Return the first value of each row, as text; empty if no column has one."""
+    """Return the first value of each row, as text; empty if no column has a value."""
     texts = [""] * len(table)
     for name in names:
         for k, value in enumerate(table.get(name, ())):

@@ -1,8 +1,8 @@
-"""The mesh of a tile as Wavefront OBJ and MTL, with the orthophoto as its texture where there is one.
+"""The mesh of a tile as Wavefront OBJ and MTL, with the orthophoto as texture if the tile has one.
 
-Z is up, and the height. In plan coordinates are relative to a whole-metre origin that all tiles of a run
-share, since most readers compute in float32. The format has no CRS: origin and CRS are comments of the file,
-and entries of a JSON file beside it.
+Z is the height. Plan coordinates are relative to a whole-metre origin that all tiles of a run share, since
+most readers compute in float32. The format has no CRS: origin and CRS are comments in the file, and entries
+of a JSON file next to it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NAME_TEXTURE = ".jpg"
 
 AXES = "x east, y north, relative to origin; z height; metres"
 DECIMALS = 4
-"""Decimals of coordinates (m): they are rounded to 0.05 mm."""
+"""Decimals of coordinates (m): the rounding error is at most 0.05 mm."""
 COLOURS = {"road": (0.23, 0.23, 0.25), "terrain": (0.77, 0.745, 0.68)}
 """Red, green and blue of the classes without a texture, 0 to 1, sRGB."""
 
@@ -34,12 +34,12 @@ def encode(mesh: Mesh, materials: str, place: Georeference, photo: Bounds | None
 
     Decks and tunnels are groups ``level_1``, by the number of their level, with the material of roads.
 
-    Coordinates are rounded to 0.05 mm, texture coordinates to 5e-8 of the image. Faces are counter-clockwise
+    Rounding errors are at most 0.05 mm, of texture coordinates 5e-8 of the image. Faces are counter-clockwise
     from above. A class without faces has no group.
 
     - `materials`: name of the file of `encode_materials`, without a folder.
-    - `photo`: west, south, east and north of the outer edges of the image that the materials name (m); None
-      if they name none.
+    - `photo`: west, south, east and north of the outer edges of the materials' image (m); None without an
+      image.
     """
     head = [f"# {line}" for line in place.lines()]
     blocks = ["\n".join([*head, f"# axes {AXES}", f"mtllib {materials}", ""])]
@@ -68,11 +68,11 @@ def encode_materials(texture: str | None = None) -> bytes:
     for name, colour in COLOURS.items():
         shade = (1.0, 1.0, 1.0) if texture else colour
         lines += [f"newmtl {name}", f"Kd {shade[0]:g} {shade[1]:g} {shade[2]:g}", "Ks 0 0 0", "illum 1"]
-        # Without options such as -clamp, which many readers take for a part of the name.
+        # No options such as -clamp: many readers take them for a part of the name.
         lines += [f"map_Kd {texture}"] if texture else []
     return "\n".join([*lines, ""]).encode()
 
 
 def _rows(row: str, columns: Iterable[NDArray[Any]]) -> str:
-    """Return columns of numbers, each of their rows in the same format."""
+    """Return columns of numbers as text, all rows in the same format."""
     return "".join(map(row.__mod__, zip(*(column.tolist() for column in columns), strict=True)))

@@ -69,7 +69,7 @@ def encode(grid: HeightGrid, comment: str = "") -> bytes:
         raise TaskError(f"the road at {place} has no height: leave out roads beyond the surface")
     datum = float(np.round(grid.heights[known].mean()))
     phi = line.chord_headings
-    # In a comment ``$`` would begin a section.
+    # ``$`` in a comment would begin a section.
     texts = [printable(text).replace("$", "S").encode("ascii", "replace") for text in comment.splitlines()]
     short = [text[at : at + LINE] for text in texts for at in range(0, max(1, len(text)), LINE)]
     header = HEADER.format(
@@ -86,7 +86,7 @@ def encode(grid: HeightGrid, comment: str = "") -> bytes:
         sections="\n".join(f"D:long section {k + 1},m" for k in range(len(grid.v))),
         end=HEADER_END,
     )
-    # The heading of a row is that of the chord which ends there; readers do not use that of the first row.
+    # The heading of a row is the heading of the chord that ends there. Readers ignore it in the first row.
     rows = np.column_stack([np.concatenate([phi[:1], phi]), grid.heights - datum])
     filling = np.full(-rows.size % RECORD, np.nan)
     return header.encode("ascii") + np.concatenate([rows.ravel(), filling]).astype(">f4").tobytes()

@@ -1,8 +1,7 @@
 """Roads as OpenDRIVE 1.8: reference lines, profiles and lanes for driving simulators, beside OpenCRG.
 
-Roads are single: each begins and ends without a link, and there are no junctions. A road has its plan as
-paramPoly3, elevation and superelevation, lanes of the known width, and a reference to its OpenCRG file, which
-has the surface itself.
+Roads have no links and no junctions. A road has its plan as paramPoly3, elevation and superelevation, lanes
+of the known width, and a reference to its OpenCRG file. That file has the surface itself.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 VERSION = 3
 NAME = ".xodr"
 
-# CARLA and esmini read no <offset>: x and y are those of the projection.
+# CARLA and esmini do not read <offset>: x and y are in the projection.
 HEADER = """\
 <?xml version="1.0" encoding="UTF-8"?>
 <OpenDRIVE>
@@ -39,13 +38,13 @@ west="{west!r}" south="{south!r}" east="{east!r}" north="{north!r}">
 """
 FOOTER = "</OpenDRIVE>\n"
 NARROWEST_M, WIDEST_M = 2.0, 6.0
-"""Widths of lanes that roads may have (m): of roads whose number of lanes is not known, it is chosen so."""
+"""Least and largest width of a lane (m). They give the number of lanes of a road if it is unknown."""
 USUAL_M = 4.5
-"""Largest width of the lanes of a road that is divided into more of them (m)."""
+"""Largest width of the lanes of a road that is divided into more lanes (m)."""
 # CARLA's parser raises an error for a lane without a mark.
 NO_MARK = {"sOffset": "0.0", "type": "none", "weight": "standard", "color": "white", "laneChange": "none"}
 SAME_SLOPE = 1e-9
-"""Slopes of the width that differ by less belong to one piece."""
+"""Pieces whose slopes of the width differ by less become one piece."""
 
 
 def encode(
@@ -56,9 +55,9 @@ def encode(
     structures: Sequence[Structure] = (),
     left_hand: bool = False,
 ) -> bytes:
-    """Return one road as XML, for `write`.
+    """Return a road as XML, for `write`.
 
-    - `crg`: name of the OpenCRG file of the same line, relative to the OpenDRIVE file; None if it has none.
+    - `crg`: name of the line's OpenCRG file, relative to the OpenDRIVE file; None without such a file.
     """
     ends, lengths = line.pieces
     element = ET.Element("road", _attributes(name=printable(line.name), length=lengths[-1], id=name))
@@ -85,9 +84,9 @@ def encode(
 
 
 def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, name: str = "") -> None:
-    """Write roads, one after the other, to a file.
+    """Write roads to a file.
 
-    - `roads`: roads with different ids, each of `encode`.
+    - `roads`: results of `encode` with different ids.
     - `proj`: the roads' coordinate system as a PROJ string (`tools.export.georeference.LocalFrame.proj`).
     - `bounds`: west, south, east and north of the roads (m, in that system).
     """
@@ -101,10 +100,10 @@ def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, nam
 
 
 def lane_count(line: ReferenceLine) -> int:
-    """Return the number of lanes: the known one, else two, or one if the road is one-way.
+    """Return the number of lanes: the known number, else two, or one if the road is one-way.
 
-    There are more if these were wider than `WIDEST_M`, and one for both directions if they were narrower than
-    `NARROWEST_M`.
+    More lanes are assumed if these were wider than `WIDEST_M`. One lane for both directions is assumed if
+    they were narrower than `NARROWEST_M`.
     """
     if line.lanes:
         return line.lanes
@@ -115,7 +114,7 @@ def lane_count(line: ReferenceLine) -> int:
 
 
 def _objects(road: str, structures: Sequence[Structure]) -> ET.Element:
-    """Return the bridges and tunnels; the schema wants tunnels first, and a material of bridges."""
+    """Return the bridges and tunnels; the schema needs tunnels first, and a material of bridges."""
     objects = ET.Element("objects")
     for number, part in sorted(enumerate(structures, 1), key=lambda each: each[1].level > 0):
         kind = ("bridge", "concrete") if part.level > 0 else ("tunnel", "standard")
@@ -125,7 +124,7 @@ def _objects(road: str, structures: Sequence[Structure]) -> ET.Element:
 
 
 def _geometry(curve: PPoly, start: float, end: float, s: float, s_end: float) -> ET.Element:
-    """Return a piece of the plan: cubics over 0 to 1, in the axes of its own start and heading."""
+    """Return a piece of the plan: cubics over 0 to 1, in axes at its start and along its heading."""
     step = end - start
     derivatives = np.array([curve(start, order) * step**order / math.factorial(order) for order in range(4)])
     (x, y), ahead = derivatives[0], derivatives[1]
@@ -133,7 +132,7 @@ def _geometry(curve: PPoly, start: float, end: float, s: float, s_end: float) ->
     along = derivatives @ (math.cos(heading), math.sin(heading))
     left = derivatives @ (-math.sin(heading), math.cos(heading))
     geometry = ET.Element("geometry", _attributes(s=s, x=x, y=y, hdg=heading, length=s_end - s))
-    # The curve starts at the origin of these axes, along the first one.
+    # The curve starts at the origin of these axes, along the first axis.
     u = _attributes(aU=0.0, bU=along[1], cU=along[2], dU=along[3])
     v = _attributes(aV=0.0, bV=0.0, cV=left[2], dV=left[3])
     ET.SubElement(geometry, "paramPoly3", {**u, **v, "pRange": "normalized"})
@@ -141,10 +140,10 @@ def _geometry(curve: PPoly, start: float, end: float, s: float, s_end: float) ->
 
 
 def _lanes(line: ReferenceLine, left_hand: bool) -> ET.Element:
-    """Return the lanes, all of one width, with the carriageway's middle on the line.
+    """Return the lanes, all of equal width, with the middle of the carriageway on the line.
 
-    A road of several lanes in two directions has half of them on either side. A one-way road has all lanes on
-    the side on which traffic goes along the line, and so has a road with one lane for both directions.
+    A road of several lanes in two directions has half of them on either side. A one-way road, and a road with
+    one lane for both directions, has its lanes on the side where traffic goes along the line.
     """
     count = lane_count(line)
     one_sided = line.oneway or count == 1
@@ -152,7 +151,7 @@ def _lanes(line: ReferenceLine, left_hand: bool) -> ET.Element:
     right = count - left
     lanes = ET.Element("lanes")
     if left != right:
-        # Lane borders are counted from the line; the offset brings the outer borders to equal distances.
+        # Lanes start at the line; the offset brings the outer borders to equal distances from it.
         shift = (right - left) / count / 2
         for s, a, b in _linear(line, shift):
             ET.SubElement(lanes, "laneOffset", _attributes(s=s, a=a, b=b, c=0.0, d=0.0))
@@ -172,7 +171,7 @@ def _lanes(line: ReferenceLine, left_hand: bool) -> ET.Element:
 
 
 def _linear(line: ReferenceLine, factor: float) -> Iterator[tuple[float, float, float]]:
-    """Return s, value and slope of the linear pieces of a multiple of the width."""
+    """Return s, value and slope of the linear pieces of the width, multiplied by a factor."""
     value: Floats = factor * line.width
     slope = np.diff(value) / np.diff(line.s)
     begins = np.concatenate([[True], np.abs(np.diff(slope)) > SAME_SLOPE])
@@ -183,9 +182,9 @@ def _linear(line: ReferenceLine, factor: float) -> Iterator[tuple[float, float, 
 def crg_reference(line: ReferenceLine, file: str, length: float) -> dict[str, str]:
     """Return the attributes of a reference to OpenCRG.
 
-    In the mode genuine, readers move the start of the file's line to the road's start and turn it by the
-    road's heading there plus ``hOffset``. The file's line starts along its first chord, the road along its
-    tangent. With their difference as ``hOffset`` the file stays where it is. Its heights are absolute.
+    In the mode genuine, readers move the start of the file's line to the start of the road. They turn it by
+    the road's heading there plus ``hOffset``. The line starts along its first chord, the road along its
+    tangent. With their difference as ``hOffset`` the line stays in its place. Its heights are absolute.
     """
     turned = float(line.chord_headings[0] - line.heading[0])
     offset = math.remainder(turned, 2 * math.pi)
@@ -195,5 +194,5 @@ def crg_reference(line: ReferenceLine, file: str, length: float) -> dict[str, st
 
 
 def _attributes(**values: float | str) -> dict[str, str]:
-    """Return attributes of XML; numbers with all their digits."""
+    """Return attributes of XML, with all digits of numbers."""
     return {key: value if isinstance(value, str) else repr(float(value)) for key, value in values.items()}

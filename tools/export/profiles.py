@@ -1,8 +1,8 @@
-"""Heights along a reference line: on a grid as OpenCRG has them, and as profiles of OpenDRIVE.
+"""Heights along a reference line: on a grid for OpenCRG, and as profiles of OpenDRIVE.
 
-Each cross-section of a road becomes a straight line: its height on the reference line, and its slope. Along
-the road both become cubic pieces within a tolerance, which go on from piece to piece with one value and one
-slope. What a road has beside that (crown, ruts, kerbs, bumps) is missed.
+Each cross-section of a road becomes a straight line, with a height on the reference line and a slope. Along
+the road both become cubic pieces within a tolerance. Neighbouring pieces have the same value and slope where
+they meet. Other shapes of a road (crown, ruts, kerbs, bumps) are missed.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from flexroad.tasks.types import Bools, Floats, HeightAt
 from flexroad.tools.export.reference_line import ReferenceLine
 
 MARGIN_M = 1.0
-"""Width of a grid beside the widest carriageway (m); less in narrow bends, so that the grid does not fold."""
+"""Width of a grid beside the widest carriageway (m); less in narrow bends, so that rows do not cross."""
 NONE = np.zeros((1, 5))
-"""A profile without records: it is 0."""
+"""A profile that is 0 everywhere."""
 TOLERANCE_M = 0.0005
 """Largest distance of a profile from the straight lines that fit the cross-sections (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
-    """Cubic pieces over the length of a road, ``(k, 5)``: s, a, b, c, d as OpenDRIVE has them."""
+    """Cubic pieces over the length of a road, ``(k, 5)``: s, a, b, c, d as in OpenDRIVE."""
 
     elevation: Floats
     """Height on the line (m)."""
@@ -43,14 +43,14 @@ class Profiles:
 def straight_lines(
     t: Floats, z: Floats, inside: Bools, through: Floats | None = None
 ) -> tuple[Floats, Floats]:
-    """Return height at t = 0 and slope of the straight line that fits each cross-section best, ``(n,)`` each.
+    """Return height at t = 0 and slope of the best straight line of each cross-section, ``(n,)`` each.
 
     NaN where a cross-section has too few points.
 
     - `t` ``(m,)``: distances from the reference line (m).
     - `z` ``(n, m)``: heights (m).
-    - `inside` ``(n, m)``: the points that count; their heights are known.
-    - `through` ``(n,)``: heights at t = 0 that the lines have; None: those of the best lines.
+    - `inside` ``(n, m)``: the points that are used; their heights are known.
+    - `through` ``(n,)``: fixed heights of the lines at t = 0; None: they are fitted, too.
     """
     known = np.where(inside, z, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -66,10 +66,10 @@ def straight_lines(
 
 
 def cubic_pieces(s: Floats, z: Floats, slope: Floats, tolerance: float) -> Floats:
-    """Return the cubic pieces of a profile, ``(k, 5)``: s, a, b, c, d as OpenDRIVE has them.
+    """Return the cubic pieces of a profile, ``(k, 5)``: s, a, b, c, d as in OpenDRIVE.
 
-    They have the values and slopes of the profile at the ends of the pieces, so that profiles that meet with
-    one value and slope meet exactly. Each piece is as long as the tolerance allows.
+    At its ends a piece has the values and slopes of the profile. So profiles with the same value and slope at
+    a place meet exactly there. Each piece is as long as the tolerance allows.
 
     - `s` ``(n,)``: distances along the road, ascending (m); at least two.
     - `z`, `slope` ``(n,)``: values of the profile there, and their derivatives by s.
@@ -97,7 +97,7 @@ def _ends(s: Floats, z: Floats, slope: Floats, tolerance: float) -> NDArray[np.i
     """Return the indices of the ends of the pieces."""
     ends, start, last = [0], 0, len(s) - 1
     while start < last:
-        # The piece grows twofold while it fits; the longest one is between the last two tries.
+        # The length is doubled while the piece fits; the largest length is between the last two tries.
         fits, step = start + 1, 2
         while fits < last:
             end = min(start + step, last)
@@ -137,14 +137,14 @@ class HeightGrid:
     v: Floats
     """Distances from the line, ``(m,)``, m; ascending by equal steps, positive to the left."""
     heights: Floats
-    """``(n, m)``, m; NaN beyond the surface, and beyond a gap in it: no row has NaN between heights."""
+    """``(n, m)``, m; NaN beyond the surface and beyond gaps, so that no row has NaN between heights."""
 
 
 def height_grid(line: ReferenceLine, height: HeightAt) -> HeightGrid:
     """Return the heights of a surface beside a part of a line that `reference_line.usable` returns."""
     v = across(line, 0.25, MARGIN_M)
     heights, middle = height(*line.beside(v)), int(np.argmin(np.abs(v)))
-    # Readers of OpenCRG refuse gaps in a row.
+    # Readers of OpenCRG reject gaps in a row.
     known = np.isfinite(heights)
     right = np.logical_and.accumulate(known[:, middle::-1], axis=1)[:, ::-1]
     left = np.logical_and.accumulate(known[:, middle:], axis=1)
@@ -152,13 +152,13 @@ def height_grid(line: ReferenceLine, height: HeightAt) -> HeightGrid:
 
 
 def across(line: ReferenceLine, step: float, margin_m: float) -> Floats:
-    """Return distances from a line, ``step`` apart (m), to ``margin_m`` beside its widest place."""
+    """Return distances from a line, ``step`` apart (m), up to ``margin_m`` beside its widest place."""
     right, left = line.reach(float(line.width.max()) / 2 + margin_m)
     return np.arange(-round(right // step), round(left // step) + 1, dtype=np.float64) * step
 
 
 def grid_error(grid: HeightGrid, height: HeightAt) -> tuple[float, float]:
-    """Return how far bilinear interpolation misses a surface in the middle of cells: median, largest (m)."""
+    """Return the errors of bilinear interpolation in the middle of cells: median, largest (m)."""
     x, y = grid.line.beside((grid.v[:-1] + grid.v[1:]) / 2)
     z = grid.heights
     middle = (z[:-1, :-1] + z[1:, :-1] + z[:-1, 1:] + z[1:, 1:]) / 4
@@ -172,9 +172,9 @@ def grid_error(grid: HeightGrid, height: HeightAt) -> tuple[float, float]:
 def profiles(grid: HeightGrid) -> Profiles:
     """Return the profiles that fit the heights of the carriageway by least squares.
 
-    Where the surface ends across the road, a cross-section is compared with the nearest complete one: a line
-    through a part of it alone would have the slope of that side of the crown. Cross-sections with less than
-    two heights do not count; what is between their neighbours is used.
+    A line through an incomplete cross-section would have the slope of one side of the crown. So the crown of
+    the nearest complete cross-section is subtracted. Cross-sections with less than two heights are
+    interpolated from their neighbours.
     """
     s, v = grid.line.s, grid.v
     crown, inside = _crown(grid, on_carriageway(grid))
@@ -192,7 +192,7 @@ def _pieces(s: Floats, values: Floats, tolerance: float) -> Floats:
 
 
 def profile_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
-    """Return how far profiles miss the heights of the carriageway: mean, largest (m); NaN if it has none."""
+    """Return the errors of profiles on the carriageway: mean, largest (m); NaN without heights."""
     missed = np.abs(profiles.at(grid.line.s[:, None], grid.v) - grid.heights)[on_carriageway(grid)]
     if not len(missed):
         return np.nan, np.nan
@@ -200,7 +200,7 @@ def profile_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
 
 
 def largest_steps(grid: HeightGrid, step: HeightAt) -> tuple[float, float]:
-    """Return the largest step up or down at the nodes of a grid, and at those of the carriageway (m).
+    """Return the largest step up or down at the nodes of a grid, and at the nodes of the carriageway (m).
 
     NaN if no node has a height.
     """
@@ -220,9 +220,9 @@ def _between_edges(grid: HeightGrid) -> Bools:
 
 
 def _crown(grid: HeightGrid, inside: Bools) -> tuple[Floats, Bools]:
-    """Return how far the nearest complete row is from its straight line, for rows that are cut, and where.
+    """Return for incomplete rows the height of the nearest complete row above its straight line.
 
-    The rows of the second array are those of ``inside``, without places where the nearest row has no height.
+    Also return the usable points: ``inside`` without points where that nearest row has no height.
     """
     crown = np.zeros(grid.heights.shape)
     cut = (inside != _between_edges(grid)).any(axis=1)

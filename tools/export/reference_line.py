@@ -1,9 +1,8 @@
 """Reference lines of roads: smooth curves with points at equal distances, for OpenCRG and OpenDRIVE.
 
 A route is smoothed within a given lateral distance and becomes a curve of cubic pieces (OpenDRIVE's
-paramPoly3). Points on it whose distances are all equal, straight from point to point, are OpenCRG's reference
-line. Both formats so have the same points. The last piece of a route that is shorter than this distance is
-left out.
+paramPoly3). OpenCRG's reference line has points on the curve at equal straight distances, so both formats
+have the same points. A last piece of a route that is shorter than this distance is left out.
 """
 
 from __future__ import annotations
@@ -20,32 +19,32 @@ from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats
 
 INCREMENT_M = 0.5
-"""Distance of the points (m); OpenCRG's consistency check wants a multiple of 1 mm."""
+"""Distance of the points (m); OpenCRG's consistency check needs a multiple of 1 mm."""
 MAX_OFFSET_M = 0.25
 """Largest distance from the centre lines (m)."""
 SMOOTH_M = 30.0
-"""Shorter waves of a line are smoothed away (m)."""
+"""Waves of a line that are shorter than this are removed (m)."""
 PIECE_M = 4.0
 """Length of a cubic piece (m)."""
 MIN_LENGTH_M = 10.0
 """Shortest road (m)."""
 SAMPLE_M = 0.25
-"""Distance of the points that are smoothed (m)."""
+"""Distance between the points that are smoothed (m)."""
 DIAGONAL = np.array([[0.0], [0.0], [1.0]])
 PINNED = 1e9
-"""Weight of a route's first and last point: routes that meet still meet when they are smooth."""
+"""Weight of a route's first and last point: routes that meet still meet after smoothing."""
 ATTEMPTS = ((0.8, 1.0), (0.6, 0.5), (0.4, 0.25))
-"""Share of the allowed offset that smoothing uses, and length of the pieces as a share of `PIECE_M`: long
-pieces cut the corners of the smoothed line, so that narrow bends need shorter ones."""
+"""Share of the allowed offset that smoothing uses, and length of the pieces as a share of `PIECE_M`.
+Long pieces cut the corners of the smoothed line, so narrow bends need shorter pieces."""
 ROUNDS = 40
 WIDENING_M = 10.0
 """Length over which a step of the width is spread (m)."""
 FOLD = 0.9
 """Largest distance on the inside of a bend as a share of its radius, where cross-sections meet."""
 TINY_M = 1e-6
-"""Pieces shorter than this are left to their neighbours (m)."""
+"""Pieces shorter than this are joined to their neighbours (m)."""
 EVEN_M, QUARTERS = 0.0005, np.arange(4) / 4
-"""Largest difference of length and parameter within a piece (m), and where it is measured."""
+"""Largest difference of length and parameter within a piece (m), and the places where it is measured."""
 CLOSED = 1e-10
 """Relative error of the distances between points."""
 
@@ -62,7 +61,7 @@ class ReferenceLine:
     s: Floats
     """Length of the curve from the first point to each point, ``(n,)``, m."""
     increment: float
-    """Distance between neighbouring points, straight (m)."""
+    """Straight distance between neighbouring points (m)."""
     width: Floats
     """Width of the carriageway at each point, ``(n,)``, m; the line is in its middle."""
     parameter: Floats
@@ -87,7 +86,7 @@ class ReferenceLine:
         return np.asarray((x1 * y2 - y1 * x2) / np.hypot(x1, y1) ** 3)
 
     def reach(self, distance: float) -> tuple[float, float]:
-        """Return how far the line's cross-sections reach to the right and to the left (m) before they meet.
+        """Return the length of the line's cross-sections to the right and left (m) before they meet.
 
         At most ``distance``. A bend to the left limits the left side.
         """
@@ -98,8 +97,8 @@ class ReferenceLine:
     def beside(self, v: Floats) -> tuple[Floats, Floats]:
         """Return x and y, ``(n, len(v))``, of points at distances ``v`` from the line, positive to the left.
 
-        They are where OpenCRG's readers have them: on the bisectors of the angles between chords, at the
-        distance ``v`` from both chords.
+        As in readers of OpenCRG, they are on the bisectors of the angles between chords, ``v`` from both
+        chords.
         """
         normal = np.stack([-np.diff(self.y), np.diff(self.x)], axis=1) / self.increment
         before, after = np.vstack([normal[:1], normal]), np.vstack([normal, normal[-1:]])
@@ -110,8 +109,8 @@ class ReferenceLine:
     def pieces(self) -> tuple[Floats, Floats]:
         """Parameters at the ends of the cubic pieces from the first to the last point, and the length there.
 
-        Both ``(k + 1,)`` for ``k`` pieces. Within a piece the parameter grows as the length does, within half
-        a millimetre: OpenDRIVE's readers take it so. Pieces of the curve where it does not are divided.
+        Both ``(k + 1,)`` for ``k`` pieces. Readers of OpenDRIVE assume that the parameter grows like the
+        length. Pieces of the curve where it differs by more than half a millimetre are divided.
         """
         first, last = self.parameter[0], self.parameter[-1]
         inner = self.curve.x[(self.curve.x > first + TINY_M) & (self.curve.x < last - TINY_M)]
@@ -127,7 +126,7 @@ class ReferenceLine:
         return ends, _lengths(self.curve, ends)
 
     def part(self, first: int, last: int) -> ReferenceLine:
-        """Return the line from one point to another one, both included."""
+        """Return the line from one point to another point, both included."""
         here = slice(first, last + 1)
         cut = {name: getattr(self, name)[here] for name in ("x", "y", "heading", "width", "parameter")}
         return replace(self, s=self.s[here] - self.s[first], **cut)
@@ -168,8 +167,8 @@ def reference_line(route: Route) -> ReferenceLine | None:
 def usable(line: ReferenceLine, known: Floats) -> list[ReferenceLine]:
     """Return the parts of a line that can be a road, without those shorter than `MIN_LENGTH_M`.
 
-    A road ends where the surface ends, and before a bend with a radius of less than half its width: there its
-    cross-sections would meet.
+    A road ends where the surface ends. It also ends before a bend with a radius of less than half its width,
+    where its cross-sections would meet.
 
     - `known` ``(n,)``: heights at its points, NaN beyond the surface.
     """
@@ -177,13 +176,13 @@ def usable(line: ReferenceLine, known: Floats) -> list[ReferenceLine]:
 
 
 def parts(line: ReferenceLine, inside: Bools) -> list[ReferenceLine]:
-    """Return the parts of a line of which all points are ``inside``, without those that are too short."""
+    """Return the parts of a line whose points are all ``inside``, without parts that are too short."""
     least = MIN_LENGTH_M / line.increment
     return [line.part(start, end - 1) for start, end in stretches(inside) if end - 1 - start >= least]
 
 
 def stretches(places: Bools) -> list[tuple[int, int]]:
-    """Return start and end of each run of true values."""
+    """Return start and end of each stretch of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], places, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
@@ -193,7 +192,7 @@ def _along(points: Floats) -> Floats:
 
 
 def _curve(smooth: Floats, piece_m: float) -> scipy.interpolate.PPoly:
-    """Return a curve through some points of a smooth polyline; its parameter is nearly its length."""
+    """Return a curve through points of a smooth polyline; its parameter is nearly its length."""
     along = _along(smooth)
     pieces = max(2, round(along[-1] / piece_m))
     chosen = np.round(np.linspace(0, len(smooth) - 1, pieces + 1)).astype(int)
@@ -201,11 +200,11 @@ def _curve(smooth: Floats, piece_m: float) -> scipy.interpolate.PPoly:
 
 
 def _smoothed(points: Floats, within_m: float) -> Floats:
-    """Return a polyline, smooth within a distance, with several points a metre.
+    """Return the polyline smoothed within a distance, with several points per metre.
 
-    The sum of squared distances and of squared second differences is least, so that waves much longer than
-    `SMOOTH_M` pass and shorter ones do not. Where the result leaves the allowed distance, weights of the
-    points grow until it does not.
+    The sum of squared distances and of squared second differences is minimal. Waves much longer than
+    `SMOOTH_M` stay, shorter waves are removed. Where the result leaves the allowed distance, the weights of
+    the points are increased.
     """
     along = _along(points)
     at = np.linspace(0.0, along[-1], round(along[-1] / SAMPLE_M) + 1)
@@ -223,7 +222,7 @@ def _smoothed(points: Floats, within_m: float) -> Floats:
 
 
 def _second_differences(count: int) -> Floats:
-    """Return the upper bands of the matrix whose quadratic form is the sum of squared second differences."""
+    """Return the upper bands of the matrix of the sum of squared second differences."""
     bands = np.ones((3, count)) * [[1.0], [-4.0], [6.0]]
     bands[1, [1, -1]] = -2
     bands[2, [0, -1]], bands[2, [1, -2]] = 1, 5
@@ -231,7 +230,7 @@ def _second_differences(count: int) -> Floats:
 
 
 def _equally_spaced(curve: scipy.interpolate.PPoly, increment: float) -> Floats:
-    """Return parameters of points whose distances are all equal, from the start of a curve."""
+    """Return the parameters of points at equal distances from the start of a curve on."""
     end = float(curve.x[-1])
     t = np.arange(0.0, end + increment / 2, increment)
     for _ in range(ROUNDS):
@@ -246,7 +245,7 @@ def _equally_spaced(curve: scipy.interpolate.PPoly, increment: float) -> Floats:
 
 
 def _lengths(curve: scipy.interpolate.PPoly, parameter: Floats) -> Floats:
-    """Return the length of a curve from the first to each parameter."""
+    """Return the length of a curve from the first parameter to each parameter."""
     ends = np.union1d(parameter, curve.x[(curve.x > parameter[0]) & (curve.x < parameter[-1])])
     node, weight = np.polynomial.legendre.leggauss(6)
     half, middle = np.diff(ends) / 2, (ends[:-1] + ends[1:]) / 2

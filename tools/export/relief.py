@@ -1,8 +1,8 @@
-"""A coarse copy of meshes: heights at the nodes of a lattice, with its largest vertical distance from them.
+"""A coarse copy of meshes: heights at the nodes of a lattice, and its largest vertical distance from them.
 
 Each cell of the lattice is two triangles, cut from the north-west to the south-east. The distance is exact:
-between two surfaces of triangles it is largest at a vertex of one, or where an edge of one crosses an edge of
-the other, and the edges of a lattice are three families of parallel lines.
+it is largest at a vertex of one surface, or where edges of both cross in plan. The edges of a lattice are
+three families of parallel lines, so all crossings are found.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class Relief:
     bounds: Bounds
     """West, south, east and north of the outermost nodes (m)."""
     heights: Floats
-    """``(n + 1, m + 1)`` (m); without meaning at nodes that are corners of no drawn cell."""
+    """``(n + 1, m + 1)`` (m); without meaning at nodes that are not corners of a drawn cell."""
     cells: Bools
-    """``(n, m)``, the cells that have a surface: all that the meshes reach."""
+    """``(n, m)``, the drawn cells: all cells that a mesh touches."""
     error_m: float
     """Largest vertical distance from the meshes (m)."""
 
@@ -56,9 +56,9 @@ class Relief:
 
 
 def highest_first(mesh: Mesh) -> NDArray[np.int32]:
-    """Return the faces of a mesh, ``(F, 3)``, those of the highest level first.
+    """Return the faces of a mesh, ``(F, 3)``, faces of the highest level first.
 
-    Where several faces are above a place, a relief takes the height of the first.
+    Where several faces lie above each other, a relief has the height of the first face.
     """
     return mesh.faces if mesh.level is None else mesh.faces[np.argsort(-mesh.level, kind="stable")]
 
@@ -78,7 +78,7 @@ def of_mesh(points: Floats, faces: Faces, spacing_m: float) -> Relief:
 
 
 def joined(parts: Sequence[Relief], spacing_m: float) -> Relief:
-    """Return one relief of several, at least one; its error is that from the meshes of the parts."""
+    """Return one relief of one or more reliefs; its error is the distance from the meshes of the parts."""
     edges = np.array([part.bounds for part in parts])
     west, south = edges[:, :2].min(axis=0).tolist()
     east, north = edges[:, 2:].max(axis=0).tolist()
@@ -96,20 +96,20 @@ def joined(parts: Sequence[Relief], spacing_m: float) -> Relief:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """The triangles of a relief with a skirt: a wall down from its outer edge, which hides cracks."""
+    """The triangles of a relief with a skirt: a wall down from its outer edge that hides gaps."""
 
     points: Floats
     """Easting, northing and height (m), ``(V, 3)``: corners of drawn cells, then the foot of the skirt."""
     faces: Faces
-    """Counter-clockwise from above and from outside, ``(F, 3)``: those of the relief, then the skirt."""
+    """Counter-clockwise from above and from outside, ``(F, 3)``: faces of the relief, then the skirt."""
     top: NDArray[np.intp]
-    """For each point the one above it in the relief, for points of the relief themselves, ``(V,)``."""
+    """``(V,)``: for a point of the skirt, the point above it in the relief; for others, the point itself."""
     count: int
     """Number of faces of the relief."""
 
 
 def sheet(relief: Relief, depth_m: float) -> Sheet:
-    """Return the triangles of a relief with a skirt of some depth (m); every point is part of a face."""
+    """Return the triangles of a relief with a skirt (depth in m); every point is part of a face."""
     used, corners = np.unique(relief.faces, return_inverse=True)
     faces = corners.reshape(-1, 3).astype(np.int32)
     points = relief.places[used]
@@ -135,10 +135,10 @@ def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes, phot
 
     The skirt has the colours and normals of the edge above it, so that it does not show.
 
-    - `local` ``(V, 3)``: its points in a frame of their own: east, north and up (m).
+    - `local` ``(V, 3)``: its points in a local frame: east, north and up (m).
     - `bounds`: west, south, east and north of the image's outer edges (m, in the CRS of the sheet).
     - `image`: the image seen from above, JPEG.
-    - `photo`: whether the image is made of photos, which are shown without a light.
+    - `photo`: whether the image is made of photos, which are shown unlit.
     """
     top = vertex_normals(local[: sheet.top.max() + 1], sheet.faces[: sheet.count])
     west, south, east, north = bounds
@@ -156,9 +156,9 @@ def _shape(bounds: Bounds, spacing_m: float) -> tuple[int, int]:
 
 
 def _fitted(bounds: Bounds, heights: Floats, meshes: Sequence[tuple[Floats, Faces, float]]) -> Relief:
-    """Return the relief with these heights at the nodes; NaN where the meshes have none.
+    """Return the relief with these heights at the nodes; NaN where no mesh has a height.
 
-    Each mesh has points, faces and its own error. All its points and edges get a cell below or above them.
+    Each mesh has points, faces and its own error. A cell is drawn under all its points and edges.
     """
     overlays = [(_overlay(_in_cells(points, bounds, heights.shape), faces), e) for points, faces, e in meshes]
     cells: Bools = np.asarray(np.isfinite(np.stack(_corners(heights))).all(axis=0))
@@ -174,7 +174,7 @@ def _fitted(bounds: Bounds, heights: Floats, meshes: Sequence[tuple[Floats, Face
 
 
 def _filled(heights: Floats, cells: Bools, places: Floats) -> Floats:
-    """Return heights at all nodes; a corner of a drawn cell without one has that of the nearest place."""
+    """Return heights at all nodes. A drawn cell's corner without a height gets the nearest height."""
     needed = np.zeros(heights.shape, bool)
     for corner in _corners(needed):
         corner[cells] = True
@@ -192,7 +192,7 @@ def _corners(nodes: NDArray[Any]) -> tuple[NDArray[Any], ...]:
 
 
 def _in_cells(points: Floats, bounds: Bounds, shape: tuple[int, ...]) -> Floats:
-    """Return points with plan coordinates in cells: east of the western and south of the northern edge."""
+    """Return points with plan coordinates in cells, east of the western and south of the northern edge."""
     west, south, east, north = bounds
     columns = (points[:, 0] - west) / (east - west) * (shape[1] - 1)
     rows = (north - points[:, 1]) / (north - south) * (shape[0] - 1)
@@ -200,7 +200,7 @@ def _in_cells(points: Floats, bounds: Bounds, shape: tuple[int, ...]) -> Floats:
 
 
 def _on_cells(places: Floats, cells: Bools) -> Bools:
-    """Return which places, in cells, lie on a drawn cell or its border."""
+    """Return which places (in cells) lie on a drawn cell or its border."""
     inside = np.zeros(len(places), bool)
     for shift in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         column, row = np.floor(places[:, :2] + np.multiply(shift, ON_LINE)).astype(np.intp).T
@@ -210,7 +210,7 @@ def _on_cells(places: Floats, cells: Bools) -> Bools:
 
 
 def _height(heights: Floats, places: Floats) -> Floats:
-    """Return the heights of the lattice's triangles at places in cells."""
+    """Return the heights of the lattice's triangles at places (in cells)."""
     column = np.clip(np.floor(places[:, 0]), 0, heights.shape[1] - 2).astype(np.intp)
     row = np.clip(np.floor(places[:, 1]), 0, heights.shape[0] - 2).astype(np.intp)
     east, south = places[:, 0] - column, places[:, 1] - row
@@ -221,9 +221,9 @@ def _height(heights: Floats, places: Floats) -> Floats:
 
 
 def _overlay(places: Floats, faces: Faces) -> tuple[Floats, Floats]:
-    """Return where edges of a mesh meet the lattice, and the middles of the pieces between, in plan.
+    """Return where edges of a mesh meet the lattice, and in plan the middles between these points.
 
-    The first are all ends of edges and their crossings with the lines of the lattice, ``(k, 3)``.
+    The points are the ends of all edges and their crossings with the lines of the lattice, ``(k, 3)``.
     """
     pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
     first, second = np.divmod(np.unique(pairs @ [len(places), 1]), len(places))
@@ -233,7 +233,7 @@ def _overlay(places: Floats, faces: Faces) -> tuple[Floats, Floats]:
     for family in ([1, 0, 0], [0, 1, 0], [1, -1, 0]):
         a, along = start @ family, step @ family
         lowest, highest = np.ceil(np.minimum(a, a + along)), np.floor(np.maximum(a, a + along))
-        # An edge along a line crosses none of this family but at its ends.
+        # An edge parallel to a family crosses its lines only at the edge's ends.
         number = np.where(np.abs(along) > ON_LINE, np.maximum(highest - lowest + 1, 0), 0).astype(np.intp)
         edge = np.repeat(np.arange(len(first)), number)
         order = np.arange(len(edge)) - np.repeat(np.cumsum(number) - number, number)

@@ -56,7 +56,7 @@ NAME = "_roads.gpkg"
 ROADS, SEGMENTS = "roads", "segments"
 """Layers of the file."""
 BATCH = 50_000
-"""Number of segments that are written at once."""
+"""Number of segments that are written at a time."""
 HEIGHT_SOURCE = {
     HeightSource.MEASURED: "measured",
     HeightSource.DTM: "dtm",
@@ -71,20 +71,19 @@ ACROSS = np.linspace(-0.5, 0.5, 9)
 
 
 Road = tuple[ManifestRow, dict[str, NDArray[Any]]]
-"""One road of ``n`` segments: its columns in the layer ``roads``, the first one is its id, and its arrays.
+"""One road of ``n`` segments: its columns in the layer ``roads`` (first its id), and its arrays.
 
-These are ``points``, ``(n + 1, 3)``: easting, northing, height (m), and columns of the layer ``segments``.
+Arrays: ``points``, ``(n + 1, 3)``: easting, northing, height (m), and the columns of the layer ``segments``.
 """
 
 
 def write(path: Path, roads: Iterable[Road], crs: str, date: datetime) -> None:
     """Write roads to a new GeoPackage.
 
-    The layer ``roads`` has a line per road, ``segments`` a line per metre. Numbers that are not known are
-    null.
+    The layer ``roads`` has a line per road, ``segments`` a line per metre. Unknown numbers are null.
 
-    - `roads`: at least one; all with the same columns.
-    - `crs`: CRS of the points, compound if that of the heights is known.
+    - `roads`: at least one road; all have the same columns.
+    - `crs`: CRS of the points, compound if the CRS of the heights is known.
     - `date`: date of the data (UTC), so that equal roads give equal bytes.
     """
     batch, new = list[Road](), True
@@ -158,7 +157,7 @@ def write_lines(
     date = max(tile.datetime for tile in source.tiles).astimezone(UTC)
 
     def fill(local: Path) -> None:
-        # GDAL wants a name that ends like a GeoPackage, and writes other files beside it.
+        # GDAL needs a name that ends in .gpkg, and writes other files next to it.
         with ScratchFolder() as scratch:
             file = Path(scratch, f"roads{NAME}")
             write(file, (road for row in rows for road in _of_route(folder, row)), crs, date)
@@ -209,7 +208,7 @@ def _file(route: int) -> str:
 def _road(road: int, line: ReferenceLine, along: Stations, steps: Stations) -> ManifestRow:
     """Return the columns of a road in the layer ``roads``.
 
-    - `along`, `steps`: of the surface without steps, and of the steps above it.
+    - `along`, `steps`: stations of the surface without steps, and of the heights that steps add.
     """
     step = np.diff(along.s)
     edges = [steps.height + slope * steps.width / 2 for slope in (steps.left, steps.right)]
@@ -264,7 +263,7 @@ def _of_route(folder: Location, row: ManifestRow) -> Iterator[Road]:
 
 @dataclass(frozen=True, eq=False)
 class Stations:
-    """``n`` segments of equal length, one after the other."""
+    """``n`` consecutive segments of equal length."""
 
     x: Floats
     """Ends of the segments, ``(n + 1,)``, m."""
@@ -276,26 +275,26 @@ class Stations:
     """Middle of each segment, ``(n,)``, m."""
     middle_y: Floats
     height: Floats
-    """At the middle, ``(n,)``, m."""
+    """Height at the middle, ``(n,)``, m."""
     grade: Floats
     """Rise of the segment per metre along it, ``(n,)``; positive uphill."""
     crossfall: Floats
-    """Slope of the straight line that fits the cross-section, ``(n,)``; positive where the left is higher."""
+    """Slope of the best straight line of the cross-section, ``(n,)``; positive where the left is higher."""
     left: Floats
     """Slope from the middle of the carriageway to its left edge, ``(n,)``; negative where it falls."""
     right: Floats
     """Slope from the middle of the carriageway to its right edge, ``(n,)``."""
     curvature: Floats
-    """In plan, ``(n,)``, 1/m; positive to the left."""
+    """Curvature in plan, ``(n,)``, 1/m; positive to the left."""
     width: Floats
-    """Of the carriageway, ``(n,)``, m."""
+    """Width of the carriageway, ``(n,)``, m."""
 
 
 def stations(line: ReferenceLine, height: HeightAt) -> Stations:
-    """Return the segments of a line; what is left of a metre at its end is not one.
+    """Return the segments of a line; a rest of less than a metre at its end is left out.
 
-    - `line`: with points at an even fraction of a metre.
-    - `height`: the surface in the line's coordinates; values are NaN where it has none.
+    - `line`: the distance of its points is a metre divided by an even number.
+    - `height`: the surface in the line's coordinates; NaN beyond it.
     """
     each = round(STEP_M / line.increment / 2)
     middle = np.arange(each, len(line.x) - each, 2 * each)
@@ -316,7 +315,7 @@ def stations(line: ReferenceLine, height: HeightAt) -> Stations:
         middle_y=y,
         height=at_middle,
         grade=np.diff(z) / np.diff(line.s[ends]),
-        # The places are symmetric, so that the slope of the line that fits does not depend on its height.
+        # The places are symmetric: so the slope of the best line does not depend on its height.
         crossfall=(away * across).sum(axis=1) / (away**2).sum(axis=1),
         left=(across[:, -1] - at_middle) / (width / 2),
         right=(across[:, 0] - at_middle) / (width / 2),

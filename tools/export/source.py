@@ -1,4 +1,4 @@
-"""What an export is made of: the finished tiles of a run, with their surfaces and meshes, and its options."""
+"""Input of an export: the finished tiles of a run, with their surfaces and meshes, and the options."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class Options:
     """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
     compress: bool = option(False, OUTPUTS, "Compress LandXML.", name="gzip")
     resolution_m: float | None = option(
-        None, OUTPUTS, "Cell size of mosaic; default: that of the run.", "METRES", min=0.01
+        None, OUTPUTS, "Cell size of mosaic; default: the cell size of the run.", "METRES", min=0.01
     )
     level: int | None = option(
         None, OUTPUTS, "Level of mosaic: 0 is the ground, also below decks; default: the highest.", "N"
     )
     drape: bool = option(False, OUTPUTS, "Put the orthophoto on the meshes of 3dtiles and obj.")
-    """Also if the meshes of the run have none."""
+    """Also if the meshes of the run have no orthophoto."""
     roads: str | None = option(
         None,
         INPUTS,
@@ -55,7 +55,7 @@ class Options:
     )
     left_hand: bool = option(False, INPUTS, "Traffic keeps left, for xodr.")
     formats: frozenset[str] = frozenset()
-    """Names of the formats that are written together: some refer to files of other formats."""
+    """Names of the formats that are written together; some refer to files of other formats."""
 
 
 def layer_state(tile: Tile, name: str) -> str:
@@ -76,7 +76,7 @@ class Source:
     left_out: tuple[str, ...]
     """Ids of selected tiles that are not finished."""
     snapshots: tuple[Snapshot, ...]
-    """Each tile as it was when the tiles were selected."""
+    """The state of each tile when the tiles were selected."""
 
     @property
     def crs(self) -> str:
@@ -85,7 +85,7 @@ class Source:
 
     @cached_property
     def vertical(self) -> str | None:
-        """The vertical CRS of the heights, by the files of the first tile; None if it is not known."""
+        """The vertical CRS of the heights, by the files of the first tile; None if unknown."""
         return vertical_crs(self.tiles[0])
 
     @property
@@ -98,13 +98,13 @@ class Source:
 
     @property
     def place(self) -> Georeference:
-        """What local coordinates of files are relative to: the run's origin, at the height 0."""
+        """Origin of local coordinates in files: the run's origin, at the height 0."""
         return Georeference(self.crs, (*self.run.origin, 0.0), self.vertical)
 
     def finished(self) -> Iterator[FinishedTile]:
-        """Yield the tiles one by one, as they were when they were selected.
+        """Yield the tiles one by one, checked to be unchanged since they were selected.
 
-        Only sizes and times of their files are compared, so that each format can have a pass of its own.
+        Only sizes and times of their files are compared: this is fast, and each format reads all tiles.
         """
         state, place = file_states(self.run), RunPlace.of(self.run)
         for tile, before in zip(self.tiles, self.snapshots, strict=True):
@@ -112,7 +112,7 @@ class Source:
             yield FinishedTile(tile, self.variant, current, place)
 
     def _checked(self, tile: Tile, before: Snapshot) -> Snapshot:
-        """Return the snapshot of a tile of which a file has another size or time than before."""
+        """Return the snapshot of a tile with a file whose size or time has changed."""
         ((_, current),) = snapshots(self.run, [tile], self.variant)
         if current is None:
             raise ConfigError(
@@ -132,11 +132,11 @@ def select(
     area: Area | None = None,
     track: Track = untracked,
 ) -> Source:
-    """Return the finished tiles of a run, of all or of the selected tiles.
+    """Return the finished tiles of a run, among all or the selected tiles.
 
     The state of each selected tile is checked here, once for all formats.
 
-    - `track`: shows the progress of that.
+    - `track`: shows the progress of this check.
     """
     run = Run.open(location, allow)
     variant = run.config.export.variants[0]
@@ -148,13 +148,13 @@ def select(
         raise ConfigError(f"{location} has no finished tile to export; see `flexroad status {location}`")
     systems = {tile.grid.crs for tile in tiles}
     if len(systems) > 1:
-        raise ConfigError(f"{location} has tiles in {len(systems)} CRSs; select tiles of one with --bbox")
+        raise ConfigError(f"{location} has tiles in {len(systems)} CRSs; select tiles of one CRS with --bbox")
     left_out = tuple(tile.id for tile in wanted if tile.id not in done)
     return Source(run, variant, tiles, left_out, tuple(done[tile.id] for tile in tiles))
 
 
 def texture_of(tile: FinishedTile) -> Texture | None:
-    """Return the photo of a tile, None if it has none; also if the products of its run have none."""
+    """Return the photo of a tile, also if the products of its run have no photo; None without a photo."""
     pattern = tile.place.pattern
     with_photo = replace(pattern, export=pattern.export.model_copy(update={"texture": True}))
     try:

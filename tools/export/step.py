@@ -2,8 +2,8 @@
 
 The file has the surface itself and no triangles: an open shell of one face, bounded by its four border
 curves, in metres. It is cut to the given bounds by knot insertion, which is exact. With equal weights the
-surface is a polynomial spline of its own degree; else it is rational (`tasks.spline.surface.exact`).
-Coordinates are relative to a whole-metre origin in plan that all tiles of a run share; z is the height.
+surface is a polynomial spline of the same degree; else it is rational (`tasks.spline.surface.exact`).
+Plan coordinates are relative to a whole-metre origin that all tiles of a run share; z is the height.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NAME_SIDECAR = "_stp.json"
 
 AXES = "x east, y north, relative to origin; z height; metres"
 LONGEST = 250
-"""Longest text of an entry of the head, of which the standard allows 256 characters."""
+"""Longest text of an entry of the head (characters); the standard allows 256."""
 
 FILE = """\
 ISO-10303-21;
@@ -44,17 +44,17 @@ END-ISO-10303-21;
 Knots = tuple[Sequence[int], Sequence[float]]
 """Multiplicities and values of the different knots."""
 SAME_KNOT = 4e-12
-"""Parameters closer than this part of the domain are one knot: 1 nm over 250 m, as northings are rounded."""
+"""Parameters closer than this share of the domain are one knot: 1 nm over 250 m, for rounded northings."""
 
 
 def encode(surface: NurbsSurface, bounds: Bounds, name: str, written: datetime, place: Georeference) -> bytes:
-    """Return the part of a surface within bounds as STEP file.
+    """Return the part of a surface within bounds as a STEP file.
 
     Coordinates have all digits of their float64 numbers. Equal inputs give equal bytes.
 
-    - `bounds`: west, south, east and north of the part, as the tile's core (m). The part ends with the
-      surface's domain where that is smaller.
-    - `place`: what coordinates are relative to; its height is 0.
+    - `bounds`: west, south, east and north of the part, such as the tile's core (m). The part ends where the
+      domain of the surface ends.
+    - `place`: origin of the coordinates; its height is 0.
     """
     nurbs, rational = patch(surface, bounds, place.origin[:2])
     lines = [f"FlexRoad surface {name}", f"axes {AXES}", *place.lines()]
@@ -125,8 +125,8 @@ class _Data:
     def face(self, nurbs: ExactNurbs) -> str:
         """Add a surface with its four borders; return the face.
 
-        The borders run from west to east and from south to north; the loop is counter-clockwise from above,
-        so that it follows the northern and the western border backwards.
+        The borders run from west to east and from south to north. The loop is counter-clockwise from above,
+        so it follows the northern and the western border backwards.
         """
         add, (p, q) = self.add, nurbs.degree
         knots_u, knots_v = _distinct(nurbs.knots_u), _distinct(nurbs.knots_v)
@@ -177,7 +177,7 @@ class _Data:
         points: Sequence[Sequence[str]],
         weights: Floats,
     ) -> str:
-        """Add the surface; its first index is along u, that of the arrays along v."""
+        """Add the surface. In STEP the first index is along u, in the arrays along v."""
         columns = _list(_list(column) for column in zip(*points, strict=True))
         shape = f"{degree[0]},{degree[1]},{columns},.UNSPECIFIED.,.F.,.F.,.F."
         form = _knots(knots_u, knots_v)
@@ -211,7 +211,7 @@ def _reals(values: Iterable[float]) -> str:
 
 
 def _real(value: float) -> str:
-    """Return a number as the standard wants it: with a point, and a large E."""
+    """Return a number in the standard's form: with a decimal point, and an upper-case E."""
     mantissa, mark, exponent = repr(float(value)).partition("e")
     return mantissa + ("" if "." in mantissa else ".") + mark.upper() + exponent
 
@@ -230,8 +230,8 @@ def _character(character: str) -> str:
 def cut(surface: NurbsSurface, bounds: Bounds) -> NurbsSurface:
     """Return the part of a surface within bounds, with clamped knots from 0 to 1; the cut is exact.
 
-    The part ends with the surface's domain: beyond it the surface is extrapolated, which no spline on the
-    same knots can express.
+    The part ends where the domain of the surface ends. Beyond it the surface is extrapolated, which a spline
+    on these knots cannot express.
     """
     if not overlap(surface.bounds, bounds):
         raise TaskError(
@@ -253,9 +253,9 @@ def cut(surface: NurbsSurface, bounds: Bounds) -> NurbsSurface:
 
 
 def covered(road: RoadMask) -> tuple[Bounds, float]:
-    """Return the smallest rectangle around all covered cells of a tile, and what of it is beyond the survey.
+    """Return the smallest rectangle around all covered cells of a tile, and its area beyond the survey.
 
-    - `bounds`: west, south, east and north (m); those of the core if none of its cells is covered.
+    - `bounds`: west, south, east and north (m); the bounds of the core if no cell is covered.
     - `beyond_m2`: area within the bounds that is beyond the survey (m2).
     """
     core, inside = road.core, ~road.outside[road.grid.window(road.core)]
@@ -274,10 +274,10 @@ def covered(road: RoadMask) -> tuple[Bounds, float]:
 
 
 def patch(surface: NurbsSurface, bounds: Bounds, origin: tuple[float, float]) -> tuple[ExactNurbs, bool]:
-    """Return the part of a surface within bounds as a NURBS with control points in space; exact.
+    """Return the exact part of a surface within bounds as a NURBS with control points in space.
 
     - `origin`: easting and northing that the control points are relative to (m).
-    - `patch`: with the degree of the surface if all weights are equal, which are 1 then; else as by `exact`.
+    - `patch`: if all weights are equal, it has the surface's degree and weights 1; else the form of `exact`.
     - `rational`: whether the weights differ.
     """
     part = replace(cut(surface, bounds), origin=origin)
@@ -289,7 +289,7 @@ def patch(surface: NurbsSurface, bounds: Bounds, origin: tuple[float, float]) ->
 
 
 def _part(knots: Floats, degree: int, ends: tuple[float, float], length: float) -> tuple[Floats, Floats]:
-    """Return clamped knots on [0, 1] of a part, and the map of the whole's control points to its own.
+    """Return clamped knots on [0, 1] of a part, and the matrix from all control points to the part's.
 
     The ends are distances from the start of the domain, whose length is given in the same unit.
     """
@@ -312,7 +312,7 @@ def _knot(knots: Floats, parameter: float, length: float) -> float:
 
 
 def _inserted(knots: Floats, points: Floats, degree: int, new: float) -> tuple[Floats, Floats]:
-    """Return knots with one more, and the control points that leave the spline as it is (Boehm)."""
+    """Insert a knot; return the knots, and the control points that leave the spline unchanged (Boehm)."""
     span = int(np.searchsorted(knots, new, side="right")) - 1
     i = np.arange(span - degree + 1, span - np.count_nonzero(knots == new) + 1)
     share = ((new - knots[i]) / (knots[i + degree] - knots[i]))[:, None]

@@ -1,13 +1,12 @@
-"""Files of an export, each with a mark: what it was made of, written when it is complete.
+"""Files of an export, with marks: a mark names the input of files, and is written when they are complete.
 
-Workers write the files of one tile, area or road, and its mark ``.pieces/ID.json`` last: an interrupted
-export goes on where it stopped, and writes only tiles that have changed. Files of tiles that an earlier
-export had and this one does not have are removed: a folder has one export, and its manifest counts what is
-there.
+Workers write the files of one tile, area or road, and its mark ``.pieces/ID.json`` last. So an interrupted
+export continues where it stopped, and only changed tiles are written. Files of an earlier export whose tiles
+are not exported again are removed: a folder has one export, and the manifest counts its files.
 
-A file over all tiles has a mark ``.FORMAT.json`` beside the format's folder: if nothing has changed, a later
-export does nothing. Some of these files are joined from parts of the tiles, files ``.parts/ID``, which
-together are about as large as the file itself; so they are removed when it is written.
+A file over all tiles has a mark ``.FORMAT.json`` next to the format's folder: if nothing has changed, a later
+export does nothing. Some of these files are joined from parts of the tiles, the files ``.parts/ID``. Together
+the parts are about as large as the file, so they are removed when it is written.
 """
 
 from __future__ import annotations
@@ -38,12 +37,12 @@ MARKERS = ".pieces"
 PARTS = ".parts"
 """Folder of the parts of a joined file."""
 LARGEST = ("height_error_m", "steps_max_m")
-"""Entries of the rows of tiles of which the manifest has the largest."""
+"""Entries of tiles' rows whose maximum is in the manifest."""
 SMOOTH = "the surface without kerbs and walls"
 STEPS_SHOWN_M = 0.01
-"""Height of steps that are left out from which the user is told (m)."""
+"""The user is told if steps of at least this height are left out (m)."""
 ManifestRow = dict[str, Any]
-"""What the files of the complete run need of a tile, as JSON values."""
+"""Values of a tile that files of the complete run need, as JSON."""
 
 
 def steps_left_out(steps_m: float) -> str:
@@ -63,7 +62,7 @@ class TileOutput:
 
 
 class Item(Protocol):
-    """What files are made of: a finished tile, an area, or a road."""
+    """Input of files: a finished tile, an area, or a road."""
 
     @property
     def id(self) -> str:
@@ -71,7 +70,7 @@ class Item(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """Name of the content by what it is made of."""
+        """Hash of the input."""
 
     @property
     def label(self) -> str:
@@ -81,19 +80,19 @@ class Item(Protocol):
 Encode = Callable[[Any, Any], TileOutput]
 """Makes the files of an `Item` with the options of a format; runs in the worker processes."""
 Join = Callable[[Path, Iterator[bytes]], None]
-"""Writes a file from the parts of all tiles, in the order of the catalog; each part is in memory alone."""
+"""Writes a file from the parts of all tiles, in the order of the catalog; one part at a time is in memory."""
 
 
 @dataclass(frozen=True)
 class _Mark:
-    """What files were made of, as JSON; written when they are complete."""
+    """The input of files, as JSON; written when the files are complete."""
 
     key: str
-    """Fingerprint of their content, the format's version and its options."""
+    """Fingerprint of their input, the format's version and its options."""
     sizes: Mapping[str, int]
     """Names and sizes of the files."""
     row: ManifestRow
-    """What else of them is needed later."""
+    """Other values that are needed later."""
 
     @classmethod
     def read(cls, where: Location) -> _Mark | None:
@@ -110,11 +109,11 @@ class _Mark:
         write(where, json.dumps({"key": self.key, "sizes": self.sizes, "row": self.row}).encode())
 
     def holds(self, folder: Location, key: str) -> bool:
-        """Return whether its files are of a key, and exist in their full size."""
+        """Return whether its files have a key, and exist in their full size."""
         return self.key == key and all(_size(folder / name) == size for name, size in self.sizes.items())
 
     def remove_files(self, folder: Location, kept: Collection[str] = ()) -> None:
-        """Remove its files that are as an earlier export has left them; others may be of the user."""
+        """Remove its files that have the size that the export wrote; the user may have changed the others."""
         for name, size in self.sizes.items():
             if name not in kept and _size(folder / name) == size:
                 remove(folder / name)
@@ -132,7 +131,7 @@ class _Job:
     """See `_Mark`."""
     group: str
     former: _Mark | None
-    """That of an earlier export."""
+    """The mark of an earlier export."""
 
 
 def write_outputs(
@@ -145,12 +144,12 @@ def write_outputs(
     group: str = "",
     made_of: Callable[[Any], str] = attrgetter("fingerprint"),
 ) -> Iterator[ManifestRow]:
-    """Write the files of each tile that does not have them, and yield the row of each, in any order.
+    """Write the missing files of each tile, and yield the row of each tile, in any order.
 
-    Files of tiles of an earlier export that are not among the given ones are removed at the end.
+    Files of an earlier export whose tiles are not among the given tiles are removed at the end.
 
-    - `group`: name of what the items have in common, if a format has several kinds of them.
-    - `made_of`: returns the name of an item's content, where it depends on more than its fingerprint.
+    - `group`: name of the kind of items, if a format has several kinds.
+    - `made_of`: returns the hash of an item's input, if it is more than the fingerprint.
     """
     unchanged: list[ManifestRow] = []
     kept: set[str] = set()
@@ -179,7 +178,7 @@ def write_outputs(
 
 
 def figures(rows: Iterable[ManifestRow]) -> dict[str, Any]:
-    """Return what the manifest says of all tiles: the largest error and step, and the number of each note."""
+    """Return the manifest's figures of all tiles: the largest error and step, and the number of each note."""
     largest, notes = dict[str, Any](), Counter[str]()
     for row in rows:
         for name in (name for name in LARGEST if name in row):
@@ -192,9 +191,9 @@ def figures(rows: Iterable[ManifestRow]) -> dict[str, Any]:
 
 
 def write_whole(file: Location, key: str, row: ManifestRow, fill: Callable[[Path], None]) -> None:
-    """Write the one file of a folder, unless it exists and was made with the same key.
+    """Write the only file of a folder, unless it exists and was made with the same key.
 
-    Its former one, if it had another name, is removed.
+    The former file is removed if it had another name.
 
     - `key`: fingerprint of its content and name.
     """
@@ -225,12 +224,12 @@ def write_joined(
     executor: Executor,
     join: Join,
 ) -> dict[str, Any]:
-    """Write one file of all tiles, unless it exists and is of the same meshes, version and options.
+    """Write one file of all tiles, unless it exists with the same meshes, version and options.
 
     The figures of all tiles are returned.
 
-    - `encode`: makes the output of a tile, whose only file has the name of `part_name`; runs in the workers.
-    - `options`: given to ``encode``; with the name of the file, also all that ``join`` depends on.
+    - `encode`: makes the output of a tile, with a single file named by `part_name`; runs in the workers.
+    - `options`: given to ``encode``; ``join`` depends only on them and the name of the file.
     """
     folder = file.parent
     made_of = sha256(f"{file.name} {version} {options}".encode())
@@ -239,7 +238,7 @@ def write_joined(
     key, mark = made_of.hexdigest(), _Mark.read(_whole_marker(folder))
     if mark and mark.holds(folder, key):
         for _ in tiles:
-            pass  # each is checked to be still finished
+            pass  # each tile is checked to be still finished
         rows = mark.row
     else:
         rows = figures(write_outputs(tiles, folder, version, encode, options, executor))
@@ -250,7 +249,7 @@ def write_joined(
 
 
 def _write(job: _Job) -> tuple[ManifestRow, str]:
-    """Write the files of a tile; return its row, or the reason why it has none."""
+    """Write the files of a tile; return its row, or the reason why it has no row."""
     folder = parse_location(job.folder)
     try:
         output = job.encode(job.tile, job.options)

@@ -1,10 +1,10 @@
-"""3D Tiles 1.1: tilesets over the GLB files of a run, which stay as they are, and over coarse meshes.
+"""3D Tiles 1.1: tilesets over the unchanged GLB files of a run, and over coarse meshes.
 
-Meshes have coordinates of a map projection, and 3D Tiles those from the Earth's centre. One affine transform
-per tile converts them: it is fitted to points of the tile's box. A rigid one would ignore the scale of the
-projection, 0.04% in the middle of a UTM zone: 79 mm at the corners of a tile of 250 m.
+Meshes have coordinates of a map projection, and 3D Tiles have geocentric coordinates. One affine transform
+per tile converts them: it is fitted to points of the tile's box. A rigid transform would ignore the scale of
+the projection, 0.04% in the middle of a UTM zone: 79 mm at the corners of a tile of 250 m.
 
-Coarse meshes are too large for that, as the Earth is curved. All their points are converted.
+Coarse meshes are too large for this, as the Earth is curved. All their points are converted.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ ASSET = {"version": "1.1", "generator": "FlexRoad"}
 MARGIN_M = 1.0
 """Height added below and above a tile's box (m): bounding volumes must contain all vertices."""
 EDGE_M = 0.1
-"""Length added around a region (m): for residuals of transforms, float32, and edges that are no meridians."""
+"""Length added around a region (m): for errors of transforms and float32, and for curved edges."""
 RADIUS_M = 6_378_137.0
-"""Of the Earth (m), for lengths of angles."""
+"""Radius of the Earth (m), to convert angles to lengths."""
 
 
 def placed(
@@ -35,14 +35,14 @@ def placed(
     place: Georeference,
     datum: Datum,
 ) -> dict[str, Any]:
-    """Return where a tile's mesh is on the Earth: entries of its row.
+    """Return the place of a tile's mesh on the Earth: entries of its row.
 
     The transform is an affine matrix, 4 x 4 by columns, from the run's coordinates (east, north, up from its
-    origin) to those from the Earth's centre (m). The region is west, south, east, north (radians), lowest and
+    origin) to geocentric coordinates (m). The region is west, south, east, north (radians), lowest and
     highest height above the ellipsoid (m).
 
     - `heights`: lowest and highest height of the mesh (m).
-    - `place`: what the coordinates of the run's GLB files are relative to.
+    - `place`: origin of the coordinates in the run's GLB files.
     """
     west, south, east, north = bounds
     low, high = heights[0] - MARGIN_M, heights[1] + MARGIN_M
@@ -51,7 +51,7 @@ def placed(
     longitude, latitude, height = datum.geographic(place.crs, *points.T)
     exact = geocentric(longitude, latitude, height)
     local = points - place.origin
-    # Centred, so that the squares of large coordinates do not cost digits.
+    # Centred: the squares of large coordinates would lose digits.
     middle, centre = local.mean(axis=0), exact.mean(axis=0)
     linear = np.linalg.lstsq(local - middle, exact - centre, rcond=None)[0].T
     shift = centre - linear @ middle
@@ -61,10 +61,10 @@ def placed(
 
 
 def sheet_placed(uri: str, points: Floats, crs: str, datum: Datum) -> tuple[dict[str, Any], Floats]:
-    """Return where a mesh is whose points are all converted, and its points in the frame of its tile.
+    """Convert all points of a mesh; return its place on the Earth, and its points in the frame of its tile.
 
-    - result: its transform is from east, north and up at the middle of the points.
-    - result ``(V, 3)``: the points in that frame (m): small numbers, which float32 holds to 0.2 mm at 4 km.
+    - result: the transform is from east, north and up at the middle of the points.
+    - result ``(V, 3)``: the points in that frame (m), which float32 stores with 0.2 mm at 4 km.
     """
     longitude, latitude, height = datum.geographic(crs, *points.T)
     middle = [float(axis.min() + axis.max()) / 2 for axis in (longitude, latitude, height)]
@@ -75,7 +75,7 @@ def sheet_placed(uri: str, points: Floats, crs: str, datum: Datum) -> tuple[dict
 
 
 def east_north_up(longitude: float, latitude: float, height: float) -> Floats:
-    """Return the matrix, ``(4, 4)``, from east, north and up at a place to those from the Earth's centre.
+    """Return the matrix, ``(4, 4)``, from east, north and up at a place to geocentric coordinates.
 
     Longitude and latitude are in degrees, the height above the ellipsoid in metres.
     """
@@ -97,15 +97,14 @@ def tile(
 ) -> dict[str, Any]:
     """Return the entry of a tile.
 
-    - `error_m`: error of showing it instead of the finest tiles (m).
-    - `parent`: the mesh of the tile of which it is a child: the transform of a tile applies to its children,
-      too.
+    - `error_m`: error if it is shown instead of the finest tiles (m).
+    - `parent`: the mesh of its parent tile, whose transform also applies to its children.
     """
     matrix = np.reshape(content["transform"], (4, 4)).T
     if parent:
         outer = np.reshape(parent["transform"], (4, 4)).T
         matrix[:3, 3] -= outer[:3, 3]
-        # The outer frame is rigid.
+        # The outer frame is rigid: its inverse is its transpose.
         matrix[:3] = outer[:3, :3].T @ matrix[:3]
     regions = [content["region"], *(child["boundingVolume"]["region"] for child in children)]
     entry = {
@@ -120,20 +119,20 @@ def tile(
 
 
 def around(regions: Sequence[Sequence[float]]) -> list[float]:
-    """Return the smallest region that contains others, at least one."""
+    """Return the smallest region that contains one or more regions."""
     edges = np.array(regions)
     low, high = edges.min(axis=0), edges.max(axis=0)
     return [float(edge) for edge in (low[0], low[1], high[2], high[3], low[4], high[5])]
 
 
 def tileset(root: dict[str, Any], error_m: float, **extras: Any) -> dict[str, Any]:
-    """Return a tileset of a tile; ``error_m`` is the error of showing nothing instead (m)."""
+    """Return a tileset of a tile; ``error_m`` is the error if nothing is shown instead (m)."""
     asset = ASSET | ({"extras": extras} if extras else {})
     return {"asset": asset, "geometricError": error_m, "root": root}
 
 
 def group(children: Sequence[dict[str, Any]], error_m: float) -> dict[str, Any]:
-    """Return a tile without a mesh; ``error_m`` is the error of showing none of its children (m)."""
+    """Return a tile without a mesh; ``error_m`` is the error if its children are not shown (m)."""
     region = around([child["boundingVolume"]["region"] for child in children])
     return {
         "boundingVolume": {"region": region},
@@ -154,7 +153,7 @@ def _columns(matrix: Floats) -> tuple[float, ...]:
 
 
 def _region(longitude: Floats, latitude: Floats, height: Floats) -> tuple[float, ...]:
-    """Return the region around places on the Earth, with `EDGE_M` on all sides."""
+    """Return the region around places on the Earth, with a margin of `EDGE_M`."""
     low, high = np.radians([longitude.min(), latitude.min()]), np.radians([longitude.max(), latitude.max()])
     margin = EDGE_M / RADIUS_M / np.array([np.cos(high[1]), 1.0])
     heights = float(height.min()) - EDGE_M, float(height.max()) + EDGE_M

@@ -1,8 +1,8 @@
-"""3D Tiles of a run: its GLB files unchanged, coarse meshes of larger areas, and tilesets over both.
+"""3D Tiles of a run: its unchanged GLB files, coarse meshes of larger areas, and tilesets over both.
 
-Coarse meshes are made level by level: each from small records of the tiles or meshes below it. A record is a
-`Relief` with its image, in a file of the folder ``.coarse``. A worker reads those of one area, so that memory
-does not depend on the size of a run, and an interrupted export goes on.
+Coarse meshes are made level by level, each from small records of the tiles or meshes below it. A record is a
+`Relief` with its image, in a file of the folder ``.coarse``. A worker reads the records of one area. So
+memory does not depend on the size of a run, and an interrupted export can continue.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ from flexroad.tools.export.tile_outputs import ManifestRow, TileOutput, write_ou
 Image = lazy("PIL.Image")
 
 RECORDS, MESHES = ".coarse", "coarse"
-"""Folders of records, and of GLB files."""
+"""Folders of records and of GLB files."""
 PREFIX = "coarse_"
-"""Start of the ids of coarse meshes, which keeps them apart from those of tiles."""
+"""Start of the ids of coarse meshes, so that they differ from the ids of tiles."""
 QUALITY = 85
 """Quality of JPEG images."""
 SHARP = 8
-"""Geometric error of a mesh in pixels of its image, at least: programs show errors of up to 16 pixels of the
-screen (the default of CesiumJS), so that a pixel of the image covers at most two of the screen."""
+"""Least geometric error of a mesh in pixels of its image. Programs accept errors of up to 16 pixels of the
+screen (the default of CesiumJS). So a pixel of the image covers at most two pixels of the screen."""
 DAMAGED = (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 VERSION = tiles3d.VERSION
 NAMED = 5
@@ -61,14 +61,14 @@ NAMED = 5
 
 
 TILE_M = 4.0, 2.0
-"""Distance of vertices, and size of pixels, of the records of tiles, which are parts of coarse meshes."""
+"""Distance of vertices and size of pixels in the records of tiles (m)."""
 LEVELS_M = ((1000.0, 16.0, 2.0), (2000.0, 32.0, 4.0), (4000.0, 64.0, 8.0))
-"""Side of the areas, distance of vertices, size of pixels of coarse meshes; each side is twice the last."""
+"""Side of the areas, distance of vertices, size of pixels of coarse meshes (m); each side is doubled."""
 SAMPLES = 4
-"""Places a pixel of `of_classes` is the mean of, from west to east and from north to south."""
+"""A pixel of `of_classes` is the mean of this number of places from west to east and from north to south."""
 
 Place = tuple[Georeference, Datum]
-"""What the coordinates of the run are relative to, and how its heights become those above the ellipsoid."""
+"""Origin of the run's coordinates, and conversion of its heights to heights above the ellipsoid."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,9 @@ class Branch:
     level: int
     """Index in `LEVELS_M`."""
     cell: tuple[int, int]
-    """Column and row of its area, in sides of the finest level."""
+    """Column and row of its area, in areas of the finest level."""
     parts: tuple[ManifestRow, ...]
-    """Rows of the tiles or coarse meshes that it replaces from afar."""
+    """Rows of the tiles or coarse meshes that it replaces in distant views."""
     folder: str
 
     @property
@@ -91,13 +91,13 @@ class Branch:
 
     @property
     def fingerprint(self) -> str:
-        """Name of the mesh by what it is made of."""
+        """Hash of the records from which the mesh is made."""
         made_of = [(row["record"], row["digest"], row["error_m"], row["photo"]) for row in self.parts]
         return sha256(f"{LEVELS_M[self.level]} {made_of}".encode()).hexdigest()
 
 
 def record(name: str, ground: Relief, image: Aerial) -> tuple[dict[str, bytes], ManifestRow]:
-    """Return a record as file, and the part of a row that refers to it."""
+    """Return a record as a file, and the entries of a row that refer to it."""
     arrays: Mapping[str, Any] = {
         "bounds": np.array(ground.bounds),
         "heights": ground.heights,
@@ -157,7 +157,7 @@ def _read(folder: Location, row: ManifestRow) -> tuple[Relief, Aerial]:
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A tile or a coarse mesh, with what replaces it."""
+    """A tile or a coarse mesh, with the nodes that replace it in close views."""
 
     row: ManifestRow
     children: tuple[Node, ...] = ()
@@ -173,9 +173,9 @@ class Node:
 def write_tilesets(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
 ) -> dict[str, Any]:
-    """Write the GLB file of each tile, coarse ones, and tilesets: one per block of 4 km, one over the blocks.
+    """Write the GLB files of tiles and coarse meshes, a tileset per block of 4 km, and one over all blocks.
 
-    Returns the entry ``notes`` of the manifest: tiles without the orthophoto that was wanted.
+    Returns the entry ``notes`` of the manifest: tiles that lack the requested orthophoto.
     """
     assert options.datum is not None  # the command checks it
     place = source.place, options.datum
@@ -206,7 +206,7 @@ def write_tilesets(
 
 
 def blocks(nodes: Sequence[Node], folder: Location, place: Place, executor: Executor) -> list[Node]:
-    """Write the coarse meshes above tiles; return the coarsest, one per area of the last level."""
+    """Write the coarse meshes above tiles; return the coarsest meshes, one per area of the last level."""
     raised = list(nodes)
     for number in range(len(LEVELS_M)):
         raised = _raised(raised, number, folder, place, executor)
@@ -216,9 +216,9 @@ def blocks(nodes: Sequence[Node], folder: Location, place: Place, executor: Exec
 def _raised(
     nodes: Sequence[Node], number: int, folder: Location, place: Place, executor: Executor
 ) -> list[Node]:
-    """Return the nodes of a level: a coarse mesh per area, or the only node of an area as it is.
+    """Return the nodes of a level: a coarse mesh per area. The only node of an area is returned unchanged.
 
-    Areas of the last level have a coarse mesh in any case.
+    Areas of the last level always have a coarse mesh.
     """
     areas: defaultdict[tuple[int, int], list[Node]] = defaultdict(list)
     for node in nodes:
@@ -252,7 +252,7 @@ def _made_of(tile: FinishedTile, drape: bool) -> str:
 
 
 def _choice(tile: FinishedTile, drape: bool) -> tuple[bool, bool]:
-    """Return whether the GLB file of the run is taken, if there is one, and whether meshes have the photo."""
+    """Return whether the GLB file of the run can be used, and whether meshes have the photo."""
     textured = tile.place.pattern.export.texture
     return textured or not drape, textured or drape
 
@@ -260,7 +260,7 @@ def _choice(tile: FinishedTile, drape: bool) -> tuple[bool, bool]:
 def leaf_output(tile: FinishedTile, place: Place, drape: bool) -> TileOutput:
     """Return the GLB file of a tile, a record for coarse meshes, and its row.
 
-    With ``drape`` its mesh has the orthophoto, even if that of the run has none.
+    With ``drape`` its mesh has the orthophoto, even if the mesh of the run has none.
     """
     own, draped = _choice(tile, drape)
     mesh, grid, texture = tile.mesh, tile.tile.grid, texture_of(tile) if draped else None
@@ -287,7 +287,7 @@ def leaf_output(tile: FinishedTile, place: Place, drape: bool) -> TileOutput:
 def _glb(
     tile: FinishedTile, own: bool, origin: tuple[float, float, float], texture: glb.Texture | None
 ) -> bytes:
-    """Return the GLB file of the run, or a new one if the run has none that fits."""
+    """Return the GLB file of the run, or a new file if the run lacks a suitable one."""
     folder = TileProducts.of(parse_location(tile.place.path), tile.id)
     file = folder.file(file_name(tile.id, tile.variant, GLB))
     if (own or not texture) and exists(file):
@@ -311,10 +311,10 @@ class Aerial:
     colour: Floats
     """Red, green and blue, 0 to 255, ``(h, w, 3)``."""
     share: Floats
-    """Share of each pixel that is known, 0 to 1, ``(h, w)``; the colour of one of 0 has no meaning."""
+    """Known share of each pixel, 0 to 1, ``(h, w)``. The colour of a pixel with share 0 has no meaning."""
 
     def complete(self) -> NDArray[np.uint8]:
-        """Return the colours, ``(h, w, 3)``; an unknown pixel has that of the nearest known one."""
+        """Return the colours, ``(h, w, 3)``; an unknown pixel has the colour of the nearest known pixel."""
         row, column = scipy.ndimage.distance_transform_edt(
             self.share == 0, return_distances=False, return_indices=True
         )
@@ -351,7 +351,7 @@ def of_classes(
 
 
 def joined(parts: Sequence[Aerial], bounds: Bounds, pixel_m: float) -> Aerial:
-    """Return one image of several over some bounds; where they overlap, the mean of them."""
+    """Return one image of several images over bounds; where images overlap, it has their mean."""
     rows, columns = shape(bounds, pixel_m)
     west, south, east, north = bounds
     x, y = np.linspace(west, east, columns + 1), np.linspace(south, north, rows + 1)[::-1]
@@ -360,7 +360,7 @@ def joined(parts: Sequence[Aerial], bounds: Bounds, pixel_m: float) -> Aerial:
         height, width = part.share.shape
         across = _common(np.linspace(part.bounds[0], part.bounds[2], width + 1), x)
         along = _common(-np.linspace(part.bounds[3], part.bounds[1], height + 1), -y)
-        # A part covers few of the pixels.
+        # Each part covers only some of the pixels.
         row, column = (np.flatnonzero(lengths.any(axis=1)) for lengths in (along, across))
         along, across = along[row], across[column].T
         place = np.ix_(row, column)
@@ -380,14 +380,14 @@ def shape(bounds: Bounds, pixel_m: float) -> tuple[int, int]:
 
 
 def _common(parts: Floats, pixels: Floats) -> Floats:
-    """Return the common length of each interval of pixels with each one of parts; ascending edges."""
+    """Return the common length of each interval of pixels with each interval of parts; edges ascend."""
     low = np.maximum(pixels[:-1, None], parts[None, :-1])
     high = np.minimum(pixels[1:, None], parts[None, 1:])
     return np.asarray(np.maximum(high - low, 0.0))
 
 
 def aerial_of(texture: glb.Texture, pixel_m: float) -> Aerial:
-    """Return a texture as pixels: means of its own, of which at least two fit into ``pixel_m`` (m)."""
+    """Return a texture reduced to pixels of at most half of ``pixel_m`` (m), if its own are smaller."""
     west, south, east, north = texture.bounds
     image = Image.open(io.BytesIO(texture.jpeg))
     dx, dy = (east - west) / image.width, (north - south) / image.height

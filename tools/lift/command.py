@@ -41,13 +41,13 @@ def lift(
     *,
     crs: Annotated[
         str | None,
-        typer.Option(metavar="CRS", help="CRS of FILE, if it does not say it.", rich_help_panel=INPUTS),
+        typer.Option(metavar="CRS", help="CRS of FILE, if the file names none.", rich_help_panel=INPUTS),
     ] = None,
     offset: Annotated[
         tuple[float, float] | None,
         typer.Option(
             metavar="E N",
-            help="Added to the coordinates of FILE (m), if it does not say it.",
+            help="Added to the coordinates of FILE (m), if the file has no offset.",
             rich_help_panel=INPUTS,
         ),
     ] = None,
@@ -55,7 +55,7 @@ def lift(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Write a CSV with a row per road: distances, grades, what has no heights.",
+            help="Write a CSV with a row per road: distances, grades, lengths without heights.",
             rich_help_panel=OUTPUTS,
         ),
     ] = None,
@@ -68,7 +68,7 @@ def lift(
     """Write a road network or features with heights of a run.
 
     FILE is OpenDRIVE (.xodr), a network of SUMO (.net.xml), OSM or Lanelet2 (.osm), or a vector file
-    (GeoPackage, GeoJSON, FlatGeobuf, Shapefile). All else in it stays as it is.
+    (GeoPackage, GeoJSON, FlatGeobuf, Shapefile). Only its heights change.
     """
     grade, crossfall = (
         None if percent is None else percent / 100 for percent in (wanted.grade_limit, wanted.crossfall_limit)

@@ -39,7 +39,7 @@ else:
 XML_FORMATS: dict[str, ModuleType] = {"OpenDRIVE": opendrive, "net": sumo, "osm": osm}
 """Formats by the name of the outermost element."""
 NOUNS: dict[ModuleType, str] = {opendrive: "road", sumo: "edge", osm: "way"}
-"""What a row of the report is; of other formats, a feature."""
+"""Name of a row of the report; in other formats, a feature."""
 VECTORS: tuple[ModuleType, ...] = (geopackage, geojson, flatgeobuf, shapefile)
 """Formats of features. Their heights have the steps beside roads."""
 KINDS = (
@@ -50,29 +50,29 @@ PACKED = {
     b"BZh": "is compressed with bzip2; unpack it: bunzip2 --keep {file}",
     b"OSMHeader": "is OSM's PBF; convert it: osmium cat {file} -o streets.osm",
 }
-"""What to do with files that are not read, by their first bytes."""
+"""Advice for files in formats that are not read, by their first bytes."""
 DISTANCES = {"elevation_m": "", "superelevation_m": " with superelevation"}
-"""Distances from the surface in the summary, and what they are with."""
+"""Distances from the surface in the summary, and the words after them."""
 PLACES = ".gpkg"
-"""Places above limits are in a file beside the report, of the same name with this suffix."""
+"""Places above limits are in a file next to the report, with the same name and this suffix."""
 
 
 @dataclass(frozen=True)
 class LiftedFile:
-    """What became of a file."""
+    """The result for a file."""
 
     rows: tuple[Lifted, ...]
     earlier: int
-    """Number of tiles whose heights are of earlier sources or options."""
+    """Number of tiles whose heights are from earlier sources or options."""
     noun: str
-    """What a row is."""
+    """Name of a row."""
     options: Options
     tile_step_m: float = 0.0
-    """Largest step between tiles of the run below it."""
+    """Largest step between the run's tiles below the file."""
 
     @property
     def summary(self) -> str:
-        """One line: what has heights, and what has not."""
+        """One line: the lengths with and without heights."""
         parts = [f"{count(len(self.rows), self.noun)}, {_length(self.rows, 'length_m')}"]
         if any(row.without_ground_m > 0 for row in self.rows):
             kept = "go on level" if self.options.beyond == "flat" else "keep their heights"
@@ -90,7 +90,7 @@ class LiftedFile:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Lines for the user: what has no heights of the run, and why."""
+        """Lines for the user: the rows without heights of the run, and the reasons."""
         without = [row for row in self.rows if row.without_ground_m > 0 or row.points_without_ground]
         unknown = [row for row in self.rows if row.unknown_deck_m > 0]
         notes = []
@@ -147,10 +147,9 @@ def lift(
 ) -> LiftedFile:
     """Write a file with the heights of a run.
 
-    - `source`, `out`: the file, and where its copy is written: both are complete files of the same format.
-    - `crs`, `offset`: CRS of the file, and what is added to its coordinates (m), if the file does not say
-      them.
-    - `report`: a CSV with a row per road or feature; places above limits are in a GeoPackage beside it.
+    - `source`, `out`: the file and its copy, in the same format.
+    - `crs`, `offset`: CRS of the file, and an offset added to its coordinates (m), if the file has none.
+    - `report`: a CSV with a row per road or feature; places above limits are in a GeoPackage next to it.
     """
     _require_outputs(source, out, report)
     try:
@@ -177,7 +176,7 @@ def lift(
 
 
 def _format(source: Path) -> ModuleType:
-    """Return the module of a file's format, told by its first bytes."""
+    """Return the module of a file's format, found by the first bytes."""
     data = head(source)
     first = data.removeprefix(b"\xef\xbb\xbf").lstrip()
     if first[:1] == b"<" or first[:2] == b"\x1f\x8b":
@@ -204,7 +203,7 @@ def _format(source: Path) -> ModuleType:
 
 
 def _require_suffix(module: ModuleType, source: Path, out: Path) -> None:
-    """Raise an error if a copy of features is to be of another format, or is open in another program."""
+    """Raise an error if a copy of features would have another format, or is open in another program."""
     if module not in VECTORS:
         return
     if out.suffix.lower() not in module.SUFFIXES:
@@ -237,7 +236,7 @@ def _require_outputs(source: Path, out: Path, report: Path | None) -> None:
 
 @contextmanager
 def _named(out: Path, scratch: Path) -> Iterator[None]:
-    """Name the output in errors of writing it in a scratch folder; that of a full disk names no file."""
+    """Name the output in errors from the scratch folder; the error of a full disk names no file."""
     try:
         yield
     except OSError as error:
@@ -247,9 +246,9 @@ def _named(out: Path, scratch: Path) -> Iterator[None]:
 
 
 def _move(scratch: Path, out: Path) -> None:
-    """Move the files that a format has written into their places; the one that was asked for is the last.
+    """Move the files that a format has written to their places; the requested file is the last.
 
-    Parts of a Shapefile that has been replaced are removed if the new one has none: old indices.
+    Parts of a replaced Shapefile that the new Shapefile lacks are removed, such as old indices.
     """
     made = sorted(path for path in scratch.iterdir() if path.is_file() and not path.name.startswith("."))
     made.sort(key=lambda path: path.name == out.name)
@@ -264,7 +263,7 @@ def _move(scratch: Path, out: Path) -> None:
 
 
 def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> None:
-    """Write the table, and the places above limits if there are any."""
+    """Write the table, and the places above limits, if any."""
     table = pd.DataFrame(map(_row, rows), columns=list(_row(Lifted(""))), dtype=object)
     write(report, csv_text(table).encode())
     steep = [(row.id, place) for row in rows for place in row.steep]
@@ -287,7 +286,7 @@ def _write_report(rows: Sequence[Lifted], report: Path, in_run: RunSurface) -> N
 
 
 def _row(row: Lifted) -> dict[str, str | int | float]:
-    """Return a row of the report; lengths in m, heights in mm, slopes in percent, empty where not known."""
+    """Return a row of the report: lengths in m, heights in mm, slopes in percent; empty where unknown."""
     figures = {
         "length_m": (row.length_m, 1, 3),
         "without_ground_m": (row.without_ground_m, 1, 3),

@@ -1,4 +1,4 @@
-"""Points, lines and polygons with heights of a run: what the formats of features have in common."""
+"""Points, lines and polygons with heights of a run: the common part of all formats of features."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ else:
     pd = lazy("pandas")
 
 MOST_PIECES = 200_000
-"""Largest number of such points of one segment: a longer one than 100 km has them further apart."""
+"""Largest number of such points of a segment; in segments of more than 100 km their distance is larger."""
 ACROSS_M = 1.0
-"""Distance to both sides at which the crossfall of a line is measured (m)."""
+"""The crossfall of a line is measured at this distance on both sides (m)."""
 COLUMNS = ("grade_max_percent", "crossfall_max_percent", "error_estimate_m")
 """Columns that are added on request."""
 BATCH_BYTES, BATCH_FEATURES = 2**25, 50_000
-"""Size of the geometries, and number, of the features that are in memory at a time."""
+"""Size of the geometries and number of the features in memory at a time."""
 ZERO = "no ground of the run: has the height 0, as the format has one dimension for all"
 
 
@@ -55,11 +55,11 @@ class Feature:
 
 
 def vector_info(source: Path) -> dict[str, Any]:
-    """Return what pyogrio knows of the layer of a file."""
+    """Return pyogrio's description of the layer of a file."""
     try:
         name = vector_name(source)
         with warnings.catch_warnings():
-            # M of a Shapefile is read without GDAL.
+            # The M values of a Shapefile are read without GDAL.
             warnings.filterwarnings("ignore", "Measured")
             return layer_info(name, str(pyogrio.list_layers(name)[0, 0]))
     except ERRORS as error:
@@ -67,10 +67,10 @@ def vector_info(source: Path) -> dict[str, Any]:
 
 
 def level_columns(names: Iterable[str]) -> list[str]:
-    """Return the columns of a layer that say the level of a feature; none if nothing does."""
+    """Return the columns of a layer that give the level of a feature; empty if no column does."""
     known = attributes.LEVEL_COLUMNS
     own = [name for name in names if name.lower() in known]
-    # OSM's layer orders what crosses; by itself it is no level, and often something else.
+    # OSM's layer only orders crossing features: alone it is not a level, and often has another meaning.
     return own if any(name.lower() != "layer" for name in own) else []
 
 
@@ -85,14 +85,14 @@ def wanted_levels(columns: Mapping[str, Sequence[Any]], count: int) -> list[int]
 
 
 def percent_columns(row: Lifted) -> tuple[float | None, float | None, float | None]:
-    """Return the values of `COLUMNS`; None where not known."""
+    """Return the values of `COLUMNS`; None where unknown."""
     values = (100 * row.grade, 100 * row.crossfall, row.error_m)
     grade, crossfall, error = (round(value, 4) if np.isfinite(value) else None for value in values)
     return grade, crossfall, error
 
 
 def with_zero(shape: Shape | None, row: Lifted) -> tuple[Shape | None, Lifted]:
-    """Return a geometry and its row for formats in which all have a z: 0, with a note, without ground."""
+    """Return a geometry with z and its row, for formats where all have a z: without ground 0, with a note."""
     if shape is None or shape.z or not (shape.paths or shape.parts):
         return shape and shape.flat(), row
     return shape.flat(), replace(row, note=ZERO)
@@ -104,9 +104,9 @@ def lifted(
     """Yield each feature's geometry with heights, and its row of the report.
 
     Lines are straight between their vertices in the CRS of the file. Features without any ground are yielded
-    as they are.
+    unchanged.
 
-    - `features`: some of a layer's: they are in memory together.
+    - `features`: some features of a layer, which fit in memory.
     """
     paths = _Paths.of(features, run)
     ends = np.cumsum(np.bincount(paths.feature, paths.pieces, len(features)).astype(np.intp))
@@ -129,11 +129,11 @@ class _Paths:
     path: NDArray[np.intp]
     """``(n,)``, the number of the path of each vertex."""
     feature: NDArray[np.intp]
-    """``(n,)``, the number of its feature."""
+    """``(n,)``, the number of the feature of each vertex."""
     pieces: NDArray[np.intp]
-    """``(n,)``, into how many pieces the segment after each vertex is cut; 1 after the last one of a path."""
+    """``(n,)``, number of pieces of the segment after each vertex; 1 after the last vertex of a path."""
     length: Floats
-    """``(n,)``, length of that segment (m), 0 after the last one."""
+    """``(n,)``, length of that segment (m); 0 after the last vertex."""
 
     @classmethod
     def of(cls, features: Sequence[Feature], run: RunSurface) -> _Paths:
@@ -168,7 +168,7 @@ class _Paths:
 
 
 def _near(run: RunSurface, east: Floats, north: Floats, on: NDArray[np.intp]) -> Bools:
-    """Return which segments may lie on the run's tiles, by their first vertices."""
+    """Return which segments may lie on the run's tiles; ``on`` has their first vertices."""
     west, south, right, top = run.bounds
     inside = (np.fmax(east[on], east[on + 1]) >= west) & (np.fmin(east[on], east[on + 1]) <= right)
     inside &= (np.fmax(north[on], north[on + 1]) >= south) & (np.fmin(north[on], north[on + 1]) <= top)
@@ -177,17 +177,17 @@ def _near(run: RunSurface, east: Floats, north: Floats, on: NDArray[np.intp]) ->
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Points along paths: their vertices and those between them."""
+    """Points along paths: their vertices and points between them."""
 
     values: Floats
-    """``(n, 4)``, x, y, z, m, of which the last two are straight between the vertices."""
+    """``(n, 4)``, x, y, z, m; z and m are linear between the vertices."""
     east: Floats
     north: Floats
     along: Floats
     """``(n,)``, distance from the start of the group of paths (m)."""
     is_vertex: Bools
     path_starts: NDArray[np.intp]
-    """Index of the first point of each path, and at the end the number of all."""
+    """Index of the first point of each path, and last the number of all points."""
 
     @classmethod
     def of(cls, paths: _Paths, run: RunSurface) -> _Samples:
@@ -207,7 +207,7 @@ class _Samples:
         return cls(values, east, north, before[vertex] + share * paths.length[vertex], ~between, path_starts)
 
     def crossfalls(self, numbers: Numbers, run: RunSurface) -> Floats:
-        """Return the crossfall at each point of a line, between two points at its sides on its own level."""
+        """Return the crossfall at each point of a line, from points on both sides on the same level."""
         right, up = np.zeros(len(self.east)), np.zeros(len(self.east))
         for start, end in pairwise(self.path_starts.tolist()):
             if end - start > 1:
@@ -234,7 +234,7 @@ class _Path:
     m: bool
 
     def of(self, values: Any) -> Any:
-        """Return its part of values of all points."""
+        """Return the path's part of values of all points."""
         return values[self.start : self.end]
 
 
@@ -246,9 +246,9 @@ class _Group:
     z: Floats
     """``(n,)``, heights of the points on the levels of their paths; NaN without ground."""
     numbers: Numbers
-    """``(n,)``, numbers of these levels."""
+    """``(n,)``, numbers of the levels of the points."""
     flags: Bits
-    """``(n,)``, flags of the surface there."""
+    """``(n,)``, flags of the surface at the points."""
     crossfalls: Floats | None
     errors: Floats | None
     options: Options
@@ -287,7 +287,7 @@ def _group(
 def _on_levels(
     heights: Heights, features: Sequence[Feature], paths: Sequence[Sequence[_Path]]
 ) -> tuple[Floats, Numbers]:
-    """Return the heights of points along paths, each on its level, and the numbers of the levels."""
+    """Return the heights of points along paths, on the level of each path, and the numbers of the levels."""
     z, numbers = heights.ground.copy(), np.zeros(heights.z.shape[1], np.int8)
     other = heights.several
     if not other.any():
@@ -299,7 +299,7 @@ def _on_levels(
             place = slice(path.start, path.end)
             own = heights[place]
             if path.code == POINT and feature.wanted == ANY:
-                # As flexroad query: the highest.
+                # Like flexroad query: the highest level.
                 row = int(np.flatnonzero(np.isfinite(own.z[:, 0]))[-1])
                 z[place], numbers[place] = own.z[row], own.numbers[row]
                 continue
@@ -311,7 +311,7 @@ def _on_levels(
 
 
 def _point(name: str, shape: Shape, at: int, group: _Group) -> tuple[Shape, Lifted]:
-    """Return what `_with_heights` does, for a single point: a file may have millions."""
+    """Return the result of `_with_heights` for a single point, faster: a file may have millions of points."""
     z = float(group.z[at])
     if not math.isfinite(z):
         return shape, Lifted(name, levels=(), points_without_ground=1)
@@ -363,7 +363,7 @@ def _line(path: _Path, samples: _Samples) -> Line:
 def _row(
     feature: Feature, paths: list[_Path], z: Floats, kept: list[NDArray[np.intp]], group: _Group
 ) -> Lifted:
-    """Return the row of a feature with heights z at its points, of which each path has some."""
+    """Return the row of a feature with heights z at the points of its paths."""
     samples, options, place = group.samples, group.options, slice(paths[0].start, paths[-1].end)
     known, number = np.isfinite(group.z[place]), group.numbers[place]
     moved = np.abs(samples.values[place, 2] - z)[known & samples.is_vertex[place]]
@@ -411,10 +411,9 @@ def _row(
 
 @compiled()
 def grades(s: Floats, z: Floats, over: float) -> Floats:
-    """Return the grade from each point of a line to the first one that is at least ``over`` metres further.
+    """Return the grade from each point of a line to the first point at least ``over`` metres further.
 
-    NaN for the last points, and where a height is not known. That of a shorter line is the one between its
-    ends.
+    NaN for the last points, and where a height is unknown. A shorter line has the grade between its ends.
     """
     found, end = np.full(len(s), np.nan), 0
     if s[-1] - s[0] < over:
@@ -422,7 +421,7 @@ def grades(s: Floats, z: Floats, over: float) -> Floats:
             found[0] = (z[-1] - z[0]) / (s[-1] - s[0])
         return found
     for i in range(len(s)):
-        # Steps of a segment are a little shorter than the longest one.
+        # Distances between points are a little shorter than the largest allowed distance.
         while end < len(s) and s[end] - s[i] < over:
             end += 1
         if end == len(s):

@@ -1,4 +1,4 @@
-"""FlatGeobuf: features are copied by GDAL, as a stream of tables in which the geometries get heights."""
+"""FlatGeobuf: GDAL copies the features as a stream of tables, in which the geometries get heights."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ else:
 
 SUFFIXES = (".fgb",)
 KINDS = NAMES[POINT : COLLECTION + 1]
-"""Types of layers that GDAL writes with z; those of layers with several types it does not."""
+"""Types of layers that GDAL writes with z; it does not write z for layers of several types."""
 
 
 def frame(source: Path) -> Frame:
@@ -77,13 +77,13 @@ def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator
                 geometry_name=geometry,
                 geometry_type=kind.removesuffix(" Z") + " Z",
                 crs=info["crs"],
-                # Without an index the features keep their order; with one they are in that of the index.
+                # Without an index the features keep their order; else they get the order of the index.
                 SPATIAL_INDEX="YES" if info["capabilities"]["fast_spatial_filter"] else "NO",
                 **{key: metadata[key] for key in ("TITLE", "DESCRIPTION") if key in metadata},
             )
     except ERRORS as error:
         if failures:
-            # Through the stream of tables, only its text would come.
+            # The stream of tables passes on only its text.
             raise failures[0] from error
         raise TaskError(f"cannot be copied: {reason(error)}") from error
     if len(rows) < info["features"]:
@@ -93,7 +93,7 @@ def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator
 
 @contextmanager
 def _general_reader() -> Iterator[None]:
-    """Have GDAL read tables as of all formats: its reader for this one fails at features without geometry."""
+    """Use GDAL's general reader of tables: the reader for FlatGeobuf fails at features without geometry."""
     option = "OGR_FLATGEOBUF_STREAM_BASE_IMPL"
     before = pyogrio.get_gdal_config_option(option)
     pyogrio.set_gdal_config_options({option: True})
@@ -112,7 +112,7 @@ def _lifted_tables(
     rows: list[Lifted],
     failures: list[Exception],
 ) -> Iterator[pa.RecordBatch]:
-    """Yield the batches of a file with heights; add their rows, and the error with which it ends."""
+    """Yield the batches of a file with heights; append their rows, and an error that ends the file."""
     try:
         for batch in reader:
             columns = {name: batch.column(name) for name in batch.schema.names}

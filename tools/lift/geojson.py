@@ -1,4 +1,4 @@
-"""GeoJSON: the text of the file, in which the coordinates of the geometries are written anew with heights.
+"""GeoJSON: the text of the file is copied, and the coordinates of geometries are replaced, with heights.
 
 All other text is copied byte by byte: ids, properties, bounding boxes, members of other programs, and order.
 """
@@ -35,20 +35,20 @@ from flexroad.tools.lift.types import Frame, Lifted, Options, RunSurface
 
 SUFFIXES = (".geojson", ".json")
 DEGREES = "EPSG:4326"
-"""The CRS of files that name none, with longitude first."""
+"""The CRS of files that name no CRS, with longitude first."""
 SPACE = re.compile(r"[ \t\r\n\x1e]*")
 CHUNK = 2**22
 LARGEST = 2**28
 """Largest text of one feature."""
 NEAR_END = 64
-"""An error so near the end of the text read so far may be due to the end."""
+"""An error less than this before the end of the text read so far may be due to the end."""
 DECODER = json.JSONDecoder()
 DIGITS = 9
 """Decimals of the coordinates of new vertices: 0.1 mm in degrees."""
 
 
 def frame(source: Path) -> Frame:
-    """Return the CRS of a file: longitude and latitude if it names none."""
+    """Return the CRS of a file: longitude and latitude if it names no CRS."""
     vector_name(source)
     with source.open("rb") as data, mmap.mmap(data.fileno(), 0, access=mmap.ACCESS_READ) as text:
         if CRS.search(text) is None:
@@ -76,27 +76,27 @@ def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator
 
 
 def _opened(path: Path) -> TextIO:
-    # Each byte is a character, so that a text in any encoding that has ASCII is copied as it is.
+    # Each byte is a character, so that text in any encoding that extends ASCII is copied unchanged.
     return path.open(encoding="latin1", newline="")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Item:
-    """A feature, or a geometry that is none of a feature."""
+    """A feature, or a geometry outside of features."""
 
     text: str
     members: dict[str, tuple[Any, int, int]]
-    """Each member with start and end of its value in the text."""
+    """Each member with the start and end of its value in the text."""
 
     def of(self, name: str) -> Any:
-        """Return the value of a member, None without it."""
+        """Return the value of a member; None if it is missing."""
         return self.members.get(name, (None,))[0]
 
 
 def _written(
     batch: list[_Item | str], first: int, copy: TextIO, run: RunSurface, options: Options
 ) -> Iterator[Lifted]:
-    """Write some pieces of text, with the geometries of features replaced; yield their rows."""
+    """Write pieces of text with the geometries of features replaced; yield the rows of the features."""
     items = [piece for piece in batch if isinstance(piece, _Item)]
     properties = [values if isinstance(values := item.of("properties"), dict) else {} for item in items]
     names = level_columns(dict.fromkeys(name for values in properties for name in values))
@@ -126,7 +126,7 @@ def _written(
 
 
 def _text(value: Any) -> Any:
-    """Return a value with its text as its encoding says: UTF-8, else cp1252."""
+    """Return a value with its text decoded: UTF-8, else cp1252."""
     if not isinstance(value, str):
         return value
     try:
@@ -164,7 +164,7 @@ def _of_json(value: dict[str, Any]) -> Shape:
 def _of_coordinates(code: int, given: Any) -> Shape:
     paths = given if code == POLYGON else [[given]] if code == POINT else [given]
     own = [_path(path) for path in paths if path and path != [[]]]
-    # Values after the height have no meaning in GeoJSON, but are kept as M.
+    # Values after the height have no meaning in GeoJSON; they are kept as M.
     width = max((path.shape[1] for path in own), default=2)
     own = [np.pad(path, ((0, 0), (0, width - path.shape[1])), constant_values=np.nan) for path in own]
     return Shape(code, width > 2, width > 3, own)
@@ -201,7 +201,7 @@ def _edits(text: str, members: dict[str, tuple[Any, int, int]], shape: Shape) ->
 
 
 def _lists(shape: Shape) -> Any:
-    """Return the coordinates of a geometry as GeoJSON has them."""
+    """Return the coordinates of a geometry as lists of GeoJSON."""
     if shape.parts or shape.code > POLYGON:
         return [_lists(part) for part in shape.parts]
     paths = [_positions(path) for path in shape.paths]
@@ -230,19 +230,19 @@ def _with_columns(item: _Item, row: Lifted) -> tuple[int, int, str]:
 
 
 class _Reader:
-    """The text of a file, of which a part is in memory."""
+    """The text of a file; only a part is in memory."""
 
     def __init__(self, file: TextIO) -> None:
         self.file, self.text, self.at, self.ended = file, "", 0, False
         self.crs: list[str | None] = []
-        """What the members ``crs`` of the outermost object name; None if one says that there is none."""
+        """The CRS in the members ``crs`` of the outermost object; None for a member that is null."""
 
     def more(self) -> bool:
-        """Read on; return whether there was more."""
+        """Read more text; return whether there was more."""
         if self.ended:
             return False
         if len(self.text) - self.at > LARGEST:
-            raise TaskError(f"has a feature of more than {LARGEST >> 20} MiB, or is no whole JSON")
+            raise TaskError(f"has a feature of more than {LARGEST >> 20} MiB, or is not complete JSON")
         try:
             data = self.file.read(max(CHUNK, len(self.text) - self.at))
         except OSError as error:
@@ -251,7 +251,7 @@ class _Reader:
         return bool(data)
 
     def taken(self, parse: Any) -> Any:
-        """Return what a function makes of the text here and where it ends; reads on until it can."""
+        """Parse the text from here on with a function, reading more text until it succeeds."""
         while True:
             try:
                 found, end = parse(self.text, self.at)
@@ -261,7 +261,7 @@ class _Reader:
                 at = getattr(error, "pos", len(self.text))
                 cut = at > len(self.text) - NEAR_END or "Unterminated" in str(error)
                 if not (cut and self.more()):
-                    raise TaskError(f"is not whole JSON: {error}; write it again") from error
+                    raise TaskError(f"is not complete JSON: {error}; write it again") from error
             except RecursionError as error:
                 raise TaskError("has too many lists within each other; write it again") from error
 
@@ -273,7 +273,7 @@ class _Reader:
         return _Item(self.until(end), own)
 
     def until(self, end: int) -> str:
-        """Return the text up to a place, and go on from there."""
+        """Return the text up to a place, and continue from there."""
         text, self.at = self.text[self.at : end], end
         return text
 
@@ -289,7 +289,7 @@ def _sign(expected: str) -> Any:
 
 
 def _key(text: str, at: int) -> tuple[str, int]:
-    """Read the name of a member and the colon behind it, up to its value."""
+    """Read the name of a member and the colon after it, up to its value."""
     at = SPACE.match(text, at).end()  # type: ignore[union-attr]
     name, at = DECODER.raw_decode(text, at)
     if not isinstance(name, str):
@@ -299,7 +299,7 @@ def _key(text: str, at: int) -> tuple[str, int]:
 
 
 def _object(text: str, at: int) -> tuple[dict[str, tuple[Any, int, int]], int]:
-    """Read an object: its members with start and end of their values."""
+    """Read an object: its members with the start and end of their values."""
     sign, at = _sign("{")(text, at)
     members = dict[str, tuple[Any, int, int]]()
     end = SPACE.match(text, at).end()  # type: ignore[union-attr]
@@ -314,7 +314,7 @@ def _object(text: str, at: int) -> tuple[dict[str, tuple[Any, int, int]], int]:
 
 
 def _pieces(reader: _Reader) -> Iterator[_Item | str]:
-    """Yield a file as features and the text between them; joined, these are the file."""
+    """Yield a file as features and the text between them; all joined give the file."""
     reader.more()
     if reader.text.startswith("\xef\xbb\xbf"):
         yield reader.until(3)
@@ -328,7 +328,7 @@ def _pieces(reader: _Reader) -> Iterator[_Item | str]:
 
 
 def _is_collection(reader: _Reader) -> bool:
-    """Return whether the outermost object is a collection of features, by the member before its features."""
+    """Return whether the outermost object is a collection of features, by its members before the features."""
     found = re.compile(r'"(features|geometry|coordinates|geometries)"\s*:')
     while True:
         first = found.search(reader.text, reader.at)
@@ -369,6 +369,6 @@ def _items(reader: _Reader) -> Iterator[_Item | str]:
 
 
 def _first_of_list(text: str, at: int) -> tuple[str, int]:
-    """Read up to the first feature of a list, or over the end of an empty one."""
+    """Read up to the first feature of a list, or past the end of an empty list."""
     at = SPACE.match(text, at).end()  # type: ignore[union-attr]
     return (text[at], at + 1) if text[at] == "]" else ("", at)

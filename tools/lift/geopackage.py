@@ -1,8 +1,7 @@
 """GeoPackage: a copy of the file in which the geometries have heights.
 
-The file is copied as it is and its geometries are replaced in their rows, so that everything else in it
-stays: all tables, styles, views, ids, types and indices. The indices have no heights, and new vertices lie on
-the segments between the others.
+The file is copied, and the geometries are replaced in their rows. So all tables, styles, views, ids, types
+and indices stay. The indices stay valid: they have no heights, and new vertices lie on existing segments.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ SUFFIXES = (".gpkg",)
 ENVELOPES = (0, 32, 48, 48, 64)
 """Size of the envelope of a geometry by its number in the flags."""
 UNDEFINED = (0, -1, 99999)
-"""Numbers of coordinate systems that say nothing."""
+"""Numbers of undefined coordinate systems."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class _Layer:
 
 
 def frame(source: Path) -> Frame:
-    """Return the CRS of the first layer that has one."""
+    """Return the CRS of the first layer that has a CRS."""
     path = vector_name(source)
     with _opened(Path(path)) as file:
         return Frame(next((layer.crs for layer in _layers(file) if layer.crs), None))
@@ -62,7 +61,7 @@ def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator
     shutil.copyfile(path, out)
     with _opened(out) as file:
         try:
-            # The copy is not yet in its place: a crash leaves nothing behind.
+            # The copy is still a temporary file, so a crash does no harm.
             file.execute("PRAGMA journal_mode=OFF")
             file.execute("PRAGMA synchronous=OFF")
             layers = _layers(file)
@@ -80,13 +79,13 @@ def lift(source: Path, out: Path, run: RunSurface, options: Options) -> Iterator
 
 def _opened(path: Path) -> closing[sqlite3.Connection]:
     file = sqlite3.connect(path)
-    # Text in another encoding than UTF-8 is read as it can be; it is not written.
+    # Text that is not UTF-8 is read with replacements; it is not written.
     file.text_factory = lambda data: data.decode("utf-8", "replace")
     return closing(file)
 
 
 def _layers(file: sqlite3.Connection) -> list[_Layer]:
-    """Return the tables with geometries; views show those of their tables."""
+    """Return the tables with geometries; views show the geometries of their tables."""
     try:
         found = file.execute(
             "SELECT g.table_name, g.column_name, g.srs_id FROM gpkg_geometry_columns g JOIN sqlite_master m "
@@ -108,7 +107,7 @@ def _layers(file: sqlite3.Connection) -> list[_Layer]:
 
 
 def _crs(file: sqlite3.Connection, number: int) -> str | None:
-    """Return a coordinate system by its number; None if it says nothing."""
+    """Return a coordinate system by its number; None if it is undefined."""
     query = (
         "SELECT organization, organization_coordsys_id, definition FROM gpkg_spatial_ref_sys WHERE srs_id = ?"
     )
@@ -147,7 +146,7 @@ def _lift_layer(
 
 @contextmanager
 def _without_triggers(file: sqlite3.Connection, table: str) -> Iterator[None]:
-    """Leave out the triggers of a table for a while: they need functions of spatial libraries."""
+    """Context manager without the triggers of a table: they need functions of spatial libraries."""
     found = "SELECT name, sql FROM sqlite_master WHERE type = 'trigger' AND lower(tbl_name) = lower(?)"
     triggers = file.execute(found, (table,)).fetchall()
     for name, _ in triggers:
@@ -158,7 +157,7 @@ def _without_triggers(file: sqlite3.Connection, table: str) -> Iterator[None]:
 
 
 def _add_columns(file: sqlite3.Connection, layer: _Layer) -> str:
-    """Add the columns that are asked for; return the part of an update that sets them."""
+    """Add the requested columns; return the part of an update that sets them."""
     known = {name.lower(): name for name in layer.columns}
     for name in COLUMNS:
         if name not in known:
@@ -206,7 +205,9 @@ def _shape(row: tuple[Any, ...], layer: _Layer) -> Shape | None:
         return None
     try:
         if not isinstance(blob, bytes) or blob[:2] != b"GP":
-            raise TaskError("has a geometry that is none of a GeoPackage; repair the file with ogr2ogr")
+            raise TaskError(
+                "has a geometry in another format than a GeoPackage's; repair the file with ogr2ogr"
+            )
         number = blob[3] >> 1 & 7 if len(blob) > 3 else len(ENVELOPES)
         if number >= len(ENVELOPES):
             raise TaskError("has a damaged geometry; repair the file with ogr2ogr")
@@ -216,7 +217,7 @@ def _shape(row: tuple[Any, ...], layer: _Layer) -> Shape | None:
 
 
 def _blob(old: bytes, shape: Shape) -> bytes:
-    """Return a geometry with the header of the one that it replaces; of its envelope, the part in plan."""
+    """Return a geometry with the header of the geometry that it replaces, and its envelope in plan."""
     flags = old[3]
     has_envelope = flags >> 1 & 7 > 0
     header = old[:3] + struct.pack("B", flags & ~0b1110 | 0b10 * has_envelope) + old[4:8]

@@ -1,4 +1,4 @@
-"""Lines on the surface: where their heights are taken, which vertices they need, and how steep they are."""
+"""Lines on the surface: the points with heights, the needed vertices, and the grades."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from flexroad.tools.export.reference_line import stretches
 from flexroad.tools.lift.types import Steep
 
 STEP_M = 0.5
-"""Largest distance of points at which the heights of a line are taken (m)."""
+"""Heights along a line are taken at points that are at most this far apart (m)."""
 LONGEST_M = 1e8
-"""Two vertices are no farther from each other on the earth (m)."""
+"""More than the largest distance of two vertices on the Earth (m)."""
 MOST_POINTS = 1_000_000
-"""Of a line; longer ones have points at larger distances, so that wrong ones do not fill the memory."""
+"""Largest number of points of a line. On longer lines the points are farther apart, to limit the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Line:
     """The vertices of a line, and points between them; n in all."""
 
     x: Floats
-    """``(n,)``, in the coordinates of the file."""
+    """``(n,)``, x in the coordinates of the file."""
     y: Floats
     s: Floats
     """``(n,)``, distance along the line (m)."""
@@ -36,7 +36,7 @@ class Line:
 
     @classmethod
     def of(cls, x: Floats, y: Floats, metres: tuple[float, float] = (1.0, 1.0), step: float = STEP_M) -> Line:
-        """Return a line with points between its vertices, at most ``step`` from each other (m).
+        """Return a line with points between its vertices, at most ``step`` apart (m).
 
         - `metres`: length of a unit of x and of y (m).
         """
@@ -55,11 +55,11 @@ class Line:
         return cls(at[0], at[1], at[2], own)
 
     def needed(self, z: Floats, tolerance: float, add: bool = True) -> NDArray[np.intp]:
-        """Return the indices of the vertices that a line needs to stay within a tolerance, its own included.
+        """Return the indices of the vertices that a line needs to stay within a tolerance; it keeps its own.
 
-        - `z` ``(n,)``: heights (m); NaN where it keeps those that it has.
+        - `z` ``(n,)``: heights (m); NaN where it keeps its old heights.
         - `tolerance`: largest distance of the line from these heights (m).
-        - `add`: whether it gets vertices that it does not have.
+        - `add`: whether vertices may be added.
         """
         if not add or len(z) < 3:
             return np.flatnonzero(self.own)
@@ -70,7 +70,7 @@ class Line:
         return np.asarray(index[known[index] | self.own[index]])
 
     def grades(self, z: Floats, limit: float | None) -> tuple[float, tuple[Steep, ...]]:
-        """Return the largest grade (m/m), NaN if none is known, and the steepest place of each steep part."""
+        """Return the largest grade (m/m; NaN if unknown), and the steepest place of each steep part."""
         length = np.diff(self.s)
         at = np.flatnonzero((length > 0) & np.isfinite(np.diff(z)))
         grade = np.abs(np.diff(z)[at]) / length[at]
@@ -80,20 +80,20 @@ class Line:
         return float(grade.max()), steepest("grade", grade, limit, x, y)
 
     def length_where(self, places: Bools) -> float:
-        """Return the length (m) of some points of the line: each has half of the way to the next ones."""
+        """Return the length (m) of points of the line: each has half of the distance to its neighbours."""
         half = np.diff(self.s) / 2
         return float(np.sum(half * places[:-1]) + np.sum(half * places[1:]))
 
 
 def largest(values: Floats | Sequence[float]) -> float:
-    """Return the largest known value; NaN if there is none."""
+    """Return the largest known value; NaN if all are unknown."""
     return float(np.fmax.reduce(values, initial=np.nan))
 
 
 def steepest(
     kind: Literal["grade", "crossfall"], values: Floats, limit: float | None, x: Floats, y: Floats
 ) -> tuple[Steep, ...]:
-    """Return the place of the largest value of each stretch above a limit; without a limit, none."""
+    """Return the place of the largest value of each stretch above a limit; empty without a limit."""
     found = [] if limit is None else stretches(values > limit)
     most = [start + int(np.argmax(values[start:end])) for start, end in found]
     return tuple(Steep(kind, float(values[at]), float(x[at]), float(y[at])) for at in most)
@@ -101,16 +101,16 @@ def steepest(
 
 @compiled()
 def vertices(s: Floats, z: Floats, kept: Bools, tolerance: float) -> NDArray[np.intp]:
-    """Return the indices of the points that a line needs so that it stays within a tolerance.
+    """Return the indices of the points that a line needs to stay within a tolerance.
 
     - `s`, `z` ``(n,)``: distances along the line and heights (m).
-    - `kept` ``(n,)``: the points that the line has in any case; the first and last one are.
-    - `tolerance`: largest distance of the line from the heights of the points that it does not have (m).
+    - `kept` ``(n,)``: the points that always stay; the first and the last point must be among them.
+    - `tolerance`: largest distance of the line from the heights of the removed points (m).
     """
     chosen, start, last = [0], 0, len(s) - 1
     while start < last:
         end = start + 1
-        # Slopes from the start with which the line stays within the tolerance of all points passed.
+        # Limits of the slope from the start: the line stays within the tolerance of all points so far.
         low, high = -np.inf, np.inf
         while True:
             away = s[end] - s[start]

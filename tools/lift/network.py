@@ -1,8 +1,8 @@
 """The network solver: the level of each line of a network, and its heights beyond the surface.
 
 Lines (roads, lanes, ways) meet at nodes. The candidates of a line are the levels that the run has along it.
-What is known of one line passes on through its nodes to lines of which it is not known. OpenDRIVE, SUMO and
-OSM note their lines here and then `decide`. Features do not meet: they need `along` and `filled` alone.
+A known level or height is passed on through nodes to lines where it is unknown. OpenDRIVE, SUMO and OSM note
+their lines here and then call `decide`. Features do not meet: they need only `along` and `filled`.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from flexroad.tasks.types import Floats
 from flexroad.tools.export.reference_line import stretches
 
 ANY = np.int8(-128)
-"""A wanted level that is not known."""
+"""An unknown wanted level."""
 SAME_M = 0.25
-"""Levels whose heights at a node differ by less both pass it (m): at an abutment, deck and ground do."""
+"""Levels whose heights at a node differ by less meet there (m), such as deck and ground at an abutment."""
 NOWHERE = (np.nan, np.nan)
 GUESSED = "several levels from end to end, and nothing that it meets says which it is on; it has the highest"
 
 Numbers = NDArray[np.int8]
 Node = Any
-"""A place where lines meet, hashable: lines that meet have equal ones."""
+"""A place where lines meet, hashable: lines that meet have equal nodes."""
 Ends = tuple[float, float]
 
 
 def along(heights: Heights, wanted: Numbers, ends: Ends = NOWHERE) -> tuple[Floats, Numbers]:
     """Return the heights of points along a line, and the numbers of their levels.
 
-    Where a wanted level is known, it is taken; if the point does not have it, level 0. Where it is not, and
-    a stretch has several levels, that one is taken with which the grade changes least, from before the
-    stretch to behind it. A line that has several levels from end to end is on the highest.
+    A known wanted level is taken, or level 0 if the point lacks that level. On a stretch with several levels
+    and an unknown wanted level, the level is taken with which the grade changes least across the stretch. A
+    line with several levels from end to end is on the highest.
 
-    - `heights`: of n points in their order along a line.
+    - `heights`: heights of n points in their order along a line.
     - `wanted` ``(n,)``: numbers of levels, or `ANY`.
-    - `ends`: heights of the nodes at its ends; NaN where not known. Stretches go on from there.
+    - `ends`: heights of the nodes at its ends; NaN where unknown. The first and the last stretch meet them.
     """
     z, numbers = heights.ground.copy(), np.zeros(len(wanted), np.int8)
     rows = {k: row for k, row in zip(heights.numbers, heights.z, strict=True) if k != 0}
@@ -75,18 +75,18 @@ def complete(heights: Heights) -> dict[int, Floats]:
 
 
 def _misfit(ends: Sequence[float], nodes: Sequence[float]) -> float:
-    """Return the distances of the ends of a line from the heights of its nodes, as far as they are known."""
+    """Return the sum of the known height differences between the ends of a line and its nodes."""
     return float(sum(abs(a - b) for a, b in zip(ends, nodes, strict=True) if np.isfinite(a - b)))
 
 
 def _best(misfits: Mapping[int, float], bends: Mapping[int, float]) -> int:
-    """Return the level that passes the nodes and is the smoothest; the highest one of equals."""
+    """Return the smoothest level that meets the nodes; of equals, the highest."""
     least = min(misfits.values()) + SAME_M
     return min((k for k in misfits if misfits[k] <= least), key=lambda k: (bends[k], -k))
 
 
 def _bend(z: Floats, around: slice, here: slice, values: Floats) -> float:
-    """Return the sum of the changes of grade with some heights in a stretch, for points at equal steps."""
+    """Return the sum of the changes of grade if a stretch has given heights; points are equidistant."""
     tried = z.copy()
     tried[here] = values
     part = tried[around]
@@ -102,15 +102,15 @@ def of_levels(heights: Heights, numbers: Numbers) -> Floats:
 
 
 def levels_of(heights: Heights, sign: int) -> list[int]:
-    """Return the numbers of the levels of n points that have a sign: those of bridges or of tunnels."""
+    """Return the numbers of the levels of n points with a sign: bridges or tunnels."""
     rows = zip(heights.numbers, heights.z, strict=True)
     return [number for number, row in rows if number * sign > 0 and np.isfinite(row).any()]
 
 
 def level_of(heights: Heights, number: int) -> int | None:
-    """Return the level of a bridge or tunnel at n points; None if none of them has one of its kind.
+    """Return the level of a bridge or tunnel at n points; None if no point has a level of its kind.
 
-    Sources may number the decks of one place differently, so the nearest number of the same sign counts.
+    Sources may number the decks of one place differently, so the nearest number of the same sign is taken.
     """
     own = levels_of(heights, number)
     return min(own, key=lambda each: (abs(each - number), abs(each))) if own else None
@@ -127,9 +127,9 @@ def _tagged_level(tags: tuple[tuple[str, str], ...]) -> int:
 
 
 def filled(s: Floats, z: Floats, ends: Ends = NOWHERE) -> Floats:
-    """Return heights that are known everywhere: straight from known to known, level beyond.
+    """Fill unknown heights: linear between known heights, constant beyond the first and last.
 
-    - `s`, `z` ``(n,)``: distances along a line and heights (m); NaN where not known.
+    - `s`, `z` ``(n,)``: distances along a line and heights (m); NaN where unknown.
     - `ends`: heights of the nodes at its ends; NaN where not known.
     """
     z = z.copy()
@@ -145,39 +145,39 @@ class _Line:
     name: str
     nodes: tuple[Node, Node]
     candidates: Mapping[int, tuple[Ends, float]]
-    """Heights at both ends, and the changes of grade between them, on each level that it may be on."""
+    """For each possible level the heights at both ends, and the changes of grade between them."""
     numbers: tuple[int, int]
     """Levels at both ends, if its level is known."""
     tagged: bool
-    """Whether its attributes say its level."""
+    """Whether its attributes give its level."""
     several: tuple[bool, bool]
-    """Whether its ends have another level than the ground."""
+    """For both ends, whether there is another level than the ground."""
     junctions: tuple[str, str] | None
 
 
 @dataclass(eq=False)
 class Network:
-    """Levels and heights at nodes. Lines are noted as a file is read; `decide` makes the answers known."""
+    """Levels and heights at nodes. Lines are noted while a file is read; `decide` finds the results."""
 
     lines: list[_Line] = field(default_factory=list)
     open: list[tuple[Sequence[Node], Floats, Floats]] = field(default_factory=list)
     """Lines that leave the surface: nodes (None if no line meets there), distances and heights at them."""
     levels: dict[str, int] = field(default_factory=dict)
-    """Levels of the lines that have had several candidates, by name."""
+    """Levels of the lines with several candidates, by name."""
     guessed: set[str] = field(default_factory=set)
-    """Names of lines of which nothing says the level."""
+    """Names of lines whose level nothing determines."""
     junctions: defaultdict[str, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
-    """Levels of the lines that end at each junction where there are several."""
+    """Levels of the lines that end at each junction with several levels."""
     heights: dict[Node, float] = field(default_factory=dict)
     """Heights at which lines pass nodes (m)."""
     beyond: dict[Node, float] = field(default_factory=dict)
-    """Heights of nodes beyond the surface, if lines go on level there (m)."""
+    """Heights of nodes beyond the surface, where lines continue level (m)."""
     _votes: defaultdict[str, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
     _numbers: dict[Node, int] = field(default_factory=dict)
     _joined: dict[Node, Node] = field(default_factory=dict)
 
     def join(self, a: Node, b: Node) -> None:
-        """Make two nodes one."""
+        """Merge two nodes."""
         a, b = self._node(a), self._node(b)
         if a != b:
             self._joined[a] = b
@@ -188,7 +188,7 @@ class Network:
         return node
 
     def ends(self, nodes: Sequence[Node], beyond: bool = False) -> Ends:
-        """Return the heights at which lines pass two nodes, or go on beyond the surface; NaN if not known."""
+        """Return the heights of lines at two nodes, also beyond the surface on request; NaN if unknown."""
         known = self.beyond if beyond else self.heights
         first, last = (known.get(self._node(node), np.nan) for node in nodes)
         return first, last
@@ -201,9 +201,9 @@ class Network:
         wanted: Numbers,
         junctions: tuple[str, str] | None = None,
     ) -> None:
-        """Remember a line. Lines of one name, as the lanes of an edge, are on one level.
+        """Remember a line. Lines with the same name, such as the lanes of an edge, are on one level.
 
-        - `wanted`: as of `along`.
+        - `wanted`: as in `along`.
         - `junctions`: ids of the junctions at its ends.
         """
         rows, tagged = complete(heights), bool((wanted != ANY).any())
@@ -220,7 +220,7 @@ class Network:
         self.lines.append(_Line(name, nodes, candidates, *ends, junctions))
 
     def note_open(self, nodes: tuple[Node, Node], s: Floats, z: Floats) -> None:
-        """Remember a line that may leave the surface by its ends and the ends of what is on the surface."""
+        """Remember a line that may leave the surface: its ends, and the ends of its part on the surface."""
         known = np.flatnonzero(np.isfinite(z))
         at = [0, *known[[0, -1] if len(known) else []].tolist(), -1]
         self.open.append(((nodes[0], *[None] * (len(at) - 2), nodes[1]), s[at], z[at]))
@@ -228,9 +228,9 @@ class Network:
     def decide(self) -> None:
         """Give each line a level, and each node a height.
 
-        Lines whose level is known come first, those with attributes before others. Then lines follow that
-        meet known ones: of the levels that pass their nodes, they take the smoothest. If none meets a known
-        one, the first is on the highest.
+        Lines with a known level come first; among them, lines with attributes. Then follow lines that meet
+        known lines: of the levels that meet their nodes, they get the smoothest. If no line meets a known
+        line, the first line is on the highest level.
         """
         rest = defaultdict[str, list[_Line]](list)
         for line in sorted(self.lines, key=lambda each: not each.tagged):
@@ -256,7 +256,7 @@ class Network:
         return bool(np.isfinite(self.ends(line.nodes)).any())
 
     def _level(self, name: str, lines: Sequence[_Line]) -> int:
-        """Return the level of lines of one name: as its other lines, else by the heights of their nodes."""
+        """Return the level of lines with one name: as of its other lines, else by the nodes' heights."""
         common = set.intersection(*(set(line.candidates) for line in lines)) or set(lines[0].candidates)
         for number, _ in self._votes[name].most_common():
             if number in common:
@@ -270,7 +270,7 @@ class Network:
         return _best(misfits, bends)
 
     def _settle(self, line: _Line, numbers: tuple[int, int], heights: Ends) -> None:
-        """Give the nodes of a line its heights and levels, if they have none."""
+        """Give the nodes of a line its heights and levels, if theirs are unknown."""
         for i, node in enumerate(map(self._node, line.nodes)):
             if np.isfinite(heights[i]):
                 self.heights.setdefault(node, heights[i])
@@ -284,7 +284,7 @@ class Network:
         return numbers.most_common(1)[0][0] if numbers else 0
 
     def _go_on_level(self) -> None:
-        """Give nodes beyond the surface the heights at which the lines that meet there leave it."""
+        """Give nodes beyond the surface the heights at which their lines leave the surface."""
         rest = sorted(self.open, key=lambda line: not np.isfinite(line[2]).any())
         while rest:
             left = []

@@ -38,13 +38,13 @@ from flexroad.tools.lift.types import NO_POINTS, Frame, HeightsAt, Lifted, Optio
 from flexroad.tools.lift.xml_text import Part
 
 ALONG_M, LEAST_ALONG = 1.0, 4
-"""Distance of the cross-sections of a road (m), and their least number, less one."""
+"""Distance of the cross-sections of a road (m), and their least number minus 1."""
 ACROSS_M = 1.0
 """Distance of the points of a cross-section (m)."""
 LEAST_ACROSS, MOST_ACROSS = 4, 80
-"""Number of the points of a cross-section, less one."""
+"""Least and largest number of the points of a cross-section, minus 1."""
 MOST_FINER, MOST_FINE = 8, 4000
-"""Cross-sections for each of the usual ones, at most, where a road bends, and of a road that has more."""
+"""In bends, cross-sections are closer by at most this factor, up to this number per road."""
 LONGEST_M = 50_000.0
 """Longest road (m)."""
 Structure = tuple[Literal["bridge", "tunnel"], float, float]
@@ -61,20 +61,20 @@ class Road:
     s: Floats
     """``(n,)``: distances of the cross-sections, m."""
     t: Floats
-    """``(m,)``: their points, m from the reference line."""
+    """``(m,)``: points of the cross-sections, m from the reference line."""
     x: Floats
-    """``(n,)``: the reference line."""
+    """``(n,)``: x of the reference line."""
     y: Floats
     heading: Floats
     extent: plan_view.Extent
     elevation: Floats
-    """The profile that it had, ``(k, 5)``."""
+    """The road's old profile, ``(k, 5)``."""
     superelevation: Floats
     structures: tuple[Structure, ...]
 
     @property
     def inside(self) -> Bools:
-        """The points of cross-sections on the lanes, ``(n, m)``, or next to them."""
+        """The points of cross-sections on or next to the lanes, ``(n, m)``."""
         half = (self.t[1] - self.t[0]) / 2
         right, left = self.extent.right[:, None], self.extent.left[:, None]
         return np.asarray((self.t >= right - half) & (self.t <= left + half))
@@ -87,12 +87,12 @@ class Road:
 
     @property
     def nodes(self) -> tuple[Node, Node]:
-        """Its start and its end."""
+        """Nodes at its start and its end."""
         return (self.id, "start"), (self.id, "end")
 
     @property
     def links(self) -> Iterator[tuple[Node, Node]]:
-        """Its ends that are linked with other roads, and the ends of those."""
+        """Its ends that are linked with other roads, and the linked ends of these roads."""
         for name, node in zip(("predecessor", "successor"), self.nodes, strict=True):
             link = self.part.element.find(f"link/{name}")
             if link is not None and link.get("elementType") == "road":
@@ -105,7 +105,7 @@ class Road:
         return np.concatenate([x, self.x]), np.concatenate([y, self.y])
 
     def places(self) -> tuple[Floats, Floats]:
-        """Return x and y of the points: cross-sections, the line, before and after its points."""
+        """Return x and y of all points: cross-sections, reference line, `AHEAD_M` before and after it."""
         ahead, left = np.cos(self.heading), np.sin(self.heading)
         x = [(self.x[:, None] - self.t * left[:, None]).ravel()]
         y = [(self.y[:, None] + self.t * ahead[:, None]).ravel()]
@@ -116,7 +116,7 @@ class Road:
 
 
 def frame(source: Path) -> Frame:
-    """Return where the coordinates of a file are: its ``geoReference`` and ``offset``."""
+    """Return the coordinate system of a file: its ``geoReference`` and ``offset``."""
     for part in xml_text.elements(source, {"header", "road"}):
         if part.element.tag == "road":
             break
@@ -145,7 +145,7 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
 
 
 def _read(part: bytes | Part) -> Road | tuple[bytes, Lifted | None]:
-    """Return a road, or a text that stays as it is; of a road, with its row, which says why."""
+    """Return a road or an unchanged text; for a road that cannot be read also a row with the reason."""
     if isinstance(part, bytes):
         return part, None
     name = part.element.get("id", "")
@@ -168,7 +168,7 @@ def _road(part: Part, name: str) -> Road:
     s = np.linspace(0.0, length, count + 1)
     extent = plan_view.extent(element, s)
     reach = max(float(np.abs(extent.right).max()), float(np.abs(extent.left).max()))
-    # In narrow bends the outer lanes are long; kinks between geometries are not bends.
+    # In narrow bends the outer lanes are long. Kinks between geometries are not bends.
     kept = np.diff(np.searchsorted(plan.start[:, 0], s, side="right")) == 0
     turned = float(np.abs(np.diff(plan.at(s)[2]))[kept].max(initial=0.0)) * reach
     if np.isfinite(turned) and turned > ALONG_M:
@@ -177,7 +177,7 @@ def _road(part: Part, name: str) -> Road:
         extent = plan_view.extent(element, s)
     x, y, heading = plan.at(s)
     if not np.isfinite([x, y, heading]).all():
-        raise TaskError("has a planView with places that are no numbers")
+        raise TaskError("has a planView with places that are not numbers")
     right, left = float(extent.right.min()), float(extent.left.max())
     if left - right < ACROSS_M / 2:
         right, left = right - ACROSS_M / 2, left + ACROSS_M / 2
@@ -206,7 +206,7 @@ def _structures(road: ET.Element) -> Iterator[Structure]:
 
 
 def _old(road: ET.Element, path: str) -> Floats:
-    """Return the pieces of a profile that a road has; readers take 0 before the first one."""
+    """Return the pieces of a road's old profile; readers take 0 before the first piece."""
     pieces = plan_view.records(road.findall(path))
     if not len(pieces):
         return NONE
@@ -244,7 +244,7 @@ def _lifted(road: Road, heights: Heights, options: Options, of_links: _Linked) -
 def _sections(
     road: Road, heights: Heights, of_links: _Linked
 ) -> tuple[CrossSections, Numbers, float, NDArray[np.intp]]:
-    """Return the cross-sections, their levels, the length of unknown ones (m), their rows of `Heights.z`."""
+    """Return the cross-sections, their levels, the length of unknown levels (m), the rows of `Heights.z`."""
     n, m = len(road.s), len(road.t)
     line = heights[np.arange(n) * m + road.column]
     wanted, joined, unknown_m = _wanted(road, line)
@@ -261,7 +261,7 @@ def _sections(
 
 
 def _wanted(road: Road, line: Heights) -> tuple[Numbers, Bools, float]:
-    """Return the wanted levels, where a tunnel has none, and the length of structures without one (m)."""
+    """Return the wanted levels, the places in tunnels of unknown level, the length of unknown levels (m)."""
     wanted, joined, unknown_m = np.full(len(road.s), ANY), np.zeros(len(road.s), np.bool_), 0.0
     for kind, start, end in road.structures:
         here = (road.s >= start) & (road.s <= end)
@@ -277,9 +277,9 @@ def _wanted(road: Road, line: Heights) -> tuple[Numbers, Bools, float]:
 
 
 class _Linked:
-    """The roads of a file as a network, for levels and heights that other roads decide.
+    """The roads of a file as a network, for levels and heights that depend on other roads.
 
-    The file is read for it when the first such road comes.
+    The file is read for it when a road first needs it.
     """
 
     def __init__(self, source: Path, heights: HeightsAt) -> None:
@@ -316,7 +316,7 @@ def _row(
     s, t = road.s, road.t
     known = np.isfinite(sections.line)
     seen = sections.inside & known[:, None] & np.isfinite(sections.z)
-    # Lanes that are level have the height of the middle.
+    # Lanes with ``level`` have the height of the middle.
     t_read = np.broadcast_to(road.extent.middle[:, None] if road.extent.level else t, seen.shape)
 
     def missed(profile: Floats, lateral: Floats) -> float:

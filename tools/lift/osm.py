@@ -1,4 +1,4 @@
-"""OpenStreetMap's XML (``.osm``), also as Lanelet2 uses it: a tag ``ele`` at each node with a surface."""
+"""OpenStreetMap's XML (``.osm``), also of Lanelet2: nodes on the surface get a tag ``ele``."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from flexroad.tools.lift.types import POINTS, Frame, HeightsAt, Lifted, Options,
 from flexroad.tools.lift.xml_text import Part
 
 STEP_M = 1.0
-"""Largest distance of points at which the heights of a way are taken (m)."""
+"""Heights along a way are taken at points that are at most this far apart (m)."""
 DEGREES, LOCAL = ("lon", "lat"), ("local_x", "local_y")
-"""Where coordinates are: attributes of nodes, or tags of Lanelet2."""
+"""Names of coordinates: attributes of nodes, or tags of Lanelet2."""
 
 Indices = NDArray[np.intp]
 
 
 def frame(source: Path) -> Frame:
-    """Return where the coordinates of a file are: longitude and latitude, or local ones of Lanelet2."""
+    """Return the coordinate system of a file: longitude and latitude, or local coordinates of Lanelet2."""
     return Frame("EPSG:4326" if _names(source) == DEGREES else None)
 
 
@@ -62,7 +62,7 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
 
 
 def _names(source: Path) -> tuple[str, str]:
-    """Return where a file has its coordinates."""
+    """Return the names of a file's coordinates."""
     local = False
     for part in xml_text.elements(source, {"node"}):
         if np.isfinite(_place(part.element, DEGREES)).all():
@@ -72,7 +72,7 @@ def _names(source: Path) -> tuple[str, str]:
 
 
 def _place(node: ET.Element, names: tuple[str, str]) -> tuple[float, float]:
-    """Return the coordinates of a node, NaN if it has none or is deleted."""
+    """Return the coordinates of a node; NaN if it is deleted or lacks them."""
     if node.get("visible") == "false" or node.get("action") == "delete":
         return np.nan, np.nan
     values = node.attrib if names == DEGREES else _tags(node)
@@ -80,7 +80,7 @@ def _place(node: ET.Element, names: tuple[str, str]) -> tuple[float, float]:
 
 
 def _number(text: str | None) -> float:
-    """Return a number, NaN if a text is none."""
+    """Return the number in a text; NaN if the text is not a number."""
     try:
         return float(text or "nan")
     except ValueError:
@@ -97,7 +97,7 @@ def _id(text: str | None) -> int:
     except ValueError:
         number = 2**63
     if abs(number) >= 2**63:
-        raise TaskError(f"has the id {shown(text)}, which is no whole number; correct it")
+        raise TaskError(f"has the id {shown(text)}, which is not a whole number; correct it")
     return number
 
 
@@ -105,29 +105,29 @@ def _id(text: str | None) -> int:
 class _Way:
     id: str
     nodes: Indices
-    """Indices of its nodes; -1 if the file does not have one."""
+    """Indices of its nodes; -1 for a node that the file lacks."""
     level: int
-    """Its level by its tags."""
+    """Its level from its tags."""
     row: bool
-    """Whether the report has a row of it."""
+    """Whether the way has a row in the report."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Streets:
-    """Nodes in the order of the file, and the ways that have levels or a row of the report."""
+    """Nodes in the order of the file, and the ways with levels or a row in the report."""
 
     ids: NDArray[np.int64]
     x: Floats
     y: Floats
     before: Floats
-    """Heights that nodes had (m); NaN without."""
+    """Old heights of the nodes (m); NaN without."""
     ways: list[_Way]
     by_tags: bool
-    """Whether ways without a level in their tags are on the ground, as roads of OpenStreetMap are."""
+    """Whether ways without a level in their tags are on the ground, like roads of OpenStreetMap."""
     geographic: bool
-    """Whether x and y are degrees; else they are metres."""
+    """Whether x and y are in degrees; else in metres."""
     z: Floats
-    """New heights of the nodes (m); NaN where they keep those that they had."""
+    """New heights of the nodes (m); NaN where they keep their old heights."""
     network: Network = field(default_factory=Network)
 
     @classmethod
@@ -156,7 +156,7 @@ class _Streets:
         return cls(own, x, y, before, found, streets, names == DEGREES, np.full(len(own), np.nan))
 
     def find_heights(self, heights: HeightsAt) -> None:
-        """Give each node its height: that of the ground, or of the level of a way that has it."""
+        """Give each node its height: of the ground, or of the level of its way."""
         for start in range(0, len(self.ids), POINTS):
             part = slice(start, start + POINTS)
             self.z[part] = heights(self.x[part], self.y[part]).ground
@@ -178,11 +178,11 @@ class _Streets:
         for way in self.ways:
             if way.level >= 0:
                 meets[way.nodes[way.nodes >= 0]] = True
-        # A tunnel whose level is not known meets other roads on the ground.
+        # A tunnel of unknown level meets other roads on the ground.
         self.z[keeps & ~meets] = np.nan
 
     def lines(self, heights: HeightsAt, ways: list[_Way]) -> Iterator[tuple[_Way, Line, Heights]]:
-        """Yield each way with the points along it and their heights on all levels."""
+        """Yield each way with points along it and the heights of the points on all levels."""
         pairs = ((way, self._line(way)) for way in ways)
         for (way, line), found in with_heights(pairs, lambda each: (each[1].x, each[1].y), heights):
             yield way, line, found
@@ -193,7 +193,7 @@ class _Streets:
         return Line.of(x, y, self._metres(y), STEP_M)
 
     def _metres(self, y: Floats) -> tuple[float, float]:
-        """Return the lengths of a unit of x and y (m), at places whose y is known."""
+        """Return the lengths of a unit of x and y (m) at the mean of the known y."""
         if not self.geographic or not np.isfinite(y).any():
             return 1.0, 1.0
         middle = np.radians(np.nanmean(y))
@@ -202,7 +202,7 @@ class _Streets:
         return float(east), float(111132.95 - 559.82 * np.cos(2 * middle) + 1.175 * np.cos(4 * middle))
 
     def along(self, way: _Way, heights: Heights) -> tuple[Floats, Numbers, bool]:
-        """Return heights along a way, the numbers of their levels, and whether its level is known."""
+        """Return heights along a way, the numbers of their levels, and whether the way's level is known."""
         own = level_of(heights, way.level) if way.level else None
         level, ends = own or 0, NOWHERE
         if own is None and not self.by_tags:
@@ -211,7 +211,7 @@ class _Streets:
         return *along(heights, wanted, ends), own is not None or not way.level
 
     def go_on_level(self) -> None:
-        """Give nodes beyond the surface the heights of the nearest ones along their ways."""
+        """Give nodes beyond the surface the heights of the nearest nodes on it, along their ways."""
         network = Network()
         for way in self.ways:
             nodes = way.nodes[way.nodes >= 0]
@@ -229,15 +229,15 @@ def _ends(way: _Way) -> tuple[Node, Node]:
 
 @dataclass(frozen=True, eq=False)
 class _Added:
-    """What a copy of the file has more than the file."""
+    """The additions of a copy to the file."""
 
     streets: _Streets
     options: Options
     segments: dict[tuple[int, int], list[tuple[float, float, float]]] = field(default_factory=dict)
-    """New nodes (x, y, height) between two others, by their ids, the lower one first."""
+    """New nodes (x, y, height) between two nodes, by the ids of these, the lower id first."""
 
     def row(self, way: _Way, line: Line, heights: Heights) -> Lifted:
-        """Return the row of a way; note the nodes that it needs."""
+        """Return the row of a way; note its new nodes."""
         z, numbers, known = self.streets.along(way, heights)
         surface = np.isfinite(z)
         if way.level < 0 and not known:
@@ -263,7 +263,7 @@ class _Added:
         )
 
     def _note(self, way: _Way, line: Line, index: Indices, z: Floats) -> None:
-        """Note the new nodes between each two nodes of a way, if another way has not noted them."""
+        """Note the new nodes between consecutive nodes of a way, unless another way has noted them."""
         ends = np.flatnonzero(line.own)
         for i, (a, b) in enumerate(zip(way.nodes[:-1].tolist(), way.nodes[1:].tolist(), strict=True)):
             new = index[(index > ends[i]) & (index < ends[i + 1])]
@@ -284,13 +284,13 @@ class _Added:
                 number += 1
             else:
                 if ids and not named:
-                    # New nodes stand before the first way, as readers expect nodes first.
+                    # New nodes are written before the first way: readers expect nodes first.
                     yield from self._new_nodes(ids)
                     named = True
                 yield self._with_nodes(part, ids)
 
     def _new_ids(self) -> dict[tuple[int, int], list[int]]:
-        """Return the ids of new nodes: below zero and below all others, as of nodes without one in OSM."""
+        """Return ids of new nodes: negative, as for nodes that OSM does not have, and below all others."""
         next_id = min(int(self.streets.ids.min(initial=0)), 0) - 1
         ids = dict[tuple[int, int], list[int]]()
         for segment, places in self.segments.items():

@@ -1,4 +1,4 @@
-"""Roads of OpenDRIVE in plan: places on their reference lines, and how far their lanes reach.
+"""Roads of OpenDRIVE in plan: places on their reference lines, and the extent of their lanes.
 
 Reference lines are lines, arcs, spirals, cubics and parametric cubics.
 """
@@ -18,21 +18,21 @@ from flexroad.tasks.types import Floats
 from flexroad.tools.export.profiles import value_at
 
 CURVED, SPIRAL, CUBIC = range(3)
-"""Kinds of geometry; a line is curved with curvature 0, poly3 and paramPoly3 are cubics."""
+"""Kinds of geometry; a line is an arc with curvature 0, poly3 and paramPoly3 are cubics."""
 SAME_TURN = 1e-9
-"""A spiral whose curvature times its length changes by less is an arc (radians)."""
+"""A spiral is treated as an arc if the change of curvature times its length is less (radians)."""
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(12)
 ROUNDS = 12
 """Largest number of steps of Newton's method for the place on a cubic."""
 CLOSE_M = 1e-10
 SIDES = ("right", "left")
 HALF_WIDEST_M = 200.0
-"""Lanes further from the reference line are not looked at (m)."""
+"""Lanes farther from the reference line are ignored (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanView:
-    """The ``k`` geometries of a road, one after the other."""
+    """The ``k`` consecutive geometries of a road."""
 
     start: Floats
     """``(k, 4)``: s, x, y and heading at the start of each."""
@@ -51,7 +51,7 @@ class PlanView:
     def at(self, s: Floats) -> tuple[Floats, Floats, Floats]:
         """Return x, y and heading at distances along the road, ``(n,)`` each.
 
-        Before the start and beyond the end the first and last geometry go on.
+        Before the start and beyond the end, the first and last geometry are continued.
         """
         number = np.maximum(np.searchsorted(self.start[:, 0], s, side="right") - 1, 0)
         along = np.asarray(s) - self.start[number, 0]
@@ -91,7 +91,7 @@ def numbers(element: ET.Element, *names: str, missing: float | None = None) -> l
         if value is None:
             raise TaskError(f"has {element.tag} without {name}")
         if not math.isfinite(value):
-            raise TaskError(f"has {element.tag} with {name} {str(text)[:40]!r}, which is no number")
+            raise TaskError(f"has {element.tag} with {name} {str(text)[:40]!r}, which is not a number")
         found.append(value)
     return found
 
@@ -117,10 +117,10 @@ def _kind(geometry: ET.Element) -> tuple[int, list[float]]:
             if shape.get("pRange", "normalized") != "arcLength":
                 # The parameter is 1 at the end.
                 values = values / np.tile(float(length or 1.0) ** np.arange(4.0), 2)
-            # The curve ends where its parameter does, also if its length is not quite the one in the file.
+            # The curve ends where its parameter ends, even if its length differs a little from the file's.
             curve = float(_length(np.array([length]), values[None])[0])
             return CUBIC, [*values.tolist(), curve / length if length > 0 and curve > 0 else 1.0]
-    raise TaskError("has a geometry that is no line, arc, spiral, poly3 or paramPoly3")
+    raise TaskError("has a geometry that is not a line, arc, spiral, poly3 or paramPoly3")
 
 
 def _curved(along: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
@@ -131,10 +131,10 @@ def _curved(along: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _spiral(along: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return u, v and heading on clothoids, as a part of that which begins with curvature 0."""
+    """Return u, v and heading on clothoids, as parts of clothoids that begin with curvature 0."""
     curvature, change = values[:, 0], values[:, 1]
     scale = np.sqrt(np.pi / np.abs(change))
-    # The other clothoid has curvature 0 at its own start, and turns to the left.
+    # The whole clothoid has curvature 0 at its start, and turns to the left.
     before = curvature / change
     sine, cosine = scipy.special.fresnel(np.stack([before, before + along]) / scale)
     side = np.sign(change)
@@ -146,7 +146,7 @@ def _spiral(along: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _cubic(along: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return u, v and heading on parametric cubics, where they have a length from their start."""
+    """Return u, v and heading on parametric cubics, at a length from their start."""
     target = along * values[:, 8]
     p = along.copy()
     for _ in range(ROUNDS):
@@ -182,9 +182,9 @@ class Extent:
     """Outer border on the right, ``(n,)``, m from the reference line, positive to the left."""
     left: Floats
     middle: Floats
-    """Where the lane 0 is, ``(n,)``."""
+    """Position of lane 0, ``(n,)``."""
     level: bool
-    """Whether all lanes are ``level``; else the extent is that of the lanes that are not."""
+    """Whether all lanes are ``level``; else the extent is only of lanes that are not."""
 
 
 def extent(road: ET.Element, s: Floats) -> Extent:
@@ -210,7 +210,7 @@ def records(elements: list[ET.Element], at: str = "s") -> Floats:
 def _side(sections: list[ET.Element], side: str, s: Floats, middle: Floats, with_level: bool) -> Floats:
     """Return the outer border of the lanes of one side."""
     border = middle.copy()
-    # A section of a single side leaves the other one as it is.
+    # A section of a single side does not change the other side.
     own = [each for each in sections if each.get("singleSide") != "true" or each.find(side) is not None]
     starts = np.array([*(numbers(each, "s")[0] for each in own), np.inf])
     sign = 1.0 if side == "left" else -1.0

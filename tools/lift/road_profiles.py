@@ -1,8 +1,8 @@
-"""Profiles of a road of OpenDRIVE, elevation and superelevation: from heights, and in its text.
+"""Elevation and superelevation of a road of OpenDRIVE: computed from heights, and written into its text.
 
-The elevation is the surface at the reference line. At both ends of a road it has the height and the grade of
-the surface there, so that roads that meet in plan meet in height. The superelevation is the slope of the
-straight line through it that fits the cross-section best.
+The elevation is the surface at the reference line. At both ends it has the height and the grade of the
+surface, so roads that meet on the map also meet in height. The superelevation is the slope of the best
+straight line of the cross-section through that height.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from flexroad.tools.lift.network import NOWHERE, Ends, filled
 from flexroad.tools.lift.xml_text import Part
 
 AHEAD_M = 0.05
-"""Distance over which the slope of a surface is taken (m)."""
+"""Distance over which the slope of a surface is measured (m)."""
 STEEPEST = 0.5
-"""Largest slope across a road (m/m): where the surface is steeper, a step or the end of a deck is beneath."""
+"""Largest slope across a road (m/m): a steeper surface has a step, or the end of a deck."""
 LEAST_ACROSS_M = 0.25
-"""Points nearer to the reference line do not say how the cross-section falls (m)."""
+"""Points nearer to the reference line are not used for the slope of a cross-section (m)."""
 BREAK_M = 1e-3
-"""Distance behind the ground at which a profile goes on as it was (m)."""
+"""The old profile continues at this distance after the ground (m)."""
 LATERAL = ("superelevation", "crossfall", "shape", "crossSectionSurface")
 """The elements of a lateral profile that are replaced."""
 Edit = tuple[int, int, bytes]
@@ -41,7 +41,7 @@ class CrossSections:
     t: Floats
     """``(m,)``: distances from the reference line, ascending, positive to the left (m)."""
     z: Floats
-    """``(n, m)``, m; NaN where the surface is not."""
+    """``(n, m)``, m; NaN beyond the surface."""
     inside: Bools
     """``(n, m)``: the points on the lanes."""
     line: Floats
@@ -49,7 +49,7 @@ class CrossSections:
     grade: Floats
     """``(n,)``: slope of the surface along the reference line."""
     joined: Bools
-    """``(n,)``: places without ground between which a profile goes on smoothly, as in a tunnel."""
+    """``(n,)``: places without ground where a profile is continued smoothly, as in a tunnel."""
 
 
 def cross_sections(
@@ -57,20 +57,20 @@ def cross_sections(
 ) -> CrossSections:
     """Return cross-sections.
 
-    - `s`, `t`, `z`, `inside`, `joined`: as of `CrossSections`.
+    - `s`, `t`, `z`, `inside`, `joined`: as in `CrossSections`.
     - `beside` ``(n,)``: heights on the reference line, and `AHEAD_M` before and after it.
     """
     on, before, after = beside
     used = np.where(inside, z, np.nan)
     known = np.isfinite(used)
-    # Where the line is beside a deck, the cross-section goes on to it.
+    # Where the line is beside a deck, the cross-section is extended to the line.
     lost = ~np.isfinite(on) & (known.sum(axis=1) > 1)
     line = on.copy()
     for row in np.flatnonzero(lost):
         slope, at_line = np.polyfit(t[known[row]], used[row, known[row]], 1)
         line[row] = at_line if abs(slope) < STEEPEST else np.nan
     line[joined] = np.nan
-    # A single place with ground is no part of a profile.
+    # A single place with ground gives no part of a profile.
     has = np.isfinite(line)
     beside_one = np.convolve(has, [1, 0, 1], "same") > 0
     line[~beside_one] = np.nan
@@ -112,9 +112,9 @@ def profile(
 ) -> Floats | None:
     """Return pieces along the whole road, ``(k, 5)``; None if it has no ground.
 
-    - `values`, `slopes` ``(n,)``: of the surface.
-    - `old`: the pieces that it had, which stay beyond the ground.
-    - `flat`: whether it goes on level there instead, or to ``ends``: heights of the nodes, NaN if not known.
+    - `values`, `slopes` ``(n,)``: values of the surface, and their derivatives.
+    - `old`: the old pieces, which stay beyond the ground.
+    - `flat`: whether it is level there instead, or leads to ``ends``: heights of the nodes, NaN if unknown.
     """
     s, known = sections.s, np.isfinite(values)
     both = known[:-1] & known[1:]
@@ -142,7 +142,7 @@ def profile(
 
 
 def _part(pieces: Floats, start: float, end: float) -> Floats:
-    """Return the pieces from one distance to another; the first one begins there."""
+    """Return the pieces between two distances; the first piece is cut at the start."""
     inner = pieces[(pieces[:, 0] > start) & (pieces[:, 0] < end)]
     first = pieces[max(int(np.searchsorted(pieces[:, 0], start, side="right")) - 1, 0)]
     s, a, b, c, d = first
@@ -168,10 +168,10 @@ def texts(name: str, pieces: Floats) -> list[str]:
 
 
 def with_profiles(road: Part, elevation: Sequence[str], lateral: Sequence[str] | None) -> bytes:
-    """Return the text of a road with the elements of its profiles; missing ones are added in their place.
+    """Return the text of a road with new elements of its profiles; missing profiles are added.
 
-    - `elevation`, `lateral`: elements in ``elevationProfile`` and in ``lateralProfile``; None leaves the
-      latter as it is.
+    - `elevation`, `lateral`: elements in ``elevationProfile`` and in ``lateralProfile``. If ``lateral`` is
+      None, the lateral profile does not change.
     """
     around, within = _indents(road)
     edits, added = list[Edit](), ""
@@ -196,12 +196,12 @@ def with_profiles(road: Part, elevation: Sequence[str], lateral: Sequence[str] |
 
 
 def _end(road: Part, name: str) -> int:
-    """Return where the last element of a name ends."""
+    """Return the end of the last element with a name."""
     return road.spans[road.element.findall(name)[-1]][1]
 
 
 def _replaced(road: Part, name: str, old: Sequence[str], body: str, around: str) -> list[Edit]:
-    """Return the edits that replace some children of an element by others; the new ones come first."""
+    """Return the edits that replace some children of an element; the new children come first."""
     element = road.element.find(name)
     assert element is not None
     place = road.inside(element)
@@ -217,7 +217,7 @@ def _replaced(road: Part, name: str, old: Sequence[str], body: str, around: str)
 
 
 def _indents(road: Part) -> tuple[str, str]:
-    """Return the white space before the children of a road and before theirs; empty if it has no lines."""
+    """Return the white space before children and grandchildren of a road; empty if the text is one line."""
     plan = road.element.find("planView")
     assert plan is not None
     found = []

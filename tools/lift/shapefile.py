@@ -1,7 +1,7 @@
-"""Shapefile: its geometries are written anew with heights; the table and all other files are copied.
+"""Shapefile: the geometries are written again, with heights; the table and all other files are copied.
 
-The index of the geometries (``.shx``) is written with them. Indices of their extents in plan stay valid: no
-vertex is added off the segments.
+The index of the geometries (``.shx``) is written again, too. Indices of their extents in plan stay valid: new
+vertices lie on existing segments.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ KEPT = (*(end for end in SHAPEFILE_PARTS if end not in (".shx", ".dbf")), ".qpj"
 TYPES = {1: POINT, 3: LINE, 5: POLYGON, 8: MULTI_POINT}
 """Types of geometries by their number in the file, without z (11 and more) and m (21 and more)."""
 NO_M = -1e39
-"""Value of an m that there is none of."""
+"""Value that means: no m."""
 COLUMNS = (b"grade_pct", b"crossf_pct", b"error_m")
-"""The columns on request, whose names have at most ten characters here."""
+"""The requested columns; names have at most ten characters in this format."""
 WIDTH, DECIMALS = 12, 4
 
 
@@ -101,7 +101,7 @@ def _lifted(source: Path, out: Path, run: RunSurface, options: Options) -> Itera
         (code,) = struct.unpack_from("<i", header, 32)
         if code % 10 not in TYPES or code > 28:
             raise TaskError(
-                f"has geometries of the type {code}, which is none of points, lines and polygons; write "
+                f"has geometries of the type {code}, not points, lines or polygons; write "
                 "them as such with ogr2ogr -nlt"
             )
         copy = _Copy(shapes, index, code % 10, header)
@@ -123,7 +123,7 @@ def _lifted(source: Path, out: Path, run: RunSurface, options: Options) -> Itera
 
 
 def _batches(source: Path, file: BinaryIO) -> Iterator[tuple[list[_Record], list[int]]]:
-    """Yield geometries in the order of the file, with the levels that their attributes say."""
+    """Yield geometries in the order of the file, with the levels in their attributes."""
     batch, size, first = list[_Record](), 0, 0
     for record in _records(file):
         batch.append(record)
@@ -197,7 +197,7 @@ def _shape(data: bytes, of_file: int) -> Shape | None:
         return Shape(kind, z, m, parts=[Shape(POINT, z, m, [row[None]]) for row in values])
     if len(starts) and (starts[0] != 0 or (np.diff(starts) < 0).any() or starts[-1] > count):
         raise ValueError
-    # The rings of all polygons of a feature stand one after the other, as the parts of lines do.
+    # The rings of all polygons of a feature follow each other, like the parts of lines.
     paths = [path for path in np.split(values, starts[1:]) if len(path)]
     if kind == POLYGON:
         return Shape(kind, z, m, paths)
@@ -254,7 +254,7 @@ class _Copy:
         return found
 
     def finish(self) -> None:
-        """Write the headers: that of the source with another type, another length, and the range of z."""
+        """Write the headers: the header of the source with the new type, length and range of z."""
         bounds = np.where(np.isfinite(self.low), [self.low, self.high], 0.0)
         for file, size in ((self.shapes, self.at), (self.index, 100 + 8 * self.count)):
             file.seek(0)
@@ -264,7 +264,7 @@ class _Copy:
 
 
 def _with_columns(source: Path, out: Path, rows: Iterator[Lifted]) -> Iterator[Lifted]:
-    """Copy the table with the columns on request, whose values are those of the rows."""
+    """Copy the table with the requested columns, filled from the rows."""
     with source.open("rb") as file, out.open("wb") as copy:
         head = file.read(32)
         (count, start, width) = struct.unpack_from("<IHH", head, 4) if len(head) == 32 else (0, 0, 0)

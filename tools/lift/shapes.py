@@ -1,4 +1,4 @@
-"""Geometries as their coordinates: read from WKB and written to it, with z and m, parts and collections."""
+"""Geometries as coordinates, with z and m, parts and collections: read from WKB, and written to WKB."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ NAMES = (
     *("GeometryCollection", "CircularString", "CompoundCurve", "CurvePolygon", "MultiCurve", "MultiSurface"),
     *("Curve", "Surface", "PolyhedralSurface", "TIN", "Triangle"),
 )
-"""Types of geometries by their code in WKB; those up to collections are read."""
+"""Types of geometries by their code in WKB; types up to collections are read."""
 DEEPEST = 32
-"""Largest number of collections within each other."""
+"""Largest depth of collections within collections."""
 
 
 @dataclass(slots=True, eq=False)
@@ -47,7 +47,7 @@ class Shape:
         return Shape(self.code, True, self.m, own, [part.with_paths(paths) for part in self.parts])
 
     def flat(self) -> Shape:
-        """Return the shape with a z of 0 where it has none."""
+        """Return the shape with a z of 0 where z is missing."""
         if self.z:
             return self
         paths = [np.insert(path, 2, 0.0, axis=1) for path in self.paths]
@@ -92,7 +92,7 @@ def _read(data: bytes | memoryview, at: int, depth: int) -> tuple[Shape, int]:
 
 
 def _head(data: bytes | memoryview, at: int) -> tuple[Shape, str, int]:
-    """Return a geometry without its coordinates, the order of bytes, and where it goes on."""
+    """Return a geometry without its coordinates, the order of bytes, and the place of the coordinates."""
     order = "<" if data[at] else ">"
     (code,) = struct.unpack_from(order + "I", data, at + 1)
     at += 5

@@ -37,13 +37,13 @@ from flexroad.tools.lift.xml_text import Part
 NO_PROJECTION = ("", "!", "-", ".")
 """Values of ``projParameter`` of networks without a CRS."""
 FAR_M = 1e12
-"""A coordinate that is beyond all others."""
+"""A coordinate far beyond all others."""
 DIGITS = 3
-"""Decimal places of heights, and at least of the vertices that are added."""
+"""Decimal places of heights, and least number of decimal places of added vertices."""
 
 
 def frame(source: Path) -> Frame:
-    """Return where the coordinates of a network are, by its element ``location``."""
+    """Return the coordinate system of a network, from its element ``location``."""
     for part in xml_text.elements(source, {"location"}):
         x, y, z = _offset(part.element)
         crs = (part.element.get("projParameter") or "").strip()
@@ -54,8 +54,8 @@ def frame(source: Path) -> Frame:
 def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Iterator[Lifted]:
     """Copy a network with heights; yield a row of the report for each edge.
 
-    A second copy follows if the first one has met roads above roads or the limit of the surface: what a line
-    has there depends on those that it meets.
+    At roads above roads, or at the limit of the surface, the heights of a line depend on the lines that it
+    meets. Then the copy is written a second time.
     """
     network = Network()
     copy = _Copy(_places(source), network, heights, options)
@@ -68,18 +68,18 @@ def lift(source: Path, out: Path, heights: HeightsAt, options: Options) -> Itera
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """The vertices of a line, of an area or of a junction's place."""
+    """The vertices of a line or an area, or the place of a junction."""
 
     element: ET.Element
     name: str
     """Attribute of the element: ``shape``, ``outlineShape``; ``z`` for the place of a junction."""
     vertices: tuple[str, ...]
-    """As the file has them: ``x,y`` or ``x,y,z``."""
+    """Texts of the file: ``x,y`` or ``x,y,z``."""
     before: Floats
-    """Heights that the vertices had; NaN without."""
+    """Old heights of the vertices; NaN without."""
     line: Line
     area: bool = False
-    """Whether it is an outline, which gets no vertices."""
+    """Whether it is an outline; outlines get no new vertices."""
 
     @classmethod
     def of(cls, element: ET.Element, name: str, text: str, area: bool = False) -> _Shape | None:
@@ -93,7 +93,7 @@ class _Shape:
             values = [[]]
         if not text.isascii() or {len(vertex) for vertex in values} - {2, 3}:
             named = f"{element.tag} {shown(element.get('id'))}"
-            raise TaskError(f"has coordinates that are no numbers ({named}: {shown(text)}); correct them")
+            raise TaskError(f"has coordinates that are not numbers ({named}: {shown(text)}); correct them")
         table = np.array([[*vertex, np.nan][:3] for vertex in values])
         table[~np.isfinite(table)] = np.nan
         line = Line.of(table[:, 0], table[:, 1], step=np.inf if area else STEP_M)
@@ -101,12 +101,12 @@ class _Shape:
 
     @property
     def ends(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The coordinates of its ends in plan, as the file has them."""
+        """The texts of the coordinates of its ends in plan."""
         first, last = (tuple(self.vertices[i].split(",")[:2]) for i in (0, -1))
         return first, last
 
     def text(self, index: NDArray[np.intp], z: Floats) -> str:
-        """Return some of its points with heights; those without keep what they had."""
+        """Return the text of some of its points with new heights; points without keep the old text."""
         number = np.cumsum(self.line.own) - 1
         decimals = [len(each.partition(".")[2]) for each in self.vertices[0].split(",")[:2]]
         digits = max(DIGITS, *decimals)
@@ -123,11 +123,11 @@ class _Shape:
 
 
 _Piece = tuple[bytes | Part, list[_Shape]]
-"""An edge or a junction with its shapes; all other text has none."""
+"""An edge or a junction with its shapes; all other text has no shapes."""
 
 
 def _places(source: Path) -> dict[str, str]:
-    """Return ``x,y`` of each junction, as the file has it."""
+    """Return the text ``x,y`` of each junction."""
     places = dict[str, str]()
     for part in xml_text.elements(source, {"junction"}):
         if part.element.get("type") != "internal":
@@ -153,7 +153,7 @@ def _of_junction(junction: ET.Element) -> Iterator[_Shape | None]:
 
 
 def _offset(location: ET.Element) -> tuple[float, float, float]:
-    """Return what has been added to coordinates: x, y and height (m)."""
+    """Return the offset that has been added to coordinates: x, y and height (m)."""
     text = location.get("netOffset") or "0,0"
     try:
         x, y, z = (*map(float, text.split(",")), 0.0)[:3]
@@ -175,12 +175,12 @@ class _Copy:
     """A copy of a network with heights."""
 
     places: Mapping[str, str]
-    """Where the junctions are."""
+    """Places of the junctions."""
     network: Network
     heights: HeightsAt
     options: Options
     decided: bool = False
-    """Whether it is known what lines share where they meet; else this is noted."""
+    """Whether levels and heights of nodes are already decided; else lines are noted for that."""
 
     def written(self, source: Path, out: Path) -> Iterator[Lifted]:
         """Write the copy; yield the rows of the report."""
@@ -216,7 +216,7 @@ class _Copy:
             z, numbers = self._heights(element, shape, here, own)
             without = shape.line.length_where(~np.isfinite(z))
             if level < 0 and own is None:
-                # A tunnel whose level is not known meets other roads at its ends alone.
+                # A tunnel of unknown level meets other roads only at its ends.
                 z[1:-1] = np.nan
             start, taken = end, z
             if self.options.beyond == "flat" and self.decided:
@@ -264,7 +264,7 @@ class _Copy:
         return z, numbers
 
     def _going_on(self, shape: _Shape, z: Floats) -> Floats:
-        """Return the heights of a shape that goes on level beyond the surface."""
+        """Return the heights of a shape that continues level beyond the surface."""
         if not shape.area:
             return filled(shape.line.s, z, self.network.ends(shape.ends, beyond=True))
         places = np.column_stack([shape.line.x, shape.line.y])
@@ -293,7 +293,7 @@ class _Copy:
             values[shape.name] = shape.text(index, z)
 
     def _row(self, shape: _Shape, z: Floats, index: NDArray[np.intp], numbers: Numbers) -> Lifted:
-        """Return the figures of a lane with heights of the surface, NaN without."""
+        """Return the figures of a lane; NaN without heights of the surface."""
         line = shape.line
         grade, steep = line.grades(z, self.options.grade_limit)
         return Lifted(
@@ -308,7 +308,7 @@ class _Copy:
 
 
 def _complete(line: Line, z: Floats, numbers: Numbers, wanted: Numbers) -> None:
-    """Give the corners of an area that lie beside its deck the height of the nearest one on it."""
+    """Give the corners of an area beside its deck the height of the nearest corner on the deck."""
     beside = np.isfinite(z) & (numbers != wanted)
     on = np.flatnonzero(np.isfinite(z) & ~beside)
     for i in np.flatnonzero(beside) if len(on) else ():
@@ -316,7 +316,7 @@ def _complete(line: Line, z: Floats, numbers: Numbers, wanted: Numbers) -> None:
 
 
 def _joined(name: str, lanes: list[Lifted], unknown: bool, note: str) -> Lifted:
-    """Return the row of an edge: of each figure, the largest one of its lanes."""
+    """Return the row of an edge: the largest value of each figure over its lanes."""
     names = ("length_m", "without_ground_m", "before_m", "elevation_m", "grade")
     most: dict[str, Any] = {each: largest([getattr(lane, each) for lane in lanes]) for each in names}
     return Lifted(

@@ -1,4 +1,4 @@
-"""What the formats have in common: the surface of a run for a file, options, and the rows of the report."""
+"""Common types of the formats: the surface of a run for a file, options, and the rows of the report."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from flexroad.tasks.types import Floats
 HeightsAt = Callable[[Floats, Floats], Heights]
 """Heights at x and y, ``(n,)`` each, in the coordinates of the file."""
 NEAR_M = 5.0
-"""Distance up to which consecutive points are of one line (m); lines have a height every metre or less."""
+"""Consecutive points that are closer than this belong to one line (m); lines have a point every metre."""
 NO_POINTS = np.zeros(0), np.zeros(0)
-"""Of a part that needs no heights, for `with_heights`."""
+"""Points of a part that needs no heights, for `with_heights`."""
 POINTS = 500_000
-"""Number of points of a batch: some 200 MB with their heights and what they belong to."""
+"""Number of points of a batch: about 200 MB with their heights and their parts."""
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Where the coordinates of a file are: turned, then added to ``x``, ``y`` and ``z``, those of a CRS."""
+    """The coordinate system of a file: its coordinates are turned, then ``x``, ``y`` and ``z`` are added."""
 
     crs: str | None
-    """Any text that PROJ reads; None if the file names none."""
+    """Any text that PROJ reads; None if the file names no CRS."""
     x: float = 0.0
     y: float = 0.0
     z: float = 0.0
@@ -45,12 +45,12 @@ class Frame:
 
 @dataclass(eq=False)
 class _Seen:
-    """What has been looked up in a run for a file."""
+    """What is known of the points looked up for a file."""
 
     known: int = 0
     """Number of points with a height."""
     bounds: Floats = field(default_factory=lambda: np.array([np.inf, np.inf, -np.inf, -np.inf]))
-    """Of all points, in the CRS of the run."""
+    """Bounds of all points, in the CRS of the run."""
     earlier: set[str] = field(default_factory=set)
     tile_step_m: float = 0.0
     """Largest step between tiles on its lines."""
@@ -58,7 +58,7 @@ class _Seen:
 
 @dataclass(frozen=True, eq=False)
 class RunSurface:
-    """The surface of a run at coordinates of a file, or of a layer of a file with several."""
+    """The surface of a run at coordinates of a file, or of one of its layers."""
 
     ground: RunSampler
     crs: str
@@ -69,7 +69,7 @@ class RunSurface:
     seen: _Seen = field(default_factory=_Seen)
 
     def in_crs(self, crs: str | None, layer: str) -> RunSurface:
-        """Return the surface for a layer with its own CRS; a CRS that the user gave goes first."""
+        """Return the surface for a layer with its own CRS; a CRS given by the user has priority."""
         if self.given:
             return self
         if crs is None:
@@ -145,21 +145,21 @@ def plan_crs(crs: str) -> str:
     try:
         return in_plan(crs)
     except CatalogError as error:
-        raise TaskError(f"has a CRS that PROJ does not read: {error}; give another one with --crs") from error
+        raise TaskError(f"has a CRS that PROJ does not read: {error}; give another CRS with --crs") from error
 
 
 @dataclass(frozen=True)
 class Options:
-    """How files get their heights."""
+    """Options of heights for files."""
 
     tolerance_m: float = option(
         0.005, METHOD, "Largest distance of profiles and lines from the surface (m).", "METRES", min=0.0001
     )
     lateral: Literal["superelevation", "none"] = option(
-        "superelevation", METHOD, "What roads of OpenDRIVE have across."
+        "superelevation", METHOD, "Cross-section of OpenDRIVE roads."
     )
     beyond: Literal["keep", "flat"] = option(
-        "keep", METHOD, "Heights where the run has no surface: as they are, or level from there on."
+        "keep", METHOD, "Heights where the run has no surface: unchanged, or level from there on."
     )
     add_vertices: bool | None = option(
         None,
@@ -190,7 +190,7 @@ class Steep:
     value: float
     """Its grade or crossfall (m/m)."""
     x: float
-    """In the coordinates of the file."""
+    """Place in the coordinates of the file."""
     y: float
 
 
@@ -198,7 +198,7 @@ class Steep:
 class Lifted:
     """One road or feature of a file: a row of the report. Lengths and heights in m, grades in m/m.
 
-    NaN where a figure is not known, or the format does not have it.
+    NaN where a figure is unknown, or the format does not have it.
     """
 
     id: str
@@ -206,13 +206,13 @@ class Lifted:
     without_ground_m: float = 0.0
     """Length where the run has no surface."""
     levels: tuple[int, ...] = (0,)
-    """Numbers of the levels whose heights it has."""
+    """Numbers of the levels from which its heights are."""
     unknown_deck_m: float = 0.0
-    """Length on bridges and in tunnels of which the run does not have the level."""
+    """Length on bridges and in tunnels whose level the run does not have."""
     before_m: float = np.nan
-    """Largest distance of the heights that it had from the surface."""
+    """Largest distance of its old heights from the surface."""
     elevation_m: float = np.nan
-    """Largest distance of its carriageway from the surface, by its elevation alone."""
+    """Largest distance of its carriageway from the surface, with the elevation only."""
     superelevation_m: float = np.nan
     """The same with the superelevation."""
     grade: float = np.nan
@@ -226,13 +226,13 @@ class Lifted:
     points_without_ground: int = 0
     """Number of points where the run has no surface."""
     flags: int = 0
-    """Flags of the surface that it passes (`tasks.quality.flagged.flag_names`)."""
+    """Flags of the surface along it (`tasks.quality.flagged.flag_names`)."""
 
 
 def with_heights(
     parts: Iterable[T], points: Callable[[T], tuple[Floats, Floats]], heights: HeightsAt
 ) -> Iterator[tuple[T, Heights]]:
-    """Yield each part, in its order, with the heights of its points: a run reads each tile once per batch.
+    """Yield the parts in order, with the heights of their points. Each tile is read once per batch of points.
 
     - `points`: returns x and y of the points of a part, ``(n,)`` each.
     """

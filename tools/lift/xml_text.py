@@ -1,7 +1,7 @@
-"""XML files copied byte by byte, with some elements changed: what is not changed stays as it was written.
+"""XML files copied byte by byte, with some elements changed.
 
-A file is read once, in pieces, so that memory does not grow with it. Some of its elements are handed over as
-trees, with the places of their parts in the text; all other text is handed over as it is.
+A file is read once, in pieces, so that memory does not grow with it. Chosen elements are yielded as trees,
+with the places of their parts in the text. All other text is yielded unchanged.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from flexroad.tasks.errors import TaskError
 
 CHUNK_BYTES = 2**18
 LARGEST_BYTES = 2**26
-"""Largest text of one element that is handed over."""
+"""Largest text of a chosen element."""
 DEEPEST = 200
-"""Largest number of elements within each other."""
+"""Largest depth of elements."""
 ENCODINGS = ("utf-8", "us-ascii", "iso-8859-1", "windows-1252")
-"""In these, the characters of ASCII are one byte each."""
+"""Encodings in which the characters of ASCII are one byte each."""
 START_TAG = re.compile(rb"""<[^>"']*(?:"[^"]*"[^>"']*|'[^']*'[^>"']*)*>""")
 ATTRIBUTE = re.compile(rb"""\s(([^\s=<>"']+)\s*=\s*(?:"[^"]*"|'[^']*'))""")
 LATER = "; save it again with a program that writes plain XML in UTF-8"
@@ -34,12 +34,12 @@ LATER = "; save it again with a program that writes plain XML in UTF-8"
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """An element with its text as the file has it."""
+    """An element with its text in the file."""
 
     element: ET.Element
     text: bytes
     spans: Mapping[ET.Element, tuple[int, int]] = field(repr=False)
-    """Start and end in ``text`` of the element and of those in it."""
+    """Start and end in ``text`` of the element and of all elements in it."""
     path: tuple[str, ...] = ()
     """The names of the elements around it, from the root."""
 
@@ -51,14 +51,14 @@ class Part:
         return start, found.end()
 
     def inside(self, element: ET.Element) -> tuple[int, int] | None:
-        """Return start and end of the text in an element; None if it is written as an empty tag."""
+        """Return start and end of the text in an element; None if it is an empty tag."""
         _, first = self.start_tag(element)
         if self.text[first - 2 : first] == b"/>":
             return None
         return first, self.text.rindex(b"</", first, self.spans[element][1])
 
     def with_child(self, element: ET.Element, text: str) -> tuple[int, int, bytes]:
-        """Return the edit that adds a text before the end of an element."""
+        """Return the edit that inserts a text before the end of an element."""
         place = self.inside(element)
         if place is not None:
             return place[1], place[1], text.encode("ascii")
@@ -69,7 +69,7 @@ class Part:
     def replaced(self, edits: Iterable[tuple[int, int, bytes]]) -> bytes:
         """Return the text with some stretches replaced: start, end and new text of each.
 
-        They must not overlap; those of length 0 insert text.
+        Edits must not overlap. Edits of length 0 insert text.
         """
         parts, at = list[bytes](), 0
         for start, end, new in sorted(edits, key=lambda edit: edit[:2]):
@@ -79,7 +79,7 @@ class Part:
         return b"".join([*parts, self.text[at:]])
 
     def with_attributes(self, element: ET.Element, values: Mapping[str, str]) -> tuple[int, int, bytes]:
-        """Return the edit that gives an element attributes; those that it has are replaced in their place."""
+        """Return the edit that gives an element attributes; existing attributes are replaced."""
         start, end = self.start_tag(element)
         tag = self.text[start:end]
         for name, value in values.items():
@@ -95,13 +95,13 @@ class Part:
 
 
 def opened(path: Path) -> BinaryIO:
-    """Open a file to read; one whose name ends in ``.gz`` is unpacked as it is read."""
+    """Open a file to read; a file whose name ends in ``.gz`` is unpacked."""
     return cast("BinaryIO", gzip.open(path)) if path.suffix.lower() == ".gz" else path.open("rb")
 
 
 @contextmanager
 def written(path: Path) -> Iterator[BinaryIO]:
-    """Open a file to write; one whose name ends in ``.gz`` is compressed, without a time in it."""
+    """Open a file to write; a file whose name ends in ``.gz`` is compressed, without a time in it."""
     with path.open("wb") as file:
         if path.suffix.lower() != ".gz":
             yield file
@@ -133,11 +133,11 @@ def root_name(path: Path) -> str:
 
 
 def parts(file: BinaryIO, names: Collection[str]) -> Iterator[bytes | Part]:
-    """Yield a file as pieces of text and the elements of some names; joined, these are the file.
+    """Yield a file as elements with given names and the text between them; all joined give the file.
 
-    Of elements within each other, the outer one is handed over.
+    If such elements contain each other, the outer element is yielded.
 
-    - `names`: names of elements, as they are written.
+    - `names`: names of elements, as in the file.
     """
     reader = _Reader(names)
     try:
@@ -151,7 +151,7 @@ def parts(file: BinaryIO, names: Collection[str]) -> Iterator[bytes | Part]:
 
 
 def elements(path: Path, names: Collection[str]) -> Iterator[Part]:
-    """Yield the elements of some names of a file."""
+    """Yield the elements of a file with given names."""
     with opened(path) as file:
         for part in parts(file, names):
             if isinstance(part, Part):
@@ -160,7 +160,7 @@ def elements(path: Path, names: Collection[str]) -> Iterator[Part]:
 
 def _broken(error: expat.ExpatError) -> TaskError:
     where = f"line {error.lineno}, column {error.offset + 1}"
-    return TaskError(f"is not whole XML: {expat.ErrorString(error.code)}, {where}; save it again")
+    return TaskError(f"is not complete XML: {expat.ErrorString(error.code)}, {where}; save it again")
 
 
 def _declaration(version: str, encoding: str | None, standalone: int) -> None:
@@ -170,7 +170,7 @@ def _declaration(version: str, encoding: str | None, standalone: int) -> None:
 
 
 class _Reader:
-    """The state of reading a file: what is not handed over yet, and the element that is being read."""
+    """The state of reading a file: the text that is not yielded yet, and the current element."""
 
     def __init__(self, names: Collection[str]) -> None:
         self.names = frozenset(names)
@@ -183,12 +183,12 @@ class _Reader:
         self.parser.CharacterDataHandler = self.characters
         self.ready: list[bytes | Part] = []
         self.text, self.offset = bytearray(), 0
-        """Text from a place of the file on."""
+        """Text from a place in the file on."""
         self.path: list[str] = []
         self.open: list[tuple[ET.Element, int]] = []
         self.spans: dict[ET.Element, tuple[int, int]] = {}
         self.outer = 0
-        """Number of elements around the one that is being read."""
+        """Number of elements around the current element."""
 
     def feed(self, data: bytes) -> Iterator[bytes | Part]:
         if self.offset == 0 and not self.text and data.startswith((b"\xff\xfe", b"\xfe\xff", b"\0", b"<\0")):
@@ -196,7 +196,7 @@ class _Reader:
         self.text += data
         self.parser.Parse(data, not data)
         if not self.open:
-            # What the parser has not passed may be the start of an element.
+            # Text that the parser has not passed may be the start of an element.
             self.pass_to(self.parser.CurrentByteIndex if data else self.offset + len(self.text))
         elif len(self.text) > LARGEST_BYTES:
             name = self.open[0][0].tag

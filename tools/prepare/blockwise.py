@@ -40,12 +40,12 @@ class _PointsJob:
     """The input of a worker call that reads the points of a block."""
 
     buckets: PointBuckets
-    """Those that overlap the block and its rim."""
+    """The buckets that overlap the block and its rim."""
     grid: Grid
     """Cells of the block."""
     options: Options
     pixels: Grid | None
-    """Pixels of the orthophoto; None if there is none."""
+    """Pixels of the orthophoto; None without an orthophoto."""
     target: Path
     """Output file, ``.npz``: the heights of the cells and the orthophoto."""
 
@@ -72,11 +72,11 @@ def write_blocks(
 ) -> None:
     """Make the rasters of all blocks and write them; a progress bar is shown on stderr.
 
-    The points of each block are read first; rasters then take the cells around a block, too, but no points.
+    The points of each block are read first. The rasters of a block then need only cells, also around it.
 
     - `writer`: writer of the output rasters. Its grid is aligned to the block edges to whole cells.
-    - `bucketed`: the points on disk; they are removed.
-    - `executor`: runs two worker calls per block, on workers that are held.
+    - `bucketed`: the points on disk; they are removed at the end.
+    - `executor`: runs two worker calls per block.
     """
     first = list(_points_jobs(writer, bucketed, options))
     second = list(_cells_jobs(writer, bucketed, options, first))
@@ -102,7 +102,7 @@ def _points_jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Option
     buckets, whole = bucketed.buckets, writer.grid
     # Points sampled from a mesh have no colours: the orthophoto is drawn from its texture.
     dop_cell = writer.photo_grid.cell if writer.photo_grid and any(bucketed.has_colours) else None
-    # A point on the eastern or southern border of the area is in a cell outside, whose height counts, too.
+    # A point on the eastern or southern border of the area is in a cell outside, whose height is used, too.
     wider = whole.buffered(whole.cell)
     for index in buckets.overlapping(wider):
         grid, inner = (_block_grid(part, buckets.edge, index) for part in (wider, whole))
@@ -138,7 +138,7 @@ def _check_memory(of_points: Sequence[_PointsJob], of_cells: Sequence[_CellsJob]
         for index in job.buckets.overlapping(job.grid, reach):
             if index not in counts:
                 counts[index] = job.buckets.count(index)
-            # The points of a block may lie anywhere in it; of its neighbours only the rim is kept.
+            # The points of a block may lie anywhere in it; only the rim of its neighbours is kept.
             is_whole = job.buckets.share(index, job.grid.bounds) > 0
             points += counts[index] * (1 if is_whole else job.buckets.share(index, rim.bounds))
         pixels = job.pixels.width * job.pixels.height if job.pixels else 0
@@ -157,7 +157,7 @@ def _check_block(grid: Grid, points: float, cells: float, pixels: int) -> None:
 
 
 def _block_grid(whole: Grid, edge: float, index: BlockIndex) -> Grid | None:
-    """Return the cells of a block that are part of the complete grid, or None if there are none."""
+    """Return the cells of a block that are part of the complete grid; None if the block is outside."""
     left, right = (round((index[0] * edge + d - whole.west) / whole.cell) for d in (0, edge))
     top, bottom = (round((whole.north - index[1] * edge - d) / whole.cell) for d in (edge, 0))
     left, right = max(left, 0), min(right, whole.width)
@@ -187,9 +187,9 @@ def _make_rasters(job: _CellsJob) -> _CellsJob:
 
 
 def _cells(sources: Sequence[tuple[Grid, Path]], rim: Grid) -> Floats:
-    """Return `CELL_LAYERS` of several blocks on one grid; cells of no block have no points."""
+    """Return `CELL_LAYERS` of several blocks on one grid; cells outside of all blocks have no points."""
     layers = np.full((len(CELL_LAYERS), *rim.shape), np.nan)
-    # The number of points of the top layer.
+    # The layer with the number of points of the top layer.
     layers[2] = 0
     for grid, path in sources:
         with np.load(path) as file:

@@ -39,7 +39,7 @@ NOT_OF_PHOTOS = ("crs", "height_unit")
 
 @dataclass(frozen=True)
 class _Options:
-    """How ground is found, and the sizes of photographs; None keeps the default of the method."""
+    """Options of ground filters, and the sizes of photographs; None keeps the default of the method."""
 
     ground: Literal["auto", "classes", "filter", "morphological"] = option(
         "auto", POINTS, "How ground is identified; auto: by classes if all files have them, else by filter."
@@ -74,7 +74,7 @@ class _Options:
         return Options(ground="filter", filter=ground_filter.Options(**given), **classes)
 
     def of_photos(self, photos: from_photos.PhotosOptions) -> from_photos.PhotosOptions:
-        """Return the options of photographs with the sizes."""
+        """Return the options of photographs with the given sizes."""
         return replace(
             photos,
             sfm=sfm.Options(**_given(image_size=self.image_size)),
@@ -141,10 +141,10 @@ def prepare(
     workers: options.Workers = None,
     common: PrepareOptions,
 ) -> None:
-    """Make rasters and a catalog of points, meshes or photographs.
+    """Make rasters and a catalog from points, meshes or photographs.
 
-    Points of a mesh are sampled on it. Photographs are reconstructed as a mesh. Of an OpenDroneMap project
-    its own rasters are taken, else its textured mesh, else its points.
+    Points are sampled on a mesh. A mesh is reconstructed from photographs. From an OpenDroneMap project its
+    rasters are taken, else its textured mesh, else its points.
     """
     kind, paths = recognised(inputs)
     if kind == "odm":

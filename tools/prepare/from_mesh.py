@@ -1,16 +1,15 @@
 """``flexroad prepare``: rasters of a textured mesh, from points sampled on its surface.
 
-With a road mask, the ground truth of the paper's DSC3D section is made, too. The paper says that the DTM is
-refined "via our ECSRC algorithm" and that "road masks, enhanced through ECSRC", take "ground truth terrain
-from DTM and road from DSM", and no more. Here
+With a road mask, the ground truth of the paper's DSC3D section is made, too. The paper only says that the DTM
+is refined "via our ECSRC algorithm" and that "road masks, enhanced through ECSRC", take "ground truth terrain
+from DTM and road from DSM". Here
 
 - *refined* means: cells with ground points are clustered like road cells, by their heights. Cells outside
-  all clusters of `min_area_m2` differ from the surrounding ground by more than `theta_z_m`: the ground filter
-  accepted them wrongly (roofs, hedges, floating fragments), and they are interpolated from their
-  surroundings. Cells without ground points are not clustered: interpolated slopes would connect a roof to
-  its garden;
+  all clusters of `min_area_m2` differ from the surrounding ground by more than `theta_z_m`. The ground filter
+  accepted them wrongly (roofs, hedges, floating fragments). They are interpolated from their surroundings.
+  Cells without ground points are not clustered: interpolated slopes would connect a roof to its garden.
 - *enhanced* means: the road mask is clustered by the DSM, as in the stage `ecsrc`; cells that are not kept
-  (crowns, vehicles, roofs) count as terrain.
+  (crowns, vehicles, roofs) are terrain.
 
 This reference has passed the same filter as the method to be evaluated, so it cannot show errors of the
 filter. Reports of figures against it must say so (`CIRCULAR`).
@@ -53,7 +52,7 @@ from flexroad.tools.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.tools.prepare.roads import add_roads, check_roads
 
 BAND = 1024
-"""Rows of the orthophoto drawn at a time, so that memory does not grow with the area."""
+"""Rows of the orthophoto drawn at a time, to limit the memory."""
 REFINE_BYTES, REFERENCE_BYTES = 300, 50
 """Memory of the refinement and of the reference per cell of the area (bytes); measured."""
 POINTS = to_rasters.Options(ground="filter")
@@ -61,12 +60,12 @@ POINTS = to_rasters.Options(ground="filter")
 CIRCULAR = "reference by ECSRC itself (circular)"
 """Text that is added to the name of data with this reference."""
 ECSRC = ecsrc.Options(keep_largest=None)
-"""The paper's thresholds; all clusters of enough area are kept, as their number grows with the area."""
+"""The paper's thresholds; all clusters above the least area are kept, as their number grows with the area."""
 
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """The options that only meshes have."""
+    """Options of meshes only."""
 
     up: Literal["y", "z"] | None = option(
         None, MESH, "The mesh's upward axis; default: y in glTF, z elsewhere."
@@ -207,9 +206,9 @@ def _sample_points(
 def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float) -> Floats:
     """Interpolate the ground cells of a DTM that ECSRC does not keep.
 
-    - `dtm` ``(H, W)``: bare ground as given by a ground filter, m; NaN where there is none.
+    - `dtm` ``(H, W)``: bare ground from a ground filter, m; NaN where unknown.
     - `ground` ``(H, W)``: cells with ground points; the heights of the others are interpolated.
-    - `fill_m`: gaps up to this width are interpolated linearly (m), wider ones become NaN.
+    - `fill_m`: gaps up to this width are interpolated linearly (m), wider gaps become NaN.
     - result ``(H, W)``: m; cells without a height in ``dtm`` have none in the result.
     """
     ground = ground & np.isfinite(dtm)
@@ -224,7 +223,7 @@ def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float) -> Floats:
 def reference(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> tuple[Floats, Bools]:
     """Return the paper's ground truth: heights of road and terrain, and the road mask, ``(H, W)`` each.
 
-    - `dsm`, `dtm` ``(H, W)``: highest surface and refined bare ground, m; NaN where there is none.
+    - `dsm`, `dtm` ``(H, W)``: highest surface and refined bare ground, m; NaN where unknown.
     - `road` ``(H, W)``: the raw road mask.
     """
     kept = _kept(dsm, road, grid)
@@ -232,6 +231,6 @@ def reference(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> tuple[Floats
 
 
 def _kept(heights: Floats, cells: Bools, grid: Grid) -> Bools:
-    """Return the cells that ECSRC keeps when they are clustered by these heights."""
+    """Return the cells that ECSRC keeps if it clusters them by these heights."""
     data = TileData("", grid, grid, heights, heights)
     return ecsrc.ecsrc(data, RoadMask(grid, grid, cells, np.zeros_like(cells)), ECSRC).mask

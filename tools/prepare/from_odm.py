@@ -1,7 +1,6 @@
 """``flexroad prepare``: rasters from an OpenDroneMap project.
 
-Uses the project's surface model and orthophoto; without a surface model its textured mesh; without a mesh
-its point cloud.
+The input is the project's surface model and orthophoto, else its textured mesh, else its point cloud.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ FILTER_BYTES = 200
 
 
 def found(folder: Path) -> tuple[str, list[Path]]:
-    """Return what rasters of a project are made of, and where it is: ``odm`` is its own surface model."""
+    """Return the kind and the path of the input for a project's rasters; ``odm`` is its surface model."""
     for name in (*MESHES, *CLOUDS) if not (folder / DSM).is_file() else ():
         if (folder / name).is_file():
             return "mesh" if name in MESHES else "points", [folder / name]
@@ -100,7 +99,7 @@ def prepare_odm(
 
 
 def _frame(dsm: Path, common: PrepareOptions) -> tuple[MetricTransform, Bounds, datetime | None]:
-    """Return the transform to metres, the bounds of the surface model (m), and the date in its tags."""
+    """Return the transform to metres, the bounds of the surface model (m), and the date from its tags."""
     with _opened(dsm) as source:
         crs = source.crs.to_wkt() if source.crs else common.crs
         if crs is None:
@@ -114,7 +113,7 @@ def _frame(dsm: Path, common: PrepareOptions) -> tuple[MetricTransform, Bounds, 
 def _resample_heights(
     writer: RasterWriter, layer: str, path: Path, frame: MetricTransform, reduction: Resampling
 ) -> None:
-    """Write a raster of heights, resampled to the writer's cells; see `_warped` for the method."""
+    """Write a raster of heights, resampled to the writer's cells by `_warped`."""
     with _opened(path) as source, _warped(source, frame, writer.grid, reduction) as warped:
         for part, window in _windows(writer.grid):
             heights = warped.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
@@ -162,7 +161,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _warped(source: Any, frame: MetricTransform, grid: Grid, reduction: Resampling) -> WarpedVRT:
-    """Return a raster resampled to a grid: by ``reduction`` if its own cells are smaller, else bilinear."""
+    """Return a raster resampled to a grid: by ``reduction`` if its cells are smaller, else bilinearly."""
     cell = max(abs(source.transform.a), abs(source.transform.e)) * (frame.plan_m or 1.0)
     return WarpedVRT(
         source,
@@ -172,7 +171,7 @@ def _warped(source: Any, frame: MetricTransform, grid: Grid, reduction: Resampli
         width=grid.width,
         height=grid.height,
         resampling=reduction if cell < grid.cell * 1.001 else Resampling.bilinear,
-        # The alpha band marks pixels outside the source as having no colour.
+        # The alpha band marks pixels outside the source: they have no colour.
         add_alpha=source.count >= 3
         and source.nodata is None
         and ColorInterp.alpha not in color_kinds(source),

@@ -1,6 +1,6 @@
 """``flexroad prepare``: rasters from overlapping photographs, via a mesh as in the paper.
 
-GNSS tags -> poses and sparse points -> dense cloud -> Poisson mesh -> rasters as of any other mesh.
+GNSS tags -> poses and sparse points -> dense cloud -> Poisson mesh -> rasters as from other meshes.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ MERGED_AT_ONCE = 5_000_000
 
 @dataclass(frozen=True)
 class PhotosOptions:
-    """The options that only photographs have."""
+    """Options of photographs only."""
 
     control: Path | None = option(
         None, PHOTOS, "Ground control, CSV: image,x_px,y_px,easting,northing,height.", "FILE"
     )
-    """A column ``name`` is optional."""
+    """The column ``name`` is optional."""
     control_crs: str | None = None
     """CRS of the control; None: the CRS of the rasters."""
     sfm: sfm.Options = field(default_factory=sfm.Options)
@@ -90,7 +90,7 @@ def prepare_photos(
     """Make the rasters and the catalog of an area from overlapping photographs with GNSS tags.
 
     - `images`: photographs, or folders of them.
-    - `common`: options shared by all commands. Cells finer than the stereo resolves are made coarser, with a
+    - `common`: options shared by all commands. Cells that are too small for the stereo are enlarged, with a
       note.
     """
     check_roads(common)
@@ -147,7 +147,7 @@ def _date(placed: PlacedPhotos) -> datetime | None:
 
 
 def _coarsened(common: PrepareOptions, pixel_m: float) -> tuple[PrepareOptions, tuple[str, ...]]:
-    """Return the options with cells no finer than the stereo resolves, and a note if they were changed."""
+    """Return the options with cells not smaller than stereo resolves, and a note if they were changed."""
     finest = PIXELS_PER_CELL * pixel_m
     if min(common.cell_m, common.dop_cell_m) >= finest:
         return common, ()

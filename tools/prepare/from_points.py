@@ -27,12 +27,12 @@ from flexroad.tools.prepare.roads import add_roads, check_roads
 
 Ground = Literal["auto", "classes", "filter", "morphological"]
 MIN_GROUND = 0.01
-"""A file with a smaller share of ground points is taken as not classified."""
+"""A file with a smaller share of ground points is treated as not classified."""
 DENSE, DENSE_CONFIDENCE = 50.0, 3.0
 """Above this density (points per m2) the slope filter uses this ``confidence``."""
 FEWER = "prepare fewer files at a time"
 LARGE, GAP_M = 10**9, 10_000.0
-"""From so many cells on, an area may not have an empty gap of this width (m) and of half its side."""
+"""In areas with at least this many cells, an empty gap of this width (m) and half the side is an error."""
 
 
 def prepare_points(
@@ -46,14 +46,13 @@ def prepare_points(
 ) -> PreparedDataset:
     """Make the rasters and the catalog of an area from point clouds.
 
-    Every file is decoded once. Memory holds one chunk of a file or one block per worker, whatever the size of
-    the files and the area. Temporary files take 16 bytes per point.
+    Every file is decoded once. A worker has one chunk of a file or one block in memory, so memory does not
+    depend on the size of the files and the area. Temporary files take 16 bytes per point.
 
     - `files`: LAS, LAZ or COPC files, and folders of them.
     - `options`: how points become rasters; its ``ground`` is replaced by the parameter.
-    - `ground`: how ground points are identified: ``classes``, ``filter``, ``morphological`` or ``auto``. With
-      ``auto``, classes are used if in every file at least `MIN_GROUND` of the points, but not all, have a
-      ground class.
+    - `ground`: how ground points are identified: ``classes``, ``filter``, ``morphological`` or ``auto``.
+      ``auto`` uses classes if in every file at least `MIN_GROUND` of the points, but not all, are ground.
     """
     check_roads(common)
     step = common.step_m
@@ -95,7 +94,7 @@ def _dated(
 ) -> tuple[PrepareOptions, tuple[str, ...]]:
     """Return the options with the date of the survey, and a note on its source.
 
-    It is that of the first point, by GPS time; else that of the latest file, which is only assumed.
+    It is the date of the first point, by GPS time; else the date of the latest file, which is only assumed.
     """
     if common.date is not None:
         return common, ()
@@ -123,7 +122,7 @@ def _with_method(options: Options, method: str) -> Options:
 def _ground(
     clouds: Sequence[Cloud], bucketed: BucketedPoints, options: Options, requested: Ground
 ) -> tuple[str, tuple[str, ...]]:
-    """Return how ground points are identified, and a note with the reason if it is not as expected."""
+    """Return how ground points are identified, and a note with the reason if this is unexpected."""
     classes = list(options.ground_classes)
     share = [kinds[classes].sum() / max(1, kinds.sum()) for kinds in bucketed.kinds]
     class_names = _classes(classes)
@@ -155,7 +154,7 @@ def _ground(
 def _for_density(options: Options, bucketed: BucketedPoints) -> tuple[Options, tuple[str, ...]]:
     """Return the options for the density of the points, and a note if they were changed.
 
-    A dense cloud has many pairs of neighbours: some exceed the usual tolerance by noise alone.
+    A dense cloud has so many pairs of neighbours that noise alone lets some exceed the usual tolerance.
     """
     west, south, east, north = bucketed.bounds
     area = min((east - west) * (north - south), len(bucketed.occupied) * bucketed.buckets.edge**2)
@@ -173,7 +172,7 @@ def _classes(classes: Collection[int]) -> str:
 
 
 def _other_bridges(bucketed: BucketedPoints, options: Options) -> tuple[str, ...]:
-    """Return notes on points of classes that are bridges in another scheme."""
+    """Return notes on points of classes that mean bridges in another scheme."""
     meanings = {
         "asprs": "bridge decks by the standard of LAS, are not used; --bridge-class",
         "ahn": "bridges and other structures in the Dutch AHN, are not used as bridges; --bridge-class",
@@ -188,7 +187,7 @@ def _other_bridges(bucketed: BucketedPoints, options: Options) -> tuple[str, ...
 
 
 def _left_out(bucketed: BucketedPoints, colourless: Sequence[str]) -> tuple[str, ...]:
-    """Return notes on data that is not part of the rasters."""
+    """Return notes on data that the rasters do not contain."""
     notes = []
     if bucketed.out_of_range:
         notes.append(
@@ -203,7 +202,7 @@ def _left_out(bucketed: BucketedPoints, colourless: Sequence[str]) -> tuple[str,
 def _require_no_gap(
     clouds: Sequence[Cloud], frame: MetricTransform, bucketed: BucketedPoints, cell_m: float
 ) -> None:
-    """Check that a large area is not large because of a few distant points."""
+    """Raise an error if an area is large only because of a few distant points."""
     west, south, east, north = bucketed.bounds
     if (east - west) * (north - south) <= LARGE * cell_m**2:
         return
@@ -254,6 +253,6 @@ def _tags(
 
 
 def _name(files: Sequence[Path]) -> str:
-    """Return the name of the data in reports: that of the only file, or of the folder of the first."""
+    """Return the name of the data in reports: the name of the only file, or of the first file's folder."""
     first = files[0].resolve()
     return first.name.split(".")[0] if len(files) == 1 else first.parent.name

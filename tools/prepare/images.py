@@ -1,4 +1,4 @@
-"""Photographs and textures: decoded only if their pixels are few enough, whatever their file claims."""
+"""Photographs and textures: images with too many pixels are refused before they are decoded."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ else:
     PIL = lazy("PIL")
 
 MOST_PIXELS = 400_000_000
-"""Largest photograph or texture (pixels), 1.1 GiB as RGB: sensors of drones have up to 150 million pixels,
-atlases of 16,384 x 16,384 texels 268 million. A PNG of 2 MB may have 2,500 million."""
-# OpenCV reads its limit when it is imported first.
+"""Largest photograph or texture (pixels), 1.1 GiB as RGB. Sensors of drones have up to 150 million pixels,
+textures of 16,384 x 16,384 texels 268 million. A PNG of 2 MB may have 2,500 million."""
+# OpenCV reads its limit only at its first import.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
 
 
 @contextlib.contextmanager
 def bounded() -> Iterator[None]:
     """Context manager in which Pillow opens images up to `MOST_PIXELS`, without a warning."""
-    # Pillow refuses twice its limit, and warns from once.
+    # Pillow warns above its limit, and refuses images above twice the limit.
     before, PIL.Image.MAX_IMAGE_PIXELS = PIL.Image.MAX_IMAGE_PIXELS, MOST_PIXELS // 2
     try:
         with warnings.catch_warnings():
@@ -40,9 +40,9 @@ def bounded() -> Iterator[None]:
 
 @contextlib.contextmanager
 def image_errors(failure: str, remedy: str, file: Path) -> Iterator[None]:
-    """Context manager that bounds images, and turns the errors of reading one into a `TaskError`.
+    """Context manager that limits images, and turns errors of reading into a `TaskError`.
 
-    - `failure`: beginning of the message: the image, and that it cannot be read.
+    - `failure`: beginning of the message, such as "IMAGE cannot be read".
     """
     try:
         with bounded():

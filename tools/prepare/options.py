@@ -1,7 +1,7 @@
-"""The options of all ``flexroad prepare`` commands, and the grid of the area that they give.
+"""The options of all ``flexroad prepare`` commands, and the grid of the area.
 
-Limits of the area, the memory and the disk are checked before rasters are made: one point with wrong
-coordinates makes an area of thousands of kilometres.
+Limits of the area, the memory and the disk are checked before rasters are made: one wrong point can make the
+area thousands of kilometres wide.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ LONGEST_M = 500_000.0
 MAX_CELLS = 10**10
 """100 km x 100 km at 1 m."""
 CELL_DISK, PIXEL_DISK = 90, 4
-"""Temporary files per cell and per pixel (bytes): eight numbers from its points; DSM, DTM, bridges, three
-bands of road heights and two masks; colours and their mask."""
+"""Temporary files per cell (eight numbers from points, DSM, DTM, bridges, three bands of road heights, two
+masks) and per pixel (colours and their mask) (bytes)."""
 ROAD_BYTES = 16
 """Memory of the road mask per cell (bytes): height and number of the highest face, and copies."""
 TILE_BYTES = 8
@@ -39,20 +39,20 @@ SMALLER = "use larger cells (--cell), or prepare a part of the area"
 
 
 def written(paths: Iterable[Path]) -> datetime:
-    """Return when the latest of some files was written."""
+    """Return the time of the latest file."""
     return datetime.fromtimestamp(max(path.stat().st_mtime for path in paths), UTC)
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """The options shared by all commands; the command line makes its options of these fields."""
+    """The options shared by all commands; the options of the command line are made from these fields."""
 
     cell_m: float = option(1.0, RASTERS, "Cell of the heights in m.", "METRES", min=0.01)
     dop_cell_m: float = option(0.5, RASTERS, "Pixel of the orthophoto in m.", "METRES", min=0.01)
     crs: str | None = option(None, INPUTS, "CRS of inputs without one, e.g. EPSG:2994.", "CRS")
     to_crs: str | None = option(None, RASTERS, "CRS of the rasters; default: the input's, in metres.", "CRS")
     height_unit: Literal["metre", "foot", "us-foot"] | None = option(
-        None, INPUTS, "Unit of heights if the CRS has none; default: that of the plan."
+        None, INPUTS, "Unit of heights if the CRS has none; default: the unit of the plan."
     )
     roads: Path | None = option(
         None,
@@ -66,10 +66,10 @@ class PrepareOptions:
     min_cover: float = MIN_COVER
     """Tiles with a DSM height in less than this share of their cells are left out."""
     date: datetime | None = option(
-        None, INPUTS, "Date of the survey; default: that of the files.", "YYYY-MM-DD"
+        None, INPUTS, "Date of the survey; default: the date of the files.", "YYYY-MM-DD"
     )
     assumed_date: datetime | None = None
-    """Date, marked as assumed, if neither the option nor the files give one; not on the command line."""
+    """Assumed date if neither the option nor the files give a date; not on the command line."""
     dataset: str | None = None
     """Name of the data in reports; None: the name of the input."""
 
@@ -100,12 +100,12 @@ def prepared_grid(
     photo: bool,
     per_cell: int = 0,
 ) -> Grid:
-    """Return the grid of an area: on multiples of the cell and the pixel, after all limits are checked.
+    """Check all limits; return the grid of an area, on multiples of the cell and the pixel.
 
     - `common`: cell, pixel, tile size and roads.
-    - `source`: what the data is, for messages: a file.
+    - `source`: the file, for messages.
     - `photo`: whether there is an orthophoto.
-    - `per_cell`: memory of the steps that hold the complete area (bytes per cell).
+    - `per_cell`: memory of steps that need the complete area (bytes per cell).
     """
     west, south, east, north = bounds
     sides = east - west, north - south
@@ -140,7 +140,7 @@ def check_disk(out: Path, needed: float, what: str, remedy: str) -> None:
 
     - `out`: the folder; it need not exist.
     - `needed`: estimated size (bytes).
-    - `what`: what needs it: the beginning of the message.
+    - `what`: the input, for the beginning of the message.
     """
     free = free_bytes(out)
     if needed > free:
@@ -151,11 +151,11 @@ def check_disk(out: Path, needed: float, what: str, remedy: str) -> None:
 
 
 def check_extent(name: str, plan: Floats, before: Bounds | None = None) -> Bounds:
-    """Return the bounds of new points and those before them, after a check that none is too far away.
+    """Check that no new point is too far away; return the bounds of the new and the earlier points.
 
     - `name`: the file, for the message.
     - `plan` ``(2, n)``: eastings and northings (m).
-    - `before`: bounds of the points before: west, south, east, north (m).
+    - `before`: bounds of the earlier points: west, south, east, north (m).
     """
     bounds = np.array([plan.min(axis=1), plan.max(axis=1)])
     if before is not None:

@@ -1,4 +1,4 @@
-"""The output folder of a ``prepare`` command: its files, which replace no existing files, and its errors."""
+"""The output folder of a ``prepare`` command: its files, which files it may replace, and its errors."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from flexroad.pipeline.errors import ConfigError
 
 CATALOG = "catalog.parquet"
 NAMES = (CATALOG, *(f"{layer}.tif" for layer in LAYERS))
-"""The files that a command writes, or removes if it does not write them."""
+"""The files that a command writes; existing files with these names are replaced or removed."""
 LAYER_TAG = "LAYER"
-"""TIFF tag with the layer of a raster: shows that this program has written it."""
+"""TIFF tag with the layer of a raster; it shows that this program has written the file."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FULL_BYTES = 2**24
-"""A disk with less free space counts as full if an error has no number, as those of GDAL."""
+"""If an error has no number, like GDAL's errors, a disk with less free space is taken as full."""
 
 
 def check_replaced(out: Path) -> None:
-    """Check that all files that will be replaced in an output folder are of an earlier ``prepare``.
+    """Check that all files that will be replaced in an output folder are from an earlier ``prepare``.
 
-    A raster is, if it has the tag of its layer. The catalog is, if it lies beside such a DSM: it is removed
-    before the rasters are, and written after them.
+    Such a raster has the tag of its layer. Such a catalog lies next to such a DSM, because it is removed
+    before the rasters and written after them.
     """
     if not out.is_dir():
         if out.exists():
@@ -98,10 +98,10 @@ def free_bytes(where: Path) -> int:
 
 
 def on_failure(name: Callable[[Any], object], remedy: str = "use fewer workers") -> Callable[[Any, str], Any]:
-    """Return what an executor calls with a job whose worker died: it raises a `ConfigError`.
+    """Return a function for an executor that raises a `ConfigError` for a job whose worker died.
 
-    - `name`: returns what a job works on, for the message.
-    - `remedy`: what the user can do; empty if nothing is known.
+    - `name`: returns the input of a job, for the message.
+    - `remedy`: advice for the user; empty if unknown.
     """
 
     def fail(job: Any, reason: str) -> NoReturn:

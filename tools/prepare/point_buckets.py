@@ -1,8 +1,8 @@
 """Points on disk, sorted into buckets: square blocks of ground, each of which can be read separately.
 
-A file has the points of many blocks, those of a block side by side, so that several processes can write files
-at the same time. Coordinates are stored as integers in tenths of a millimetre, so that they do not depend on
-the division into blocks.
+A file has the points of many blocks, sorted by block, so that several processes can write files at the same
+time. Coordinates are stored as integers in tenths of a millimetre, so that they do not depend on the division
+into blocks.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ RECORD = np.dtype(
 )
 """One point; ``east`` and ``north`` are relative to the block's south-west corner."""
 POINTS_PER_BLOCK = 2_000_000
-"""Target number of points that a worker holds in memory, including the rim around its block."""
+"""Target number of points in the memory of a worker, including the rim around its block."""
 SHORTEST_EDGE_M, LONGEST_EDGE_M = 50.0, 500.0
 """Limits of the edge of a block (m)."""
 
@@ -52,7 +52,7 @@ def block_edge_of(clouds: Sequence[Cloud], frame: MetricTransform, reach_m: floa
 def block_edge(points: float, area: float, reach_m: float, step: float) -> float:
     """Return the edge of a block (m), a multiple of ``step``, for ``points`` points on ``area`` m2.
 
-    A block then has about `POINTS_PER_BLOCK` points, including those of its rim.
+    A block and its rim then have about `POINTS_PER_BLOCK` points.
     """
     fitting = math.sqrt(POINTS_PER_BLOCK * area / points) - 2 * reach_m
     edge = LONGEST_EDGE_M if points <= POINTS_PER_BLOCK else np.clip(fitting, SHORTEST_EDGE_M, LONGEST_EDGE_M)
@@ -61,7 +61,7 @@ def block_edge(points: float, area: float, reach_m: float, step: float) -> float
 
 @dataclass(frozen=True)
 class BlockPart:
-    """Points of one block that lie side by side in a file."""
+    """Consecutive points of one block in a file."""
 
     block: BlockIndex
     path: Path
@@ -81,7 +81,7 @@ class PointBuckets:
     edge: float
     """Edge of a block (m)."""
     parts: Mapping[BlockIndex, Sequence[BlockPart]] = field(default_factory=dict)
-    """Where the points of each block are; blocks without points are left out."""
+    """The parts with the points of each block; blocks without points are left out."""
 
     @classmethod
     def of(cls, edge: float, parts: Iterable[BlockPart]) -> PointBuckets:
@@ -92,7 +92,7 @@ class PointBuckets:
         return cls(edge, by_block)
 
     def around(self, grid: Grid, reach_m: float) -> PointBuckets:
-        """Return only the blocks that overlap a grid and a rim around it: a worker needs no others."""
+        """Return only the blocks that overlap a grid and a rim around it: a worker needs no other blocks."""
         near = self.overlapping(grid, reach_m)
         return PointBuckets(self.edge, {index: self.parts[index] for index in near if index in self.parts})
 
@@ -153,7 +153,7 @@ class PointBuckets:
 
 
 def append(path: Path, edge: float, east: Integers, north: Integers, records: Records) -> list[BlockPart]:
-    """Add points, ``(n,)``, with coordinates in stored units, to a file; return where they are."""
+    """Add points, ``(n,)``, with coordinates in stored units, to a file; return their parts."""
     side = edge * PER_METRE
     west, south = math.floor(east.min() / side), math.ceil(north.min() / side) - 1
     width = math.floor(east.max() / side) - west + 1

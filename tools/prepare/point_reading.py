@@ -29,13 +29,13 @@ from flexroad.tools.prepare.point_buckets import (
 )
 
 Dates = tuple[datetime, datetime]
-"""When the first and the last point were measured."""
+"""Times of the first and the last point."""
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(seconds=10**9)
 """The zero of adjusted standard GPS time (ASPRS LAS 1.4), without leap seconds."""
 FIRST_GPS = (datetime(1990, 1, 1, tzinfo=UTC) - GPS_EPOCH).total_seconds()
 WEEK_S = 604_800
 SHIFT, BYTE = 8, 255
-"""Number of bits by which colours of 16 bits are moved to the right, and the greatest colour of 8 bits."""
+"""Number of bits by which 16-bit colours are shifted to the right, and the largest 8-bit colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class BucketedPoints:
     out_of_range: int
     """Number of points left out because their height is outside `LOWEST_M`..`HIGHEST_M`."""
     dates: Dates | None = None
-    """When the first and the last point were measured, or None if that is not known of every file."""
+    """Times of the first and the last point; None if they are unknown for a file."""
 
     @property
     def occupied(self) -> frozenset[BlockIndex]:
@@ -79,12 +79,12 @@ class _Job:
     target: Path
     """File of the points."""
     shift: int | None = None
-    """By how many bits colours are moved to the right; None: `_Part.shift`."""
+    """Number of bits by which colours are shifted to the right; None: `_Part.shift`."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What a job has read."""
+    """The result of a job."""
 
     job: _Job
     block_parts: list[BlockPart]
@@ -155,7 +155,7 @@ def _jobs(
 
 
 def _span(dates: Iterable[Dates | None]) -> Dates | None:
-    """Return the first and the last of the dates that are known, None if none is."""
+    """Return the first and the last of the known dates; None if all are unknown."""
     known = [pair for pair in dates if pair]
     return (min(first for first, _ in known), max(last for _, last in known)) if known else None
 
@@ -165,7 +165,7 @@ def _read(job: _Job) -> _Part:
     block_parts, outermost = list[BlockPart](), np.zeros((2, 0), np.int64)
     kinds, out_of_range, dates = np.zeros(256, np.int64), 0, list[Dates | None]()
     with disk_errors(job.target.parent.parent):
-        # A worker that died may have written a part of it.
+        # A worker that died may have written a part of the file.
         job.target.unlink(missing_ok=True)
     for chunk in chunks(path, CHUNK, points=job.points):
         if shift is None and chunk.colour is not None and chunk.colour.any():
@@ -188,7 +188,7 @@ def _read(job: _Job) -> _Part:
 
 
 def _records(chunk: Chunk, frame: MetricTransform, shift: int) -> tuple[Integers, Records]:
-    """Return eastings and northings in stored units, ``(2, n)``, and records with all other fields set."""
+    """Return eastings and northings in stored units, ``(2, n)``, and records with all other fields."""
     metres = frame.metres(chunk.x, chunk.y, chunk.z)
     in_range = (metres[2] >= LOWEST_M) & (metres[2] <= HIGHEST_M)
     east, north, height = (np.rint(axis[in_range] * PER_METRE).astype(np.int64) for axis in metres)
@@ -200,10 +200,10 @@ def _records(chunk: Chunk, frame: MetricTransform, shift: int) -> tuple[Integers
 
 
 def _survey_dates(gps: Floats) -> Dates | None:
-    """Return the dates of the first and the last point, or None if no time can be one of a survey.
+    """Return the dates of the first and the last point; None if no time can belong to a survey.
 
-    - `gps`: see `Chunk.gps`. Times of a week (0 to 604,800 s) are left out, as some files have them although
-      their header declares standard times; so are times before 1990 and in the future.
+    - `gps`: see `Chunk.gps`. Times of a week (0 to 604,800 s) are left out: some files have them although
+      their header declares standard times. Times before 1990 and in the future are left out, too.
     """
     latest = (datetime.now(UTC) - GPS_EPOCH).total_seconds()
     times = gps[np.isfinite(gps) & ((gps < 0) | (gps > WEEK_S)) & (gps > FIRST_GPS) & (gps < latest)]

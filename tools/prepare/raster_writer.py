@@ -1,7 +1,7 @@
 """Writer of the rasters of one area: block by block, then published together as COGs with a catalog.
 
-Until they are published, all files are in a hidden folder inside the output folder: a failure leaves no
-files behind, and new rasters replace old ones by renaming. The catalog is written last.
+Until they are published, all files are in a hidden folder inside the output folder. So a failure leaves no
+files behind, and new rasters replace old rasters by renaming. The catalog is written last.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class PreparedDataset:
     tiles: int
     """Number of tiles in the catalog."""
     notes: tuple[str, ...] = ()
-    """What was left out or assumed, one line each."""
+    """Notes on data that was left out or assumed, one line each."""
 
     def with_notes(self, *notes: str) -> PreparedDataset:
         """Return a copy with more notes in front."""
@@ -77,7 +77,7 @@ class PreparedDataset:
 class RasterWriter:
     """Writer of the rasters of one area; a context manager that removes its temporary files.
 
-    - `dop_cell`: pixel of the orthophoto (m); None if there is no orthophoto.
+    - `dop_cell`: pixel of the orthophoto (m); None without an orthophoto.
     - `vertical`: vertical CRS of the heights, in metres, if it is known.
     """
 
@@ -99,7 +99,7 @@ class RasterWriter:
         self._roads: list[VectorFile] = []
         self._notes: list[str] = []
         self.scratch = out
-        """Folder for temporary files, also of the caller; made and removed with the context."""
+        """Folder for temporary files, also for the caller; made and removed with the context."""
         self._stack = contextlib.ExitStack()
         for name in NAMES:
             # Refused at the start and not after the rasters are computed.
@@ -119,9 +119,9 @@ class RasterWriter:
         self._stack.close()
 
     def write(self, layer: str, part: Grid, values: NDArray[Any]) -> None:
-        """Write a window of a layer: heights (m, NaN where there is none) or a mask, ``(H, W)``.
+        """Write a window of a layer: heights (m; NaN where unknown) or a mask, ``(H, W)``.
 
-        Of ``road_height`` it has all bands, ``(3, H, W)``.
+        The window of ``road_height`` has all bands, ``(3, H, W)``.
         """
         heights = layer in HEIGHTS
         with self._writing(layer):
@@ -164,19 +164,19 @@ class RasterWriter:
     ) -> PreparedDataset:
         """Convert the rasters to COGs and write the catalog; existing outputs in the folder are replaced.
 
-        - `tile_size_m`: side of a tile (m). An area no larger than this is a single tile; a larger one is
-          divided at multiples of it.
+        - `tile_size_m`: side of a tile (m). A smaller area is a single tile; a larger area is divided at
+          multiples of it.
         - `date`: acquisition date; None: ``assumed`` is used, with a note.
         - `dataset`: name of the data in reports.
         - `min_cover`: tiles with heights in less than this share (0 to 1) of their cells are left out.
-        - `assumed`: when the source was written, with a time zone; None: now.
+        - `assumed`: time when the source was written, with a time zone; None: now.
         - `executor`: converts each layer by a worker call.
         """
         names = [layer for layer in LAYERS if layer in self._open]
         for layer in names:
             with self._writing(layer):
                 self._open[layer].close()
-        # The largest layers first, so that no worker has one of them at the end.
+        # The largest layers first, so that no worker starts a large layer at the end.
         files = sorted((self._file(layer) for layer in names), key=lambda file: -file.stat().st_size)
         for file in executor.map(_to_cog, files, on_failure(_published)):
             file.unlink()
@@ -184,7 +184,7 @@ class RasterWriter:
         tiles, notes = self._tiles(names, tile_size_m, survey, dataset, min_cover)
         tiles = tuple(replace(tile, datetime_assumed=date is None) for tile in tiles)
         tiles, far = with_roads(tiles, self._roads, None)
-        # A catalog must only exist beside complete rasters: removed first, written last.
+        # A catalog must exist only next to complete rasters: it is removed first and written last.
         for name in NAMES:
             output_file(self.out / name).unlink(missing_ok=True)
         for layer in names:
@@ -273,7 +273,7 @@ def _raster_errors(where: Path) -> Iterator[None]:
 
 
 def _to_cog(source: Path) -> Path:
-    """Convert a layer to a COG beside it; return the layer's file."""
+    """Convert a layer to a COG in the same folder; return the layer's file."""
     layer = source.name.removesuffix(UNFINISHED)
     smooth = layer in HEIGHTS or layer == PHOTO
     with _raster_errors(_published(source)):
@@ -293,7 +293,7 @@ def _to_cog(source: Path) -> Path:
 
 
 def _published(source: Path) -> Path:
-    """Return where a layer is published, by its file in the temporary folder."""
+    """Return the published file of a layer, from its file in the temporary folder."""
     return source.parents[1] / f"{source.name.removesuffix(UNFINISHED)}.tif"
 
 

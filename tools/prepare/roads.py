@@ -1,6 +1,6 @@
 """Road masks from the user's own road data: polygons of a vector file, a raster, or a mesh.
 
-Lines have no width, so they make no mask: the file is entered in the catalog, for ``segment: vector``.
+Lines have no width, so they give no mask. Their file is entered in the catalog, for ``segment: vector``.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ pyogrio = lazy("pyogrio")
 
 AREAS = ("Polygon", "MultiPolygon")
 RASTER_BYTES = 4
-"""Memory that reading a raster takes, as a multiple of its values: masked, compared and copied."""
+"""Memory to read a raster, as a multiple of its values: masked, compared and copied."""
 CUT = "cut it to the area, e.g. gdal_translate -projwin"
 LINES = ("LineString", "MultiLineString")
 
 
 def check_roads(common: PrepareOptions) -> None:
-    """Check the roads before the work that precedes their use; a mesh is only checked to exist."""
+    """Check the roads before the long work; for a mesh only check that it exists."""
     if common.roads is None:
         return
     path, layer = file_and_layer(common.roads)
@@ -164,7 +164,7 @@ def _raster(path: Path, grid: Grid) -> Bools | None:
 def _features(
     path: Path, layer: str | None, where: str | None, grid: Grid, notify: Callable[[str], None]
 ) -> Any:
-    """Return the polygons of a vector file in the grid's CRS, or None if it holds lines."""
+    """Return the polygons of a vector file in the grid's CRS; None if it has lines."""
     if _osm(path, layer):
         return None
     features = _read(path, layer, where)
@@ -186,7 +186,7 @@ def _features(
 
 
 def _osm(path: Path, layer: str | None) -> bool:
-    """Return whether a file is OSM's own format: mostly lines, and slow to read as a whole."""
+    """Return whether a file is in OSM's own format: it has mostly lines, and is slow to read."""
     vectors = _vectors(path, layer)
     return vectors is not None and vectors.extents is None and layer is None
 

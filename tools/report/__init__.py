@@ -1,6 +1,6 @@
 """``flexroad report``: a run as Markdown, CSV, or one HTML page with a map and pictures.
 
-For who has to know whether a run can be delivered. Start at `write_report` below, then `content.gather`.
+For users who decide whether a run can be delivered. Start at `write_report` below, then `content.gather`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from flexroad.tools.report.pages import csv_page, markdown_page
 
 Format = Literal["md", "csv", "html"]
 VIEWER, PAGE = "viewer", "index.html"
-"""Folder in RUN where a 3D viewer is looked for, and its page."""
+"""Folder in RUN where a 3D viewer is searched, and its page."""
 LAST = "the state before the last run"
-"""Name of the run as it was before."""
+"""Name of the earlier state of the run."""
 
 
 def write_report(
@@ -37,10 +37,9 @@ def write_report(
 ) -> Location:
     """Write RUN/report.<form> and return its path.
 
-    - `viewer`: folder of `flexroad view`, to which an HTML report links; by default RUN/viewer if there is
-      one.
-    - `compared`: another run over the same tiles, with which an HTML report compares the figures; by default
-      this run before its last execution.
+    - `viewer`: folder of `flexroad view` for the links of an HTML report; by default RUN/viewer if it exists.
+    - `compared`: another run over the same tiles, for the comparison in an HTML report; by default this run
+      before its last execution.
     """
     address = _viewer_address(run, viewer) if form == "html" else ""
     before = _before(run, compared) if form == "html" else None
@@ -55,7 +54,7 @@ def write_report(
 
 
 def _before(run: Run, compared: Location | None) -> tuple[str, pd.DataFrame] | None:
-    """Return name and rows of the run to compare with, None if there is none."""
+    """Return name and rows of the run to compare with; None without such a run."""
     if compared is not None:
         return compared.name, read_metrics(Run.open(compared, run.allowed).path)
     if not exists(run.path / PREVIOUS):
@@ -64,7 +63,7 @@ def _before(run: Run, compared: Location | None) -> tuple[str, pd.DataFrame] | N
 
 
 def _viewer_address(run: Run, folder: Location | None) -> str:
-    """Return the address of the viewer's page relative to RUN, empty if there is none."""
+    """Return the address of the viewer's page relative to RUN; empty without a viewer."""
     if folder is None:
         return f"{VIEWER}/{PAGE}" if exists(run.path / VIEWER / PAGE) else ""
     if not exists(folder / PAGE):

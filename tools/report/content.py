@@ -49,14 +49,14 @@ FURTHER = {
 }
 """Further columns."""
 WITH_ROADS = "with roads"
-"""Column with the number of tiles that the figures of roads are over; only if it is not that of all tiles."""
+"""Column with the number of tiles with figures of roads; left out if all tiles have them."""
 WORST = 10
 """Rows in the tables of the worst tiles."""
 MESH_COLUMNS = ["method", "meshes", "faces", "meshes with faults", "result"]
 MESH_MEANING = (
     "A mesh has no fault if all numbers are finite, all faces have an area and look up, no faces overlap in "
     "plan, edges meet at vertices only, and no vertex is unused or there twice. A tile that has a mesh with "
-    "faults is failed; the faces are those of the other meshes."
+    "faults is failed; only faces of the other meshes are counted."
 )
 FAULT = f"evaluate: {MeshFault.__name__}: "
 """Start of the error of a row whose mesh has a fault."""
@@ -91,10 +91,10 @@ DECKS = {
 }
 """Columns of the table of decks and tunnels."""
 DECKS_MEANING = (
-    "Levels above 0 are decks, levels below 0 tunnels. Abutments are ends where a road of level 0 goes on, "
+    "Levels above 0 are decks, levels below 0 tunnels. Abutments are ends where a road of level 0 continues, "
     "clearance is the median height between the level and level 0. docs/levels.md explains the flags."
 )
-HOLDOUT = "A second fit did without these squares of road (`assess.holdout`); 90% intervals hold 90% of them."
+HOLDOUT = "A second fit left out these squares of road (`assess.holdout`); 90% intervals contain 90% of them."
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +112,9 @@ class Content:
     variant: str
     """The variant that is exported first."""
     reference: str
-    """What the figures were measured against, in one paragraph."""
+    """The reference of the figures, in one paragraph."""
     tables: dict[str, tuple[pd.DataFrame, str]]
-    """Table and explanation by title, in the order of the page; what the run has no figures for is empty."""
+    """Table and explanation by title, in the order of the page; tables without figures are empty."""
     versions: dict[str, str]
     config: str
     tiles: tuple[str, ...]
@@ -122,11 +122,11 @@ class Content:
     running: bool = False
     """Whether another process is computing tiles of the run."""
     results: Results = field(default_factory=dict)
-    """Where the surfaces of the finished tiles are in the store."""
+    """Places of the finished tiles' surfaces in the store."""
 
 
 def gather(run: Run, track: Track = untracked) -> Content:
-    """Collect the tables of a run; of one that is not finished, those of the tiles so far."""
+    """Collect the tables of a run; if it is not finished, the tables of the tiles so far."""
     rows = _rows(run)
     done = rows[rows.status == "done"]
     states: dict[str, TileState] = {}
@@ -179,7 +179,7 @@ def gather(run: Run, track: Track = untracked) -> Content:
 
 
 def _rows(run: Run) -> pd.DataFrame:
-    """Return the rows of metrics.parquet, which the end of a run writes; before, those of its tiles."""
+    """Return the metrics: from metrics.parquet if the run has ended, else from the tiles finished so far."""
     if exists(run.path / METRICS):
         return read_metrics(run.path)
     with open_database(run) as database:
@@ -199,7 +199,7 @@ def _over_tiles(
     tiles = done.groupby("variant")
     table = tiles[list(columns)].agg(statistic).reindex(variants).rename(columns=columns)
     table.insert(0, "tiles", tiles.size().reindex(variants))
-    # Tiles without road have no figures of roads (NaN), and the statistic leaves them out.
+    # Tiles without road have no figures of roads (NaN). The statistic leaves them out.
     if done.l2_road_m.isna().any():
         table.insert(1, WITH_ROADS, tiles.l2_road_m.count().reindex(variants))
     return table.reset_index().rename(columns={"variant": "method"})
@@ -265,7 +265,7 @@ def mesh_checks(rows: pd.DataFrame, variants: Iterable[str]) -> pd.DataFrame:
 def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
     """Return the means over tiles and the number of flagged tiles per variant; empty without estimates.
 
-    A tile whose only flag is that it has no road is no problem, and is not counted as flagged.
+    A tile is not counted as flagged if its only flag is that it has no road.
     """
     if not done["error_estimate_m"].notna().any():
         return pd.DataFrame()
@@ -277,7 +277,7 @@ def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
 
 
 def decks_and_tunnels(rows: list[dict[str, Any]], variant: str) -> pd.DataFrame:
-    """Return one row per tile and level of a variant, those with flags first; empty if there are none."""
+    """Return one row per tile and level of a variant, rows with flags first; empty without levels."""
     own = [row for row in rows if row["variant"] == variant]
     if not own:
         return pd.DataFrame()
@@ -287,7 +287,7 @@ def decks_and_tunnels(rows: list[dict[str, Any]], variant: str) -> pd.DataFrame:
 
 
 def held_out(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
-    """Return how well a second fit and its intervals meet the squares withheld from it; empty without any."""
+    """Return the errors of a second fit and its intervals at withheld squares; empty without such squares."""
     counted = done[done["holdout_squares"].fillna(0) > 0]
     if counted.empty:
         return pd.DataFrame()

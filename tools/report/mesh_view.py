@@ -24,7 +24,7 @@ EXAGGERATION = 1.5
 
 ROAD, TERRAIN, EDGE, SKY = "#3b3f46", "#ddd6c4", "#6f6753", "#ffffff"
 DENSE_PX = 5.0
-"""Edges of triangles smaller than this are drawn fainter, or the terrain would look black."""
+"""Edges of smaller triangles are drawn fainter: else the terrain would look black."""
 
 
 def main(folder: Path) -> str:
@@ -35,7 +35,7 @@ def main(folder: Path) -> str:
             with np.load(file) as arrays:
                 picture = draw(**arrays)
         except Exception as error:
-            # A broken mesh must not prevent the other pictures.
+            # A damaged mesh must not prevent the other pictures.
             errors.append(f"{file.name}: {error!r}")
             continue
         temporary = file.with_suffix(".part")
@@ -52,7 +52,7 @@ def draw(
     within: Sequence[float] | None = None,
     size_px: Sequence[int] = SIZE_PX,
 ) -> Image.Image:
-    """Draw one mesh as seen obliquely from the south-south-west.
+    """Draw one mesh, seen obliquely from the south-south-west.
 
     - `vertices`: east, north and up, ``(V, 3)``, m.
     - `faces`: vertex indices, ``(F, 3)``, counter-clockwise seen from above.
@@ -62,7 +62,7 @@ def draw(
     - `within`: west, south, east and north of the part to draw, in the vertices' coordinates (m).
     """
     whole = pv.PolyData.from_regular_faces(vertices * [1, 1, EXAGGERATION], faces)
-    # Normals are computed on the complete mesh, so that there is no seam between road and terrain.
+    # Normals are computed on the complete mesh, so that no seam shows between road and terrain.
     whole.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False, inplace=True)
     whole.cell_data["road"] = road
     if colours is not None:
@@ -106,7 +106,7 @@ def _add_classes(plotter: Any, whole: Any, edge_opacity: float) -> None:
 
 
 def _edge_opacity(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> float:
-    """Return the opacity of the edges, the higher the larger the triangles are in the picture."""
+    """Return the opacity of the edges; larger triangles in the picture have a higher opacity."""
     sides = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
     width = np.ptp(vertices[:, 0]) or 1.0
     side_px = float(np.median(np.linalg.norm(sides, axis=2))) / width * SIZE_PX[0] * 0.8
@@ -114,7 +114,7 @@ def _edge_opacity(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> fl
 
 
 def _set_scene(plotter: Any, bounds: tuple[float, ...], width_px: int) -> None:
-    """Add lights and camera: sun in the north-west as on the maps, camera in the south-south-west."""
+    """Add lights and camera: sun in the north-west like on the maps, camera in the south-south-west."""
     west, east, south, north, low, high = bounds
     middle = np.array([(west + east) / 2, (south + north) / 2, (low + high) / 2])
     size = float(np.hypot(east - west, north - south))

@@ -19,11 +19,11 @@ from flexroad.tasks.quality.flagged import Place
 from flexroad.tools.report.content import MAIN, Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
-"""A number as text, with its interval if it has one."""
+"""A number as text, with its interval, if any."""
 MARKUP = re.compile(r"[\\`*|~$]|<(?=[A-Za-z/!?])|^>|(?<![^\W_])_|_(?![^\W_])|\](?=[\[(:])|&(?=#?\w+;)")
 """Characters that are markup in Markdown at this place: not, for example, ``_`` within a word."""
 ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
-"""Written for characters that some programs take for HTML also after a backslash."""
+"""Replacements of characters that some programs take for HTML even after a backslash."""
 
 Section = tuple[str, pd.DataFrame, str]
 """Title, table, and explanation or an empty text."""
@@ -35,10 +35,10 @@ class TilePictures:
 
     tile_id: str
     pictures: tuple[tuple[str, bytes], ...]
-    """Caption and picture, the most telling ones first and last."""
+    """Caption and picture; the first and the last picture show most."""
     notes: tuple[str, ...] = ()
     places: Mapping[str, Place] = field(default_factory=dict)
-    """Where to look, by flag."""
+    """Place to look at, by flag."""
 
 
 def markdown_page(content: Content) -> str:
@@ -81,7 +81,7 @@ def sections(content: Content) -> list[Section]:
 
 
 def are_numbers(table: pd.DataFrame) -> list[bool]:
-    """Return for each column whether it holds numbers, as numbers or as text."""
+    """Return for each column whether its values are numbers or texts of numbers."""
     return [
         pd.api.types.is_numeric_dtype(column) or all(PRINTED.fullmatch(str(cell)) for cell in column)
         for _, column in table.items()
@@ -105,14 +105,14 @@ def _cells(table: pd.DataFrame) -> list[list[str]]:
 
 
 def _without_controls(value: object) -> object:
-    """Return a text with escapes for control characters but line breaks; anything else as it is."""
+    """Return a text with control characters escaped, except line breaks; other values are unchanged."""
     if not isinstance(value, str) or isinstance(value, Markup):
         return value
     return "\n".join(map(printable, value.split("\n")))
 
 
 def marked(text: str) -> str:
-    """Return a text in Markdown that shows as it is."""
+    """Return a text for Markdown, with markup escaped."""
     return MARKUP.sub(lambda found: ENTITIES.get(found[0], f"\\{found[0]}"), printable(text))
 
 

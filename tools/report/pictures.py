@@ -1,4 +1,4 @@
-"""The pictures of a report as WebP: maps and mesh views of its tiles, and the relief of all of them.
+"""The pictures of a report as WebP: maps and mesh views of its tiles, and the relief of all tiles.
 
 Meshes are drawn in a child process, because VTK ends its process if OpenGL is missing.
 """
@@ -44,9 +44,9 @@ from flexroad.tools.report.render import (
 from flexroad.tools.report.steps import Results
 
 MOST = 24
-"""Largest number of tiles of which all are shown; of larger runs only the worst are shown."""
+"""Largest number of tiles that are all shown; from larger runs only the worst are shown."""
 QUALITY, RELIEF_QUALITY = 80, 62
-"""Quality of the WebP pictures, which take a quarter of the bytes of PNG, and that of the relief."""
+"""Quality of the WebP pictures (a quarter of the bytes of PNG) and of the relief."""
 NO_MESH = "No 3D view: no usable OpenGL library (on Debian: apt-get install libegl1)."
 CHILD_START_S, CHILD_MESH_S = 60.0, 15.0
 """Time limit of the child process: a fixed part, plus a part per mesh (s)."""
@@ -65,9 +65,9 @@ OPACITY = 0.78
 def tile_pictures(
     run: Run, content: Content, first: Sequence[str] = (), track: Track = untracked
 ) -> list[TilePictures]:
-    """Draw the exported variant of every tile, or of a large run that of the worst tiles.
+    """Draw the exported variant of every tile; in a large run only of the worst tiles.
 
-    - `first`: ids of finished tiles that are drawn in any case, and come first.
+    - `first`: ids of finished tiles that are always drawn, and come first.
     """
     variant = run.config.export.variants[0]
     tile_ids = list(dict.fromkeys([*first, *_shown(content)]))
@@ -81,7 +81,7 @@ def tile_pictures(
             meshes[tile.id] = tile.mesh
             maps[tile.id] = _maps(tile)
         except ConfigError as error:
-            # For example if source files were deleted after the run; the tables do not need them.
+            # For example if source files were deleted after the run. The tables do not need them.
             reason = str(error).removeprefix(f"{tile.label}: ")
             maps[tile.id] = TilePictures(tile.id, (), (f"No pictures: {reason}",))
     views = render_meshes(meshes)
@@ -139,7 +139,7 @@ def _maps(tile: FinishedTile) -> TilePictures:
 
 
 def _finished(tile: TilePictures, view: bytes | None) -> TilePictures:
-    """Add the view of the mesh, if there is one, and make the pictures small."""
+    """Add the view of the mesh, if any, and reduce the pictures."""
     if not tile.pictures:
         return tile
     views, notes = ((("The mesh of the road", view),), ()) if view else ((), (NO_MESH,))
@@ -184,7 +184,7 @@ def render_meshes(
 
 
 def _draw_in_child(folder: Path, seconds: float) -> str:
-    """Run the child process; return why it failed, or an empty string."""
+    """Run the child process; return the reason of a failure, or an empty string."""
     # Started by file, not by module: the child does not import flexroad and starts in half the time. With -P
     # the modules of this folder (steps, pages) cannot shadow others.
     command = [sys.executable, "-P", str(Path(__file__).with_name("mesh_view.py")), str(folder)]
@@ -200,7 +200,7 @@ def _draw_in_child(folder: Path, seconds: float) -> str:
 
 @dataclass(frozen=True)
 class _Relief:
-    """The background of the map: one picture with the tiles side by side, in squares of equal size."""
+    """The background of the map: one picture with a square of equal size for each tile."""
 
     webp: bytes
     side_px: int
@@ -212,9 +212,9 @@ class _Relief:
 
 
 def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = untracked) -> _Relief | None:
-    """Draw the surfaces of tiles as a shaded relief with their roads; None if none is in the store.
+    """Draw the surfaces of tiles as a shaded relief with their roads; None if the store has no surface.
 
-    - `tiles`: the tiles to draw; those whose surface is not in the store are left out.
+    - `tiles`: the tiles to draw; tiles whose surface is not in the store are left out.
     """
     tiles = list(tiles)
     if not tiles:
@@ -242,7 +242,7 @@ def _square(surface: Surface, road: RoadMask, side: int) -> NDArray[np.uint8]:
     """Return grey and opacity of one tile, ``(side, side, 2)``; pixels are not square if the tile is not."""
     grid = road.core
     step_x, step_y = grid.width * grid.cell / side, grid.height * grid.cell / side
-    # One pixel beyond each edge, so that the shading goes on across tiles.
+    # One pixel beyond each edge, so that the shading continues across tiles.
     beyond: Floats = np.arange(-1.0, side + 1.0) + 0.5
     east: Floats = np.asarray(grid.west + beyond * step_x)
     north: Floats = np.asarray(grid.north - beyond * step_y)

@@ -1,7 +1,7 @@
 """Pictures for reports, as PNG bytes 480 pixels wide: maps of one tile, and line charts.
 
-Maps have north up and metres on the axes. Their ``grid`` says where the cells lie. Pictures of meshes are in
-`pictures`.
+Maps have north up and metres on the axes. Their ``grid`` gives the place of the cells. Pictures of meshes are
+in `pictures`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ DPI = 100
 WIDTH_PX, MAP_PX = 480, 340
 """Widths of a picture and of the map in it."""
 TRUE_COLOUR_BYTES = 100_000
-"""Largest size of a PNG in true colours; larger ones are reduced to 256 colours."""
+"""Largest size of a PNG in true colours (bytes); larger pictures are reduced to 256 colours."""
 LEFT_PX, BELOW_PX, GAP_PX = 46, 42, 10
 """Space left of and below the map, and between map and legend."""
 
@@ -44,7 +44,7 @@ RELIEF = LinearSegmentedColormap.from_list(
 ROAD, KEPT, DROPPED = "#33373d", "#1f6fb2", "#f0681a"
 BY_DTM = "#8a5fbf"
 TRUE = "#00d5ff"
-"""Outline of the labels: contrasts with grass, asphalt and roofs."""
+"""Colour of labels' outlines: it contrasts with grass, asphalt and roofs."""
 OVERLAY = 0.72
 """Opacity of a mask over the relief."""
 UNKNOWN = "#f2f2f2"
@@ -52,10 +52,10 @@ UNKNOWN = "#f2f2f2"
 SUN_AZIMUTH_DEG, SUN_ALTITUDE_DEG = 315.0, 45.0
 COLOURS = "YlOrRd"
 LIMIT_M = 0.5
-"""End of the colour bar: beyond it all is equally bad."""
+"""End of the colour bar: larger values have the same colour."""
 CIRCLE, RING = "#1c2430", "#ffffff"
 NEAR, LINE = 0.3, 0.04
-"""Distance across which labels may overlap, and that of their lines, as shares of the width of the map."""
+"""Distance across which labels may overlap, and distance of their lines, as shares of the map's width."""
 
 
 def hillshade(height: Floats, grid: Grid) -> bytes:
@@ -116,7 +116,7 @@ def _parts_picture(height: Floats, parts: Sequence[tuple[str, Bools, str]], grid
 
 
 def error_map(error: Floats, grid: Grid, road: Bools | None = None, limit_m: float | None = None) -> bytes:
-    """Draw signed vertical errors: red is too high, blue too low, arrows say that some exceed the limit.
+    """Draw signed vertical errors: red is too high, blue too low, arrows mean that some exceed the limit.
 
     - `error`: mesh or surface minus reference (m), ``(H, W)``; NaN stays empty.
     - `road`: cells whose outline is drawn.
@@ -140,7 +140,7 @@ def segmentation_map(photo: NDArray[np.uint8], truth: Bools, segmented: Bools, g
     - `truth`, `segmented`: road by the labels and by the segmenter, ``(H, W)``.
     """
     figure, axes = _map(np.moveaxis(photo, 0, -1) / 255, grid)
-    # The first line is wider, so that it is visible below the second where both agree.
+    # The first line is wider, so that it is visible below the second line where both agree.
     parts = (("labels", truth, TRUE, 2.4), ("segmented", segmented, DROPPED, 0.9))
     for _, mask, colour, width in parts:
         _outline(axes, mask, grid, colour, width)
@@ -193,7 +193,7 @@ def _round_limit(error: Floats) -> float:
 
 def _shaded(rgb: Floats, height: Floats, cell: float) -> Floats:
     """Shade colours by Lambert's law with the sun in the north-west; level ground keeps its colour."""
-    # Next to NaN cells the gradient is NaN: shaded as level.
+    # Next to NaN cells the gradient is NaN; these cells are shaded like level ground.
     south, east = (np.asarray(np.nan_to_num(slope)) for slope in np.gradient(height, cell))
     light = np.clip(0.5 * sunlight(east, south), 0, 1)[..., None]
     lit: Floats = 2 * light * rgb + (1 - 2 * light) * rgb**2
@@ -201,7 +201,7 @@ def _shaded(rgb: Floats, height: Floats, cell: float) -> Floats:
 
 
 def sunlight(east: Floats, south: Floats) -> Floats:
-    """Return the light on slopes to the east and south relative to that on level ground, by Lambert's law."""
+    """Return the light on slopes to the east and south relative to level ground, by Lambert's law."""
     azimuth, altitude = math.radians(SUN_AZIMUTH_DEG), math.radians(SUN_ALTITUDE_DEG)
     sun_east, sun_north = math.sin(azimuth) * math.cos(altitude), math.cos(azimuth) * math.cos(altitude)
     facing = (math.sin(altitude) - sun_east * east + sun_north * south) / np.sqrt(1 + east**2 + south**2)
@@ -258,7 +258,7 @@ def _png(figure: Figure) -> bytes:
 def _small(picture: Image.Image) -> bytes:
     """Return the picture as a PNG: in true colours if that is small, else in 256 colours.
 
-    256 colours take a third of the bytes. They would show on smooth pictures only, and these are small.
+    256 colours take a third of the bytes. They would be visible only on smooth pictures, which are small.
     """
     true = picture.convert("RGB")
     full = _encoded(true)
@@ -305,7 +305,7 @@ def _circles(axes: Axes, grid: Grid, places: Mapping[str, Place]) -> None:
         for colour, line in ((RING, 3.4), (CIRCLE, 1.6)):
             axes.plot(x, y, "o", ms=15, mfc="none", mec=colour, mew=line)
         on_left = x < width / 2
-        # From south to north, each label at least a line above the one before it, if both are near.
+        # From south to north, each label at least a line above the previous label, if both are near.
         near = abs(x - last[0]) < NEAR * width
         label = max(y, last[1] + LINE * width) if near else y
         last = x, label

@@ -1,7 +1,7 @@
 """Steps and angles between the surfaces of neighbouring tiles along their shared edges.
 
-The surfaces of a fit that shares its borders (`pipeline.graph.borders`) meet exactly, and this is checked.
-Other fits know nothing of the neighbours.
+The surfaces of a fit that shares its borders (`pipeline.graph.borders`) meet exactly; this is checked here.
+Other fits do not use the neighbours.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from flexroad.pipeline.run.status import TileStatus, Track, untracked
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 Results = dict[str, dict[str, tuple[str, str]]]
-"""Exported variant -> finished tile -> fingerprints of its surface and of its road mask: not graphs, of which
-thousands would be large."""
+"""Exported variant -> finished tile -> fingerprints of its surface and road mask. Thousands of graphs would
+need too much memory."""
 
 
 def add_results(results: Results, status: TileStatus) -> None:
@@ -38,7 +38,7 @@ MEAN, LARGEST, ON_ROAD, ANGLE = "mean step (m)", "largest step (m)", "on road, m
 COLUMNS = ["variant", "tile", "neighbour", MEAN, LARGEST, ON_ROAD, ANGLE]
 CHECK = ["variant", "edges", MEAN, LARGEST, ANGLE, "result"]
 MOST = 2000
-"""Largest number of tiles compared with their neighbours; of larger runs, every n-th tile is compared."""
+"""Largest number of tiles compared with their neighbours; in larger runs, every n-th tile is compared."""
 KEPT = 1024
 """Tiles whose surfaces are kept in memory until their other neighbours are compared."""
 
@@ -49,8 +49,8 @@ def edge_steps(
     """Return the steps at the shared edges of finished tiles; surfaces missing from the store are left out.
 
     - result: one row per exported variant, columns `CHECK`, empty if no two neighbours are done; one row per
-      edge where the surfaces do not meet, columns `COLUMNS`, largest steps first; and which tiles were
-      compared, empty if all.
+      edge where the surfaces do not meet, columns `COLUMNS`, largest steps first; and a note if only some
+      tiles were compared.
     """
     tiles = run.catalog.usable
     every = math.ceil(len(tiles) / MOST)
@@ -75,7 +75,7 @@ def _checked(run: Run, variant: str, edges: pd.DataFrame) -> tuple[str, int, flo
     largest, angle = float(edges[LARGEST].max()), float(edges[ANGLE].max())
     result = "tiles are fitted independently"
     if has_borders(run.config.chains[variant]["fit"]):
-        # NaN, if all edges lie outside the survey, is no difference.
+        # NaN (all edges lie outside the survey) is taken as no difference.
         apart = int(((edges[LARGEST] > 0) | (edges[ANGLE] > 0)).sum())
         result = (
             f"error: {apart} edges do not meet" if apart else "one surface: all differences are exactly 0"
@@ -132,7 +132,7 @@ def _step(
     step = np.abs(a.height(east, north) - b.height(east, north))
     angle = _angle_deg(a.normal(east, north), b.normal(east, north))
     on_road = inside & road.mask[cells]
-    # Other than max, fmax leaves out NaN, and is NaN if there is nothing else.
+    # Unlike max, fmax leaves out NaN. It is NaN if all values are NaN.
     largest, turn = (float(np.fmax.reduce(values[inside], initial=math.nan)) for values in (step, angle))
     return _mean(step[inside]), largest, _mean(step[on_road]), turn
 

@@ -1,7 +1,7 @@
-"""The test of the paper's claims on a run, and the bootstrap confidence intervals that it takes.
+"""The test of the paper's claims on a run, and the bootstrap confidence intervals for it.
 
-Tiles are drawn with replacement, the same tiles for every variant, so that intervals of differences and
-ratios between variants use the pairing (Efron & Tibshirani, An Introduction to the Bootstrap, 1993).
+Tiles are drawn with replacement, the same tiles for every variant. So intervals of differences and ratios
+between variants use the pairing (Efron & Tibshirani, An Introduction to the Bootstrap, 1993).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Means:
 
 
 def interval(values: Floats) -> tuple[float, float]:
-    """Return the percentile interval of resampled values; NaN if none is finite."""
+    """Return the percentile interval of resampled values; NaN if all are infinite or NaN."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return float("nan"), float("nan")
@@ -70,7 +70,7 @@ def bootstrap(figures: pd.DataFrame) -> Means:
     table = figures.reset_index().pivot(index="tile_id", columns="variant", values=list(figures))
     values = table.to_numpy(dtype=np.float64)
     valid = np.isfinite(values)
-    # How often each resample contains each tile.
+    # Number of times that each resample contains each tile.
     draws = np.random.default_rng(SEED).multinomial(
         len(values), np.full(len(values), 1 / len(values)), size=RESAMPLES
     )
@@ -92,17 +92,17 @@ class Verdict:
     ours: str
     """The run's figures; "–" if not tested."""
     certainty: str
-    """Share of resamples with the order; or interval of the change, and share with the means' verdict."""
+    """Share of resamples with the same order; or interval of the change, and share with the same verdict."""
     verdict: str
 
 
 def check(claim: Claim, means: Means, dataset: str = GEROD) -> Verdict:
     """Test a claim on a run.
 
-    An order holds if the means over tiles are in that order. A change holds if it has the paper's sign and
-    the logarithm of its ratio is between half and twice that of the paper's tables; below that range it is
-    weaker, above it stronger. Whatever the verdict, it is "not decided" if fewer than `LEVEL` percent of the
-    resamples give it.
+    An order is "held" if the means over tiles are in that order. A change is "held" if it has the paper's
+    sign and the logarithm of its ratio is between half and twice the value in the paper's tables; below that
+    range it is weaker, above it stronger. If fewer than `LEVEL` percent of the resamples give the same
+    verdict, it is replaced by "not decided".
 
     - `dataset`: the paper's dataset that the run is compared with; claims about other datasets are not
       tested.
@@ -151,7 +151,7 @@ def _check_change(claim: Claim, paper: float, means: Means) -> Verdict:
 
 
 def strength(ratio: float, paper: float) -> str:
-    """Return how our ratio compares with the paper's: held, weaker, stronger, not held or not tested."""
+    """Compare our ratio with the paper's: held, weaker, stronger, not held or not tested."""
     if not (math.isfinite(ratio) and ratio > 0):
         return NOT_TESTED
     relative = math.log(ratio) / math.log(paper)

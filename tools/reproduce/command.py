@@ -38,7 +38,7 @@ def tables(
         Path | None,
         typer.Option(
             metavar="RUN",
-            help="A run for the rows of DSC3D: of its scenes or of synthetic ones.",
+            help="A run for the rows of DSC3D: of its scenes or of synthetic scenes.",
             rich_help_panel=INPUTS,
         ),
     ] = None,
@@ -85,7 +85,7 @@ def figures(
     output: Output,
     tile: Annotated[
         str | None,
-        typer.Option(metavar="ID", help="Tile of the maps; default: the one with the median road L2."),
+        typer.Option(metavar="ID", help="Tile of the maps; default: the tile with the median road L2."),
     ] = None,
 ) -> None:
     """Draw the paper's figures from a run.

@@ -86,7 +86,7 @@ def trade_off(config: Config, full: str, done: pd.DataFrame) -> Captioned:
 
 
 def sweep(chains: Mapping[str, Chain], full: str, options: tuple[str, ...]) -> dict[str, str]:
-    """Return the variants that differ from the full pipeline only in these options, and the full one.
+    """Return the variants that differ from the full pipeline only in these options, and the full pipeline.
 
     - result: label by variant, ordered by the options' values; empty if the methods of the full pipeline lack
       one of the options.
@@ -134,7 +134,7 @@ def _panel(axes: Axes, means: pd.DataFrame, labels: Mapping[str, str], full: str
     for i, (variant, x, y) in enumerate(means.itertuples(name=None)):
         colour = PATH if variant == full else FLEXROAD
         axes.plot(x, y, "o", color=colour, markersize=4, zorder=3)
-        # Alternately above and below, so that the labels of close neighbours do not overlap.
+        # Labels are alternately above and below, so that close neighbours do not overlap.
         up = bool(i % 2)
         axes.annotate(
             labels[variant],
@@ -152,7 +152,7 @@ def _panel(axes: Axes, means: pd.DataFrame, labels: Mapping[str, str], full: str
 def statistics(run: Run, full: str, done: pd.DataFrame) -> pd.DataFrame:
     """Return ``tile_id, stratum, road_percent, height_range_m`` of the finished tiles.
 
-    The road share is that of the run's table; heights are those of the DSM, with houses and trees.
+    The road share is from the run's table; heights are from the DSM, with houses and trees.
     """
     table = done.loc[done.variant == full, ["tile_id", "stratum", "road_fraction"]].copy()
     wanted = set(table.tile_id)

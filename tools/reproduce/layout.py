@@ -71,7 +71,7 @@ def save(figure: Figure, folder: Path, name: str) -> None:
         buffer = io.BytesIO()
         with rc_context(STYLE):
             figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
-        # The layout costs as much as the drawing: the PDF has that of the PNG.
+        # The layout takes as long as the drawing, so the PDF uses the layout of the PNG.
         figure.set_layout_engine("none")
         files[kind] = buffer.getvalue()
         write(folder / f"{name}.{kind}", files[kind])

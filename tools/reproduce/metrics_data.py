@@ -28,16 +28,16 @@ UNNAMED = "rasters whose catalog does not name them"
 
 @dataclass(frozen=True, eq=False)
 class MetricsData:
-    """The rows of one run, or of two that differ in `evaluate.classes`, and of the runs for DSC3D."""
+    """The rows of one run, or of two runs that differ in `evaluate.classes`, and of the runs for DSC3D."""
 
     rows: pd.DataFrame
     """Columns `KEYS` and `FIGURES`, one row per classes, tile and variant; NaN for failed tiles."""
     dsc3d: tuple[MetricsData, ...] = ()
     """Runs for the DSC3D rows, one per reference; the reference that the paper describes comes first."""
     literal: MetricsData | None = None
-    """A run with the paper read literally over all or some of the tiles, None if there is none."""
+    """A run with the paper read literally over all or some of the tiles; None without such a run."""
     dsm: MetricsData | None = None
-    """The same tiles measured against the DSM, None if there is no such run."""
+    """The same tiles measured against the DSM; None without such a run."""
 
     @property
     def dataset(self) -> str:
@@ -68,7 +68,7 @@ class MetricsData:
 
     @property
     def _roads(self) -> str:
-        """The number of tiles without figures of roads, as a part of a sentence; empty if all have them."""
+        """The number of tiles without figures of roads, as a part of a sentence; empty if it is 0."""
         figures = self.part(self.classes[0]).l2_road_m.unstack()
         without = int(figures.isna().any(axis=1).sum())
         return f"; {without} without roads, left out of the figures of roads" if without else ""
@@ -92,7 +92,8 @@ def collect(
 
     - `run`: the main run.
     - `true`: the same tiles, classed by the true road mask.
-    - `dsc3d`: scenes of DSC3D or of its stand-in, measured against the reference that the paper describes.
+    - `dsc3d`: scenes of DSC3D or synthetic scenes instead, measured against the reference that the paper
+      describes.
     - `dsc3d_true`: the same scenes, measured against the true surface.
     - `literal`: a run with configs/literal.yaml over the same tiles or some of them.
     - `dsm`: the same tiles and variants with configs/ablation_dsm.yaml: measured against the DSM.
@@ -161,7 +162,7 @@ def _tile_variants(rows: pd.DataFrame) -> set[tuple[str, str]]:
 
 
 def write_metrics_data(data: MetricsData, folder: Path) -> None:
-    """Write the figures, those of each kind of runs to a file of its own; files without figures go."""
+    """Write the figures, one file for each kind of run; files of other kinds are removed."""
     kinds = {
         FILE: (data,),
         DSC3D_FILE: data.dsc3d,
@@ -199,7 +200,7 @@ def _rows(run: Run) -> pd.DataFrame:
 
 
 def _classes_used(run: Run, option: str, rows: pd.DataFrame) -> str:
-    """Return the mask that classed the cells: without a true mask it is the segmented one, by any option."""
+    """Return the mask that classed the cells; without a true mask it is always the segmented mask."""
     done = set(rows.tile_id[rows.status == "done"])
     tiles = [tile for tile in run.catalog.tiles if tile.id in done or not done]
     with_mask = sum(tile.layer("reference_road") is not None for tile in tiles)

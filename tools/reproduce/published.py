@@ -1,4 +1,4 @@
-"""What the paper says: its Tables I and II, as printed, and the claims of its text about them."""
+"""The paper's Tables I and II, as printed, and the claims of its text about them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Claim(NamedTuple):
     """Section of the paper that makes the claim."""
     figure: str
     variants: tuple[str, ...]
-    """In ascending order; or two, of which the second is compared with the first."""
+    """Variants in ascending order; or two variants: the second is compared with the first."""
     quoted: float | None = None
     """Change in percent, as quoted in the paper's text; None if the claim is about the order."""
     slack: float = 0.0

@@ -35,9 +35,9 @@ GROUPS = (("l2_road_m", "l2_terrain_m"), ("mad_road_deg", "mad_terrain_deg"), ("
 """Figures that share a table; all five in one table would be wider than a page."""
 ROAD_L2 = "l2_road_m"
 FIGURES_SCORED = ("l2_road_m", "l2_terrain_m", "mad_road_deg", "mad_terrain_deg")
-"""Without T, which depends on the mask and the sampling alone."""
+"""All figures but T: it depends only on the mask and the sampling."""
 LEAST = 0.05
-"""Changes of the paper up to this size are not scored: their sign is no statement."""
+"""Smaller changes in the paper are not scored: their sign has no meaning."""
 KINDS = {HELD: "within", WEAKER: "weaker", STRONGER: "stronger", NOT_HELD: "opposite or flat"}
 REASONS = {
     ("wo_dynamic", "l2_road_m"): "The same surface, sampled at the same points on roads.",
@@ -58,8 +58,8 @@ def side_by_side(
 
     - `name`: name of the table, the first part of the titles.
     - `rows`: the paper's rows; every variant is in `ours`.
-    - `ours`: our means by column name; the difference from the paper is added if there is only one. A variant
-      that a column lacks has a dash there.
+    - `ours`: our means by column name; a single column is followed by the difference from the paper. A
+      variant that a column lacks has a dash there.
     - `line`: the data of the table, if not the page's main data.
     """
     for figures in GROUPS:
@@ -79,7 +79,7 @@ def side_by_side(
 
 
 def numbers(name: str, rows: tuple[Row, ...], classes: str, means: Means, data: str) -> pd.DataFrame:
-    """Return every number of a table, one per row, unrounded."""
+    """Return every number of a table, one per row, not rounded."""
     records = []
     for row in rows:
         for figure in FIGURES:
@@ -136,7 +136,7 @@ def _with_interval(means: Means, variant: str, figure: str) -> str:
 
 
 def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
-    """Return the counts of the changes by figure, and the list of those that are opposite or flat."""
+    """Return the counts of the changes by figure, and the list of opposite or flat changes."""
     scored, opposite = _changes(rows, means)
     if not scored:
         return ()
@@ -147,7 +147,7 @@ def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
     kinds = ", ".join(f"{verdicts[kind]} {name}" for kind, name in KINDS.items())
     line = (
         f"{len(scored)} changes of L2 and MAD by more than {LEAST:.0%} in the paper: {kinds}. Within: the "
-        "logarithm of our ratio is between half and twice that of the paper's; weaker: below; stronger: "
+        "logarithm of our ratio is between half and twice the paper's value; weaker: below; stronger: "
         "above; opposite or flat: no change or one of the other sign. Not decided: of these, the changes for "
         f"which fewer than {LEVEL}% of the resamples give the same answer."
     )
@@ -158,10 +158,10 @@ def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
 
 
 def _changes(rows: tuple[Row, ...], means: Means) -> tuple[list[tuple[str, str, bool]], list[dict[str, str]]]:
-    """Return the changes that exceed `LEAST` in the paper, and the rows of the table of opposite ones.
+    """Return the changes that exceed `LEAST` in the paper, and the rows of the table of opposite changes.
 
-    Of each change: the figure's label, the verdict by the rule for claims, and whether enough resamples of
-    the tiles give it.
+    A change is the figure's label, the verdict by the rule for claims, and whether enough resamples of the
+    tiles give the same verdict.
     """
     base = next(row for row in rows if row.variant == BASE)
     scored, opposite = [], []
@@ -200,7 +200,7 @@ def literal_column(data: MetricsData) -> dict[str, Means]:
 
 
 def literal_notes(data: MetricsData) -> Iterator[str]:
-    """Yield the note that explains the second column, if there is one."""
+    """Yield the note on the second column, if the column exists."""
     if data.literal:
         yield (
             f"The column “{_name(data, data.literal)}” has the paper read literally: the points S(u, v) lie "
@@ -210,7 +210,7 @@ def literal_notes(data: MetricsData) -> Iterator[str]:
 
 
 def literal_numbers(tables: Mapping[str, tuple[Row, ...]], data: MetricsData) -> list[pd.DataFrame]:
-    """Return every number of the second column, a table each; see `sections.numbers`."""
+    """Return every number of the second column for each table; see `numbers`."""
     if not data.literal:
         return []
     means, run = _means(data.literal), data.literal
@@ -224,7 +224,7 @@ def literal_numbers(tables: Mapping[str, tuple[Row, ...]], data: MetricsData) ->
 
 
 def literal_sections(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Section]:
-    """Yield the factors between the paper's figures and those of both columns, on the tiles of both."""
+    """Yield the factors between the paper's figures and both columns, on the tiles of both columns."""
     if not data.literal or not rows:
         return
     literal = _means(data.literal)
@@ -247,7 +247,7 @@ def literal_sections(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Secti
 
 
 def road_sections(rows: tuple[Row, ...], means: Means, data: MetricsData) -> Iterator[Section]:
-    """Yield L2 on roads against the reference and against the DSM, if there is a run with the DSM."""
+    """Yield L2 on roads against the reference and against the DSM, if a run with the DSM is given."""
     if not data.dsm:
         return
     table = pd.DataFrame({"variant": [row.label for row in rows]})
@@ -265,7 +265,7 @@ def road_sections(rows: tuple[Row, ...], means: Means, data: MetricsData) -> Ite
 
 
 def road_numbers(rows: tuple[Row, ...], data: MetricsData) -> list[pd.DataFrame]:
-    """Return L2 on roads against the DSM as rows of `numbers`, if there is a run with it."""
+    """Return L2 on roads against the DSM as rows of `numbers`, if a run with the DSM is given."""
     if not data.dsm:
         return []
     name = f"{data.dsm.dataset}; against the DSM"
@@ -277,7 +277,7 @@ def distances_of(rows: tuple[Row, ...], means: Means, relative: bool) -> np.ndar
     """Return the absolute logarithms of the ratios of our figures to the paper's, ``(rows, 4)``.
 
     - `rows`: rows of Table II with the full pipeline.
-    - `relative`: whether to compare the ratios to the full pipeline in place of the figures.
+    - `relative`: whether to compare the ratios to the full pipeline instead of the figures.
     """
     paper = np.array([[row.value(figure) for figure in FIGURES_SCORED] for row in rows])
     ours = np.array([[means.mean[row.variant, figure] for figure in FIGURES_SCORED] for row in rows])

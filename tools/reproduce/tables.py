@@ -1,6 +1,6 @@
 """The paper's Tables I and II with our figures beside them, written as Markdown, LaTeX, CSV and HTML.
 
-The metrics behind them are written, too.
+The metrics that they are computed from are written, too.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ LATEX = {
 }
 """LaTeX for characters that pdflatex does not print, or prints differently from the paper."""
 NARROW, SENTENCE = 12, 25
-"""Limits of a text column's longest cell (characters) above which it is wrapped; see `_latex`."""
+"""A text column is wrapped if its longest cell has more characters than one of these; see `_latex`."""
 MASKS = {
     "segmented": "segmented mask",
     "reference": "true mask",
@@ -94,7 +94,7 @@ class Comparison:
     """How to read the tables."""
     sections: tuple[Section, ...]
     numbers: pd.DataFrame
-    """Every number of the tables, one per row, unrounded."""
+    """Every number of the tables, one per row, not rounded."""
     claims: pd.DataFrame
     """Every claim with its verdict; claims about DSC3D once per reference."""
 
@@ -150,7 +150,7 @@ def compare(data: MetricsData) -> Comparison:
     # Table II with the full pipeline only would repeat Table I.
     tables = {name: rows for name, rows in tables.items() if {row.variant for row in rows} - {BASE}}
     if not tables:
-        raise ConfigError("the run has none of the variants FlexRoad is compared with; use --config ablation")
+        raise ConfigError("the run has no variants to compare FlexRoad with; use --config ablation")
     dsc3d_sections, dsc3d_notes, dsc3d_numbers, dsc3d_claims = _dsc3d(data.dsc3d)
     # Claims about DSC3D have their own table if there is a run to test them on.
     tested = [claim for claim in CLAIMS if claim.dataset == paper or not data.dsc3d]
@@ -206,7 +206,7 @@ def _notes(data: MetricsData, paper: str, verdicts: list[Verdict]) -> Iterator[s
     yield (
         f"The paper's {len(verdicts)} claims{about}: {', '.join(counts)}. An order holds if the means are in "
         "that order. A change holds if it has the paper's sign and the logarithm of its ratio is between "
-        "half and twice that of the paper's tables; below that range it is weaker, above it stronger. A "
+        "half and twice the paper's value; below that range it is weaker, above it stronger. A "
         f"claim is not decided if fewer than {LEVEL}% of the resamples give the verdict of the means"
         f"{', and not tested if the run has no such data or variants' if totals[NOT_TESTED] else ''}."
     )
@@ -263,7 +263,7 @@ def _per_stratum(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Section]:
 def _dsc3d(
     runs: tuple[MetricsData, ...],
 ) -> tuple[list[Section], tuple[str, ...], list[pd.DataFrame], list[pd.DataFrame]]:
-    """Return sections, notes, numbers and verdicts of the runs for DSC3D, one run and table per reference."""
+    """Return sections, notes, numbers and verdicts of the runs for DSC3D, with one table per reference."""
     if not runs:
         return [], (), [], []
     title = f"{DSC3D_ROWS}{_standing_in(runs[0])}"
@@ -344,7 +344,7 @@ def latex_page(comparison: Comparison) -> str:
 
 def _latex(table: pd.DataFrame, caption: str) -> str:
     lengths = [max(map(len, column), default=0) for _, column in table.items()]
-    # A column of sentences makes the page too wide: then every text column over NARROW is wrapped.
+    # A column of sentences makes the page too wide. Then every text column over NARROW is wrapped.
     widest = NARROW if max(lengths) > SENTENCE else SENTENCE
     kinds = "".join(
         "r" if number else "l" if length <= widest else "p{0.12\\linewidth}"
@@ -352,7 +352,7 @@ def _latex(table: pd.DataFrame, caption: str) -> str:
     )
     first, *others = [str(column).split(", ") for column in table.columns]
     if all(len(parts) == 2 for parts in others):
-        # "L2 road (m), paper" and "L2 road (m), ours" stand under one heading "L2 road (m)".
+        # "L2 road (m), paper" and "L2 road (m), ours" get one common heading "L2 road (m)".
         pairs = [("", *first), *((parts[0], parts[1]) for parts in others)]
         table = table.set_axis(pd.MultiIndex.from_tuples(pairs), axis="columns")
     body = table.to_latex(index=False, escape=True, column_format=kinds, multicolumn_format="c")

@@ -108,7 +108,7 @@ def _map(axes: Axes, view: TileView, row: Floats, col: Floats, at: Floats) -> No
     for distance in np.arange(0, at[-1] + 1, 100):
         i = int(np.searchsorted(at, distance).clip(0, at.size - 1))
         axes.plot(x[i], y[i], "o", color=PATH, markersize=2.5)
-        # Offset towards the middle of the map, so that the labels of the ends stay inside.
+        # The labels of the ends are moved towards the middle of the map, so that they stay inside.
         right, up = x[i] < x.max() / 2, y[i] < y.max() / 2
         axes.annotate(
             f"{distance:.0f} m",
@@ -253,7 +253,7 @@ def draw_renders(pictures: dict[str, bytes]) -> Figure:
     not_white = np.any([image.min(axis=2) < 250 for image in pixels], axis=0)
     rows, cols = (np.flatnonzero(not_white.any(axis=axis)) for axis in (1, 0))
     for panel, label, image in zip(axes, pictures, pixels, strict=True):
-        # All cropped alike, to the part that is not white in at least one.
+        # All are cropped to the same part: outside of it, every picture is white.
         panel.imshow(image[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1])
         panel.set_title(label)
         panel.set_axis_off()

@@ -1,4 +1,4 @@
-"""What the figures show of one tile: its rasters, the results of the paper's methods, a vehicle's path."""
+"""Data of one tile for the figures: its rasters, the results of the paper's methods, a vehicle's path."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EDGE_COST = 8.0
 SMOOTHING_CELLS = 3.0
 """Standard deviation of the Gaussian that smooths the path."""
 STEP_CELLS = 0.5
-"""Distance between the points that are returned."""
+"""Distance between the points of the path."""
 SIDE = 0.5
 """Shift to the right, as a fraction of the distance from the middle of the road to its edge."""
 
@@ -95,9 +95,9 @@ class TileView:
     truth: Floats
     """Heights that errors are measured against (m)."""
     against: str
-    """Name of `truth` for captions: the reference surface, or the DTM if there is none."""
+    """Name of `truth` for captions: the reference surface, else the DTM."""
     street: Bools
-    """Road cells: the catalog's reference road mask, or the filtered mask if there is none."""
+    """Road cells: the catalog's reference road mask, else the filtered mask."""
     dropped: Bools
     """Cells of the segmented mask that the filter dropped."""
     results: dict[str, Result]
@@ -152,7 +152,7 @@ def _result(tile: FinishedTile, core: Grid) -> Result:
 
 
 def missing_roles(view: TileView, methods: Mapping[str, str]) -> str:
-    """Return which methods have no variant in the run, as a message; empty if all have one.
+    """Return a message on methods without a variant in the run; empty if all methods have a variant.
 
     - `methods`: role of each method that a figure needs, by label.
     """

@@ -60,7 +60,7 @@ def query(
         str | None,
         typer.Option(
             metavar="CRS",
-            help="CRS of the points or the line, if it is another one: EPSG:4326 for degrees. First east, "
+            help="CRS of the points or the line, if it is not the run's: EPSG:4326 for degrees. First east, "
             "then north.",
             rich_help_panel=INPUTS,
         ),
@@ -69,7 +69,7 @@ def query(
         str | None,
         typer.Option(
             metavar="N|all",
-            help="Level of roads above roads: 0 is the sampler, all: a row per level; default: the highest.",
+            help="Level of roads above roads: 0 is the ground, all: a row per level; default: the highest.",
         ),
     ] = None,
     variant: Annotated[

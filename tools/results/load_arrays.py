@@ -36,7 +36,7 @@ else:
 TILE_ID = "arrays"
 """The tile id of data that come from no catalog."""
 WITHOUT_ROAD = (
-    "road_mask has no road cell on the grid of the dsm, so the surface is that of the terrain; "
+    "road_mask has no road cell on the grid of the dsm, so the surface is the terrain's; "
     "a road cell is True, not 0, or one of road_values"
 )
 """Note on a mask without road cells."""
@@ -55,7 +55,7 @@ def load_arrays(
     - `road_mask`: road where True or not 0, or roads as vectors.
     - `options`: the halo is NaN where the DTM and the mask do not reach beyond the DSM.
     - `road_values`: values of the mask that mean road; empty: every value but 0 and nodata.
-    - result: the DTM and the mask are copied where their cells coincide with those of the DSM. Otherwise they
+    - result: the DTM and the mask are copied where their cells coincide with the DSM's cells. Otherwise they
       are resampled (heights bilinearly, the mask to the nearest cell), with a note. A mask without road
       cells, or whose values do not fit those that mean road, gives a note, too.
     """
@@ -205,7 +205,7 @@ def _values(name: str, array: xr.DataArray) -> Floats:
         )
     raw: np.ndarray[Any, Any] = np.asarray(array.values)
     if raw.dtype.kind not in "buif":
-        raise TaskError(f"{name} holds {raw.dtype}, not numbers; convert it with .astype(float)")
+        raise TaskError(f"{name} has {raw.dtype}, not numbers; convert it with .astype(float)")
     values = raw.astype(np.float64)
     # A comparison keeps the attribute of its raster, and rioxarray cannot convert 255 to bool.
     nodata = None if raw.dtype.kind == "b" else array.rio.nodata
@@ -216,7 +216,7 @@ def _values(name: str, array: xr.DataArray) -> Floats:
 
 
 def _absurd(patch: RasterWindow) -> str:
-    """Set heights outside the valid range to NaN, as `load` does; return a note, or "" if there are none."""
+    """Set heights outside the valid range to NaN, as `load` does; return a note, or "" if none is outside."""
     given = replace(patch, values=patch.values.copy())
     count = remove_absurd(patch.values)
     if count and np.isnan(patch.values).all():
@@ -229,7 +229,7 @@ def _absurd(patch: RasterWindow) -> str:
 
 
 def _road(patch: RasterWindow, grid: Grid, road_values: Sequence[int]) -> tuple[Bools, str]:
-    """Return the road cells of a mask, and how its values do not fit; empty if they do."""
+    """Return the road cells of a mask, and a note if its values do not fit, else ""."""
     known = patch.values[~np.isnan(patch.values)]
     values = set(np.unique(known).tolist())
     note = values_note(values, road_values, known.size < patch.values.size, "road_values") if values else ""

@@ -38,7 +38,7 @@ LAYERS: tuple[tuple[str, str, str, float, dict[str, str]], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Mosaic(xr.backends.BackendArray):
-    """One layer of the finished tiles, ``(H, W)``, which xarray reads as it reads a file."""
+    """One layer of the finished tiles, ``(H, W)``; xarray reads it like a file."""
 
     shape: tuple[int, int]
     stems: tuple[str, ...]
@@ -77,7 +77,7 @@ def mosaic(run: Run, variant: str, bounds: Bounds | None) -> tuple[xr.Dataset, G
 
     The arrays are backed by Dask, with a chunk between any two neighbouring edges of tiles.
 
-    - `bounds`: none for all tiles.
+    - `bounds`: None for all tiles.
     """
     tiles = run.catalog.usable
     grid = _grid(tiles, bounds)

@@ -37,7 +37,7 @@ def catalog_from(
     tile_size_m : float
         Edge of a tile (m).
     road_values : sequence of int
-        Values of the road mask that mean road; empty: all but 0 and nodata.
+        Values of the road mask that mean road; empty: all except 0 and nodata.
     crs : str, optional
         CRS of files without one.
     reproject : bool
@@ -95,9 +95,9 @@ def run(
     allow: Sequence[str | Path] = (),
     observer: Observer | None = None,
 ) -> RunView:
-    """Bring the tiles of a catalog up to date, as ``flexroad run`` does; a tile that fails stops no other.
+    """Bring the tiles of a catalog up to date, as ``flexroad run`` does. A failed tile does not stop the run.
 
-    What is up to date is not computed again, so that the same call resumes a run.
+    Results that are up to date are not computed again. So the same call resumes a run.
 
     Parameters
     ----------
@@ -106,11 +106,11 @@ def run(
     config : str or Path
         Name of a shipped configuration, or a YAML file.
     out : str or Path
-        The run's folder: new, empty, or of a run.
+        The run's folder: new, empty, or with an earlier run.
     tiles : sequence of str
         Ids of the tiles to process; empty: all.
     workers : int, optional
-        Most worker processes; 1: this process alone; None: as many as pay. A script that starts them needs
+        Most worker processes; 1: this process alone; None: as many as save time. A script with workers needs
         ``if __name__ == "__main__":`` around the call.
     settings : sequence of str, or mapping
         Options of the configuration: ``["fit.spacing_m=5"]`` or ``{"fit": {"spacing_m": 5}}``.
@@ -133,7 +133,7 @@ def run(
     CatalogError
         If the catalog cannot be read, or has no such tile.
     ClusterLost
-        If all workers are lost; what was done before is kept.
+        If all workers are lost; finished tiles are kept.
     OSError
         If a file of the run cannot be written.
 

@@ -1,4 +1,4 @@
-"""Answers of ``flexroad query``: tables of points or profiles with what a run has there."""
+"""Answers of ``flexroad query``: heights, normals and classes of a run at points or along lines."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ else:
 MAX_POINTS = 10_000_000
 """Largest number of points of the profiles of one command: their table takes gigabytes."""
 LevelWanted = int | Literal["all"] | None
-"""A level of roads above roads, all that each point has, or the highest."""
+"""A number of a level, all levels of each point, or the highest."""
 MOST_NAMED = 3
 """Kinds of flagged places that a note names."""
 PASSED_M = 1.0
@@ -54,13 +54,13 @@ MILLIMETRES = ("distance_m", "easting", "northing")
 
 @dataclass(frozen=True, eq=False)
 class AnswerTable:
-    """A table of n points and what a run has there."""
+    """A table of n points with the heights, normals and classes of a run."""
 
     table: pd.DataFrame
-    """One row per point: the given columns, then those of the answer."""
+    """One row per point: the given columns, then the columns of the answer."""
     easting: Floats
     northing: Floats
-    """``(n,)``, m, in the CRS of the run; NaN where there are none."""
+    """``(n,)``, m, in the CRS of the run; NaN where the coordinates are unknown."""
     crs: str | None
     """CRS of the run; None if its tiles have several."""
     answer: Answer
@@ -72,7 +72,7 @@ class AnswerTable:
     """The level that was asked for."""
 
     def write_csv(self, out: TextIO | Path) -> None:
-        """Write the table as CSV; text that a spreadsheet takes for a formula begins with an apostrophe."""
+        """Write the table as CSV. Text that a spreadsheet takes for a formula gets a leading apostrophe."""
         table = self.table.copy()
         for name in MILLIMETRES:
             if name in table and table[name].dtype.kind == "f":
@@ -102,7 +102,7 @@ class AnswerTable:
 
 
 def at_points(sampler: RunSampler, points: Points, level: LevelWanted = None) -> AnswerTable:
-    """Return what a run has at points: the columns height_m, nx, ny, nz, tile, class, flags.
+    """Return the columns height_m, nx, ny, nz, tile, class and flags at points.
 
     Points of a vector file also get the columns easting and northing (m), in the CRS of the run. With a level
     there is also a column level; with all levels, each point has a row for each level that it has.
@@ -130,7 +130,7 @@ def at_points(sampler: RunSampler, points: Points, level: LevelWanted = None) ->
 def _on_level(
     sampler: RunSampler, easting: Floats, northing: Floats, level: LevelWanted
 ) -> tuple[NDArray[np.intp], Answer]:
-    """Return the number of the point of each row, and what a run has there."""
+    """Return for each row the index of its point, and the values of the run there."""
     if level == "all":
         return sampler.on_every_level(easting, northing)
     return np.arange(len(easting)), sampler.at(easting, northing, level)
@@ -139,11 +139,11 @@ def _on_level(
 def along_lines(
     sampler: RunSampler, lines: list[Floats], step_m: float, level: LevelWanted = None
 ) -> AnswerTable:
-    """Return profiles: what a run has every ``step_m`` along lines, and at their ends.
+    """Return profiles: the values of a run every ``step_m`` along lines, and at their ends.
 
     The columns are line (only if there are several), distance_m, easting, northing, height_m, grade_percent,
-    nx, ny, nz, tile, class and flags. The grade is that of the surface in the direction of the line, positive
-    uphill. Flags are those up to the next point. For levels see `at_points`.
+    nx, ny, nz, tile, class and flags. The grade is the slope of the surface in the direction of the line,
+    positive uphill. Flags apply up to the next point. For levels see `at_points`.
     """
     points = stations(lines, step_m)
     easting, northing = points.easting.to_numpy(), points.northing.to_numpy()
@@ -167,7 +167,7 @@ def _up_to_next(sampler: RunSampler, lines: list[Floats], points: pd.DataFrame, 
     length = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines)
     between = stations(lines, max(PASSED_M, 2 * length / MAX_POINTS))
     found = sampler.at(between.easting.to_numpy(), between.northing.to_numpy(), level).flags
-    # Lines one behind the other.
+    # Lines are placed one after the other.
     own, fine = (
         table.line.to_numpy() * (length + 1.0) + table.distance_m.to_numpy() for table in (points, between)
     )
@@ -180,7 +180,7 @@ def stations(lines: list[Floats], step_m: float) -> pd.DataFrame:
     """Return the points every ``step_m`` along lines, and at the end of each.
 
     The columns are line (from 1), distance_m (in plan, from the start of the line), easting, northing (m),
-    and east, north: the unit vector of the line's direction, at a vertex that of the part that begins there.
+    and east, north: the unit vector of the line's direction; at a vertex, of the next part's direction.
     """
     lengths = [float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines]
     number = sum(length / step_m + 2 for length in lengths)
@@ -203,7 +203,7 @@ def _along(line: Floats, step_m: float) -> Floats:
     start, parts, lengths = line[:-1][lengths > 0], parts[lengths > 0], lengths[lengths > 0]
     ends = np.cumsum(lengths)
     distance = np.arange(0.0, ends[-1], step_m)
-    # The end is a point of its own unless the last step reaches it, within a millimetre.
+    # The end is a separate point unless the last step reaches it, within a millimetre.
     distance = np.append(distance[distance < ends[-1] - 1e-3], ends[-1])
     part = np.minimum(np.searchsorted(ends, distance, side="right"), len(ends) - 1)
     direction = parts[part] / lengths[part, None]
@@ -219,7 +219,7 @@ def _columns(answer: Answer, level: LevelWanted) -> dict[str, Any]:
 
 
 def beyond_survey(result: AnswerTable) -> str:
-    """Return a line about the points where a tile has no data, empty if there are none."""
+    """Return a line about the points where a tile has no data; empty if it has data at all points."""
     number = int(((result.answer.tile != "") & np.isnan(result.answer.height)).sum())
     if not number:
         return ""
@@ -230,7 +230,7 @@ def beyond_survey(result: AnswerTable) -> str:
 
 
 def on_flagged(result: AnswerTable) -> str:
-    """Return a line about the points on flagged places, empty if there are none."""
+    """Return a line about the points on flagged places; empty if no point is on one."""
     found = Counter(name for name in result.table["flags"] if name)
     if not found:
         return ""
@@ -241,7 +241,7 @@ def on_flagged(result: AnswerTable) -> str:
 
 
 def outside(result: AnswerTable, sampler: RunSampler) -> str:
-    """Return a line about the points that lie on no finished tile, empty if there are none.
+    """Return a line about the points that lie on no finished tile; empty if all lie on one.
 
     If all points do, it says where the tiles lie.
     """

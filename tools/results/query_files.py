@@ -48,13 +48,13 @@ class Points:
     """n points with their attributes."""
 
     table: pd.DataFrame
-    """The columns of the file: those of a CSV as text, as they are written there."""
+    """The columns of the file. The values of a CSV are its unchanged text."""
     x: Floats
-    """``(n,)``, eastings in metres or longitudes in degrees; NaN where there is none."""
+    """``(n,)``, eastings in metres or longitudes in degrees; NaN where unknown."""
     y: Floats
     """``(n,)``, northings in metres or latitudes in degrees."""
     crs: str | None
-    """CRS of the coordinates; None if neither the user nor the file says it: it is then that of the run."""
+    """CRS of the coordinates. None if neither the user nor the file gives one: the run's CRS is used."""
     separator: str = ","
     """Separator of the columns of a CSV."""
     decimal: str = "."
@@ -204,7 +204,7 @@ def read_lines(given: str, crs: str | None, run_crs: str) -> list[Floats]:
 
     - `given`: a vector file of lines, with a layer as in `file_and_layer`, or the vertices of one line:
       ``"x y, x y"``. Parts of one feature that touch at their ends are one line.
-    - `crs`: CRS of the lines, as the user says it; None: that of the file, or for vertices that of the run.
+    - `crs`: CRS of the lines, given by the user; None: the CRS of the file, or for vertices of the run.
     """
     if _COORDINATES.fullmatch(given) and not Path(given).exists():
         lines, source = [_vertices(given)], crs

@@ -159,7 +159,7 @@ class RunView:
             Eastings and northings (m) in the CRS of the tiles, of shapes that broadcast.
         level : int, optional
             The level of roads above roads (``segment.levels``): 0 is the ground with its streets, 1 a deck
-            above it, -1 a tunnel below it; NaN where there is none. By default the highest at each point.
+            above it, -1 a tunnel below it; NaN where a point lacks the level. By default the highest.
 
         Returns
         -------
@@ -181,7 +181,7 @@ class RunView:
         return answer.height.reshape(shape)[()]
 
     def normal(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        """Return the upward unit normal at points: that of the spline, without the steps beside roads.
+        """Return the upward unit normal of the spline at points, without the steps beside roads.
 
         Parameters
         ----------
@@ -220,12 +220,12 @@ class RunView:
         Parameters
         ----------
         path, out : str or Path
-            The file, and where its copy is written, in the same format (``flexroad lift --help`` names
-            them). All but the heights stays as it is.
+            The file and its copy, both in one of the formats that ``flexroad lift --help`` names. Only the
+            heights differ.
         options : flexroad.tools.lift.types.Options, optional
-            Tolerance, what roads have across, what is listed.
+            Tolerance, cross-sections of roads, rows of the report.
         crs : str, optional
-            CRS of the file, if it does not say it.
+            CRS of the file, if the file has none.
         report : str or Path, optional
             A CSV with a row per road or feature.
 
@@ -256,7 +256,7 @@ class RunView:
         Parameters
         ----------
         bounds : tuple of float, optional
-            West, south, east, north (m), extended to whole cells; by default those of all tiles.
+            West, south, east, north (m), extended to whole cells; by default the bounds of all tiles.
 
         Returns
         -------
@@ -264,7 +264,7 @@ class RunView:
             ``height`` (m, float32; NaN off the finished tiles and beyond the survey) and ``road`` (bool, the
             filtered mask), backed by Dask: one chunk per tile, read from the tile's GeoTIFF when it is
             computed. Coordinates ``x`` (ascending) and ``y`` (descending) are eastings and northings (m);
-            ``.rio.crs`` is set. Where tiles overlap, the first one in the catalog is used.
+            ``.rio.crs`` is set. Where tiles overlap, the first tile in the catalog is used.
 
         Raises
         ------
@@ -302,7 +302,7 @@ class RunView:
         Surface
             Equal to the surfaces of its tiles, with the steps beside roads, except for rounding (below
             1e-9 m), see docs/mosaic.md. NaN in tiles that are not finished, and on their edges. It has no
-            road mask, and so no mesh, and goes on beyond the survey.
+            road mask and no mesh, and continues beyond the survey.
 
         Raises
         ------
@@ -356,8 +356,8 @@ class RunView:
         Returns
         -------
         xarray.Dataset, (y, x)
-            ``dsm``, ``dtm``, ``surface`` (m; with levels, that of level 0), ``road``, ``road_filtered`` and,
-            where the catalog has them, ``reference`` (m) and ``reference_road``.
+            ``dsm``, ``dtm``, ``surface`` (m; with levels, the surface of level 0), ``road``,
+            ``road_filtered`` and, where the catalog has them, ``reference`` (m) and ``reference_road``.
 
         Raises
         ------
@@ -406,25 +406,25 @@ class RunView:
         Parameters
         ----------
         tiles : sequence of str
-            Ids of the tiles; none given: all, or the failed ones.
+            Ids of the tiles; empty: all tiles, or the failed tiles.
         failed : bool
-            Whether the tiles that failed are processed.
+            Whether the failed tiles are processed, besides the given ones.
         from_stage : str, optional
             Stage to compute again, with all later ones; ``export``: only the products are written again.
         workers : int, optional
-            Most worker processes; 1: this process alone; None: as many as pay.
+            Most worker processes; 1: this process alone; None: as many as save time.
         observer : Observer, optional
             Takes the events of the run.
 
         Returns
         -------
         RunView
-            The run as it is then.
+            The run after that.
 
         Raises
         ------
         ConfigError, CatalogError, ClusterLost, OSError
-            As of `flexroad.run`.
+            As in `flexroad.run`.
 
         Examples
         --------
@@ -459,18 +459,17 @@ def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str |
     path : str or Path
         The folder given to ``flexroad run --out``, or its address in object storage (``s3://...``).
     variant : str, optional
-        The variant whose surfaces are used; by default the first one exported.
+        The variant whose surfaces are used; by default the first exported variant.
     allow : sequence of str or Path
-        Further folders that the sources of the run may lie below. Needed for runs that another user, or
-        the same user on another machine, has made from files outside the run's own folder.
+        Further folders that the sources of the run may lie below. Needed for runs of another user, or of
+        another machine, with sources outside the run's folder.
 
     Raises
     ------
     ConfigError
-        If the folder is no run, or has no such variant.
+        If the folder is not a run, or has no such variant.
     CatalogError
-        If its catalog is damaged. Methods of the view also raise it if a source lies outside the allowed
-        folders.
+        If its catalog is damaged, or later if a source lies outside the allowed folders.
 
     Examples
     --------
@@ -484,7 +483,7 @@ def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str |
 
 
 def _of_one_level(tiles: Iterable[FinishedTile]) -> Iterator[NurbsSurface]:
-    """Yield the surfaces of tiles; one with levels raises an error, since it is more than its spline."""
+    """Yield the surfaces of tiles. A tile with levels raises an error: it has several surfaces."""
     for tile in tiles:
         surface = tile.surface
         if surface.levels:
@@ -514,7 +513,7 @@ def _joined(grids: Sequence[Grid], surfaces: Iterable[NurbsSurface]) -> NurbsSur
     for grid, surface in zip(grids, chain([spline], surfaces), strict=True):
         window = down, along = cells.window(grid)
         i, j = along.start // width, rows - 1 - down.start // height
-        # Points and steps on the border are in both tiles; those of a missing neighbour stay.
+        # Points and steps on the border are in both tiles; they stay if the neighbour is missing.
         heights[j * m : (j + 1) * m + q, i * n : (i + 1) * n + p] = surface.A
         if isinstance(surface, SteppedSurface):
             stepped, steps[window] = True, surface.steps

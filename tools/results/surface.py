@@ -97,9 +97,9 @@ class Surface:
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """``("no-road",)`` if there is no road cell after the filter, so that it is the terrain's surface.
+        """``("no-road",)`` if no road cell is left after the filter: the surface is the terrain's.
 
-        Empty if there is one, or if the surface has no mask.
+        Empty if a road cell is left, or if the surface has no mask.
 
         Examples
         --------
@@ -137,7 +137,7 @@ class Surface:
         return np.where(self._valid(easting, northing), self.fitted.height(easting, northing), np.nan)[()]
 
     def normal(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        """Return the upward unit normal at points: that of the spline, without the steps beside roads.
+        """Return the upward unit normal of the spline at points, without the steps beside roads.
 
         Parameters
         ----------
@@ -191,7 +191,7 @@ class Surface:
         ({'y': 120, 'x': 120}, ['height', 'road'], 25832)
         """
         if not 0 < resolution < np.inf:
-            raise ConfigError(f"resolution {resolution:g} m is no cell size; give one above 0, such as 0.5")
+            raise ConfigError(f"resolution {resolution:g} m is not a cell size; give a number above 0")
         grid = Grid.covering(self.crs, self.bounds, resolution)
         x, y = np.meshgrid(grid.eastings, grid.northings)
         heights = self.fitted.lattice(grid.eastings, grid.northings)
@@ -272,7 +272,7 @@ class Surface:
         """
         if not isinstance(self.fitted, NurbsSurface):
             raise TaskError(
-                f"a {type(self.fitted).__name__} is no NURBS surface; save the result of to_xarray()"
+                f"a {type(self.fitted).__name__} is not a NURBS surface; save the result of to_xarray()"
             )
         buffer = io.BytesIO(npz.encode(self.fitted))
         if self.road is not None and self.clusters is not None:
@@ -314,31 +314,31 @@ def fit(
 ) -> Surface:
     """Fit a smooth surface to the road and the terrain of one area.
 
-    The stages and the result are those of a run over the same rasters. The area is fitted as one tile, which
-    suits 60 m x 60 m to about 500 m x 500 m. For larger areas make a catalog and a run.
+    The stages and the result are the same as in a run. The area is fitted as one tile. This suits 60 m x 60 m
+    to about 500 m x 500 m. For larger areas make a catalog and a run.
 
     Parameters
     ----------
     dsm : xarray.DataArray, (H, W)
-        Digital surface model, heights in m. Its grid is that of the surface: square pixels, a projected CRS
-        in metres (``dsm.rio.crs``), coordinates of the cell centres that ascend or descend. NaN and
+        Digital surface model, heights in m. The surface has the same grid: square pixels, a projected CRS in
+        metres (``dsm.rio.crs``), coordinates of the cell centres that ascend or descend. NaN and
         ``dsm.rio.nodata`` are nodata. Dask arrays are computed.
     dtm : xarray.DataArray, (H, W)
-        Digital terrain model, heights in m, in the same CRS. If its cells do not coincide with those of the
-        DSM, it is resampled bilinearly, with a warning.
+        Digital terrain model, heights in m, in the same CRS. If its cells do not coincide with the cells of
+        the DSM, it is resampled bilinearly, with a warning.
     road_mask : xarray.DataArray, (H, W), or geopandas.GeoDataFrame
         Road where True, not 0, or one of ``road_values``, in the same CRS. If its cells do not coincide with
-        those of the DSM, the nearest cell is taken, with a warning. It replaces the configuration's
-        ``segment``. Or areas and centre lines of roads, which ``segment: vector`` reads with its options.
-        Without any road cell, also after the filter, the surface is that of the terrain, as in a run, and has
-        the flag ``no-road`` (`Surface.flags`); a mask without road cells also gives a warning, and so do
-        several classes that all count as road, or a mask that is all road.
+        the cells of the DSM, the nearest cell is taken, with a warning. It replaces the configuration's
+        ``segment``. Or areas and centre lines of roads: ``segment: vector`` reads them with its options.
+        If no road cell is left after the filter, the surface is the terrain's, as in a run, and has the flag
+        ``no-road`` (`Surface.flags`). A warning is given for a mask without road cells, a mask that is all
+        road, and several classes that all mean road.
     config : str or Path
         A shipped configuration (``production``, ``paper``) or a YAML file.
     variant : str, optional
-        A variant of the configuration; by default the first one exported.
+        A variant of the configuration; by default the first exported variant.
     road_values : sequence of int
-        Values of the road mask that mean road; empty: all but 0 and nodata.
+        Values of the road mask that mean road; empty: all except 0 and nodata.
     settings : sequence of str, or mapping
         Options of the configuration: ``["fit.spacing_m=5"]`` or ``{"fit": {"spacing_m": 5}}``.
 
@@ -350,9 +350,9 @@ def fit(
     Raises
     ------
     TaskError
-        If an array has no CRS, is in degrees or feet, is rotated, or its pixels are not square; if the CRS of
-        two arrays differ; if the DSM has too few heights; if the mask has fractions, such as
-        probabilities; if a stage fails.
+        If an array has no CRS, is in degrees or feet, is rotated, or its pixels are not square; if two arrays
+        differ in CRS; if the DSM has too few heights; if the mask has fractions, such as probabilities; if a
+        stage fails.
     ConfigError
         If there is no such configuration, variant or setting.
 
@@ -371,7 +371,7 @@ def fit(
     if variant not in chosen.chains:
         raise ConfigError(f"{config} has no variant {variant!r}; it has {', '.join(chosen.chains)}")
     chain = chosen.chains[variant]
-    # At these sizes several BLAS threads are much slower than one.
+    # At these sizes several BLAS threads are much slower than one thread.
     with threadpool_limits(1), _layer(road_mask) as layer:
         data = load_arrays(dsm, dtm, layer, chain["load"], road_values)
         if data.roads and road_values:
@@ -411,7 +411,7 @@ def _layer(road_mask: xr.DataArray | geopandas.GeoDataFrame) -> Iterator[xr.Data
 
 
 def _segment(data: types.TileData, options: Options) -> Options:
-    """Return the options of the segmentation for what is given: a mask, or roads as vectors."""
+    """Return the options of the segmentation for the given roads: a mask, or vectors."""
     if data.roads is None:
         return mask.Options()
     of_vectors = options if isinstance(options, vector.Options) else vector.Options()
@@ -429,7 +429,7 @@ def open_surface(path: str | Path) -> Surface:
     ----------
     path : str or Path
         An ``.npz`` file, such as ``RUN/tiles/ID/ID_flexroad_surface.npz``. Files of a run contain no road
-        mask: the surface then has heights and normals over its complete domain, but no mesh.
+        mask: then the surface has heights and normals over its complete domain, but no mesh.
 
     Raises
     ------
@@ -462,7 +462,7 @@ def open_surface(path: str | Path) -> Surface:
 def placed(raster: xr.Dataset, crs: str, transform: Affine | None = None) -> xr.Dataset:
     """Return a raster with a CRS and, if it is given, a transform, as rioxarray reads them.
 
-    The nodata of heights is NaN, of which programs that get them as GeoTIFF would not know otherwise.
+    Heights have NaN as nodata: programs that read them as GeoTIFF need this value.
     """
     result: xr.Dataset = rioxarray.raster_dataset.RasterDataset(raster).write_crs(crs)
     for name, layer in result.data_vars.items():

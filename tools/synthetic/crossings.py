@@ -42,7 +42,7 @@ REACH_M = 90.0
 RAMP_M, LEVEL_M = 70.0, 12.0
 """Length of a crossing road's ramps, and of half of the level piece between them (m)."""
 SHARE = 0.6
-"""Fraction of the clearance by which the main road rises or dips; the crossing road does the rest."""
+"""The main road rises or dips by this fraction of the clearance, the crossing road by the rest."""
 SLOPE, WALL = 1 / 1.5, 20.0
 """Slope of embankments and of walls (m per m)."""
 VERGE_M, BLEND_M = 1.5, 9.0
@@ -52,7 +52,7 @@ BESIDE_M = 6.5
 RAIL_M, RAIL_OFFSET_M = 1.0, 4.75
 """Height of a parapet over its deck, and its distance from the axis (m)."""
 TREES = 24
-"""Trees per crossing, before those on roads and banks are left out."""
+"""Trees per crossing, before trees on roads and banks are left out."""
 
 
 class CrossingOptions(Options):
@@ -62,7 +62,7 @@ class CrossingOptions(Options):
         (5.5, 8.0), description="least and greatest height of the upper over the lower road (m)"
     )
     skew_deg: tuple[float, float] = Field(
-        (0.0, 35.0), description="least and greatest difference of the roads' angle from a right one"
+        (0.0, 35.0), description="least and greatest difference of the roads' angle from a right angle"
     )
     wall_m: tuple[float, float] = Field(
         (1.0, 4.0), description="least and greatest distance from the crossing road's edge to an abutment (m)"
@@ -91,7 +91,7 @@ class _Crossing:
 
     number: int
     skew: float
-    """Angle of the crossing road from a right one (rad)."""
+    """Difference of the crossing road's angle from a right angle (rad)."""
     clearance_m: float
     wall_m: float
     slopes: bool
@@ -104,7 +104,7 @@ class _Crossing:
 
     @property
     def level(self) -> int:
-        """Level of the main road there."""
+        """Level of the main road at the crossing."""
         return -1 if self.tunnel else 1
 
     @property
@@ -120,13 +120,13 @@ class _Crossing:
         return (s - self.along) * sin + v * cos, (s - self.along) * cos - v * sin
 
     def rise(self, s: Floats) -> Floats:
-        """Return by how much the main road lies above the hills (m), at positions along it."""
+        """Return the height of the main road above the hills (m), at positions along it."""
         ramp = SPACING_M / 2 - self.half_length_m - 5
         away = np.maximum(np.abs(s - self.along) - self.half_length_m, 0)
         return self.level * SHARE * self.clearance_m * smoothstep(1 - away / ramp)
 
     def dip(self, t: Floats) -> Floats:
-        """Return by how much the crossing road lies below the hills (m), at positions along it."""
+        """Return the depth of the crossing road below the hills (m), at positions along it."""
         away = np.maximum(np.abs(t) - LEVEL_M, 0)
         return self.level * (1 - SHARE) * self.clearance_m * smoothstep(1 - away / RAMP_M)
 
@@ -145,7 +145,7 @@ class Crossings:
         return Plan(self.seed, SPACING_M, 0.0, "rural", turn)
 
     def height(self, level: int, easting: Floats, northing: Floats) -> Floats:
-        """Return the true height of a level (m) at points, NaN where it is not; level 0 is everywhere."""
+        """Return the true height of a level (m) at points; NaN outside of it. Level 0 is everywhere."""
         s, v = self._along(easting, northing)
         z = np.full(np.shape(s), np.nan)
         for crossing, near in self._near(s):
@@ -192,7 +192,7 @@ class Crossings:
         return road
 
     def terrain_model(self, easting: Floats, northing: Floats) -> Floats:
-        """Return the ground as a DTM has it (m): below decks linear between the ground on both sides."""
+        """Return the ground of a DTM (m): below decks linear between the ground on both sides."""
         s, v = self._along(easting, northing)
         z = self.height(0, easting, northing)
         for crossing, near in self._near(s):
@@ -245,13 +245,13 @@ class Crossings:
         return x - self._origin[0], y - self._origin[1]
 
     def _near(self, s: Floats) -> Iterator[tuple[_Crossing, Bools]]:
-        """Yield the crossings, each with the points that are nearest to it along the main road."""
+        """Yield each crossing with the points that are nearest to it along the main road."""
         number = np.rint(s / SPACING_M).astype(np.int64)
         for k in np.unique(number):
             yield self._crossing(int(k)), number == k
 
     def _at(self, bounds: Bounds) -> list[_Crossing]:
-        """Return the crossings of which a part may lie within `MARGIN_M` of some bounds."""
+        """Return the crossings that may reach within `MARGIN_M` of some bounds."""
         west, south, east, north = bounds
         s, v = self._along(np.array([west, west, east, east]), np.array([south, north, south, north]))
         reach = REACH_M + MARGIN_M
@@ -347,7 +347,7 @@ def _embankment(top: Floats, aside: Floats) -> Floats:
 
 
 def make_crossings(grid: Grid, seed: int, options: CrossingOptions = DEFAULTS) -> Scene:
-    """Make one tile of the world of a seed, as `scene.make_scene` does; the mask is the visible road."""
+    """Make one tile of the world of a seed, like `scene.make_scene`; the mask is the visible road."""
     if seed < 0:
         raise TaskError(f"a seed is 0 or more, not {seed}")
     world = Crossings(seed, options)

@@ -1,11 +1,11 @@
-"""The stand-in for the paper's dataset DSC3D: five urban scenes as textured meshes with faults.
+"""A replacement for the paper's dataset DSC3D: five urban scenes as textured meshes with faults.
 
 The paper describes five scenes with meshes of 35 to 101 thousand triangles and height differences of 4.5 m to
-33.9 m. Its table gives RGT 45 thousand triangles: a square of 150 m with cells of 1 m. ``docs/decisions.md``
-("the stand-in") lists which numbers were checked, and against what.
+33.9 m. Its table gives RGT 45 thousand triangles: a square of 150 m with cells of 1 m.
+``docs/results/causes.md``, section 7, compares the numbers with the paper's.
 
-Photogrammetry sees walls at flat angles only, and uniform surfaces give no matching points. So edges become
-slopes, cars and trees become smooth bumps, asphalt becomes uneven, and areas without matches are bridged by a
+Photogrammetry sees walls only at flat angles, and uniform surfaces give no matching points. So edges become
+slopes, cars and trees become smooth bumps, and asphalt becomes uneven. Areas without matches are bridged by a
 smooth surface or left open.
 """
 
@@ -32,7 +32,7 @@ from flexroad.tools.synthetic.spoilers import Kind
 from flexroad.tools.synthetic.world import SOUTH_M, WEST_M, SceneOptions, field, generator, waves
 
 CRS = "EPSG:32632"
-"""UTM zone 32 on WGS 84, as for DSC3D's own meshes."""
+"""UTM zone 32 on WGS 84, like DSC3D's meshes."""
 SIZE_M = 150
 APART_M = 3000
 """Distance between scenes (m), as in the benchmark: more than the longest wave of the hills."""
@@ -50,7 +50,7 @@ BUMP_WAVES_M = (1.5, 15.0)
 BLANK_M = (4.0, 20.0)
 """Shortest and longest wave of the random field that places areas without matches (m)."""
 TEXTURELESS = (Kind.GROUND, Kind.DECK, Kind.PAVED, Kind.BUILDING)
-"""Kinds that may have no texture: asphalt (on roads and car parks) and flat roofs."""
+"""Kinds of cells that may have no texture: asphalt (on roads and car parks) and flat roofs."""
 OVERHEAD_M, ALLEY_M = 4.0, 2.0
 """Ground may be hidden within `ALLEY_M` of a surface that is `OVERHEAD_M` higher (m)."""
 MELT_M, BUMPS_M = 0.6, 0.04
@@ -89,8 +89,8 @@ class _Site:
     blank: float = 0.04
     """Fraction of the surfaces without texture that have no matches."""
     hidden: float = 0.1
-    """Fraction of the ground at walls that no photograph shows. It follows from RGT on roads, 0.195 m: ground
-    bridged at walls is too high, and the mask covers it."""
+    """Fraction of the ground at walls that no photograph shows. It was fitted to RGT on roads, 0.195 m:
+    ground bridged at walls is too high, and the mask covers it."""
 
 
 TOWN = SceneOptions(
@@ -100,14 +100,14 @@ TOWN = SceneOptions(
     dsm_noise_m=(0.0, 0.0),
     cross_slope=0.02,
     curb_m=0.12,
-    # T = 40K of RGT's 45K: the mask covers 89%, so it is all ground between roofs and crowns.
+    # T is 40K, RGT has 45K: the mask covers 89%, which is all ground between roofs and crowns.
     open_ground=1.0,
     built=0.45,
     trees=0.6,
-    # RGT on terrain, 15.411 m: what is no road are roofs and crowns alone.
+    # RGT on terrain is 15.411 m: only roofs and crowns are not road.
     storeys=1.5,
     overhang_m=0.4,
-    # RGT's road MAD, now that lawns count as road.
+    # RGT's road MAD, if lawns are road.
     growth_m=0.1,
     car_parks=0.1,
 )
@@ -120,7 +120,7 @@ SITES = (
     _Site("hillside", "suburban", 23.0, 46_000, SUBURB),
     _Site("steep_quarter", "urban", 33.9, 60_000, TOWN, blank=0.06),
 )
-"""The ends of the ranges are the paper's; the values between them and their order are assumptions."""
+"""Least and greatest rise and number of triangles are the paper's; other values are assumed."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +136,8 @@ class Place:
 def survey(scenes: int = len(SITES), seed: int = 0) -> list[Place]:
     """Return the locations of the first ``scenes`` scenes in a world.
 
-    A scene takes the first location of its row where hills of at most slope `STEEPEST` give its rise. The
-    slope is then set so that they give exactly its rise.
+    A scene gets the first location of its row where hills with a slope of at most `STEEPEST` give its rise.
+    Then the slope is set so that they give exactly its rise.
 
     - `scenes`: number of scenes, the first of `SITES`.
     """
@@ -214,7 +214,7 @@ def _static_surface(scene: Scene) -> Floats:
 
 
 def _bumps(grid: Grid, seed: int) -> Floats:
-    """Return bumps (m), higher in some areas than in others."""
+    """Return bumps (m), higher in some areas than in other areas."""
     x, y = np.meshgrid(grid.eastings, grid.northings)
     bumps = field(seed, "bumps", BUMP_WAVES_M, 40)(x, y)
     patchy = np.exp(waves(generator(seed, "matching"), np.geomspace(15, 80, 9), 0.15)(x, y))
@@ -287,7 +287,7 @@ class _PhotogrammetryScene:
 
 
 def photogrammetry(place: Place, seed: int) -> _PhotogrammetryScene:
-    """Make one scene of the stand-in for DSC3D.
+    """Make one scene of the replacement for DSC3D.
 
     - result: equal input gives equal scenes. The mesh fills the square of the place, except for open holes.
     """

@@ -1,6 +1,6 @@
 """The benchmark: independent tiles in the strata of the paper's dataset GeRoD, with the errors of real tiles.
 
-``docs/decisions.md`` ("the benchmark") lists which numbers were checked, and against what.
+``docs/results/causes.md``, section 7, compares the numbers with the paper's.
 """
 
 from __future__ import annotations
@@ -93,32 +93,32 @@ _WORLDS: Mapping[str, SceneOptions] = {
 }
 """Mean contents of the tiles of each stratum.
 
-``built`` was fixed by RGT on terrain, 1.773 m; the rest by the rounds of 2026-11-21 (``docs/decisions.md``).
+``built`` was fitted to RGT on terrain, 1.773 m; ``docs/results/causes.md``, section 7, explains the others.
 """
 
 ERRORS: Mapping[str, float] = {
-    # 14 pixels, DINOv2's patch, of 0.1 m, the pixel of the orthophotos of Geobasis NRW.
+    # A patch of DINOv2 has 14 pixels; a pixel of the orthophotos of Geobasis NRW has 0.1 m.
     "patch_m": 1.4,
-    # The pavement of these scenes is 2.2 m wide; how much of it the mask shows: T, with the yards.
+    # The pavement of these scenes is 2.2 m wide. Its share in the mask follows from T, with the yards.
     "verge_m": 2.2,
     "verge_share": 0.9,
     # T = 33,447, which needs a mask of 26%.
     "yards": 4.0,
-    # Roofs 1 to 2 m off, as at a field of view of 28 degrees; no figure of the paper tells.
+    # Roofs are displaced by 1 to 2 m: a field of view of 28 degrees. The paper has no figure for it.
     "lean": 0.25,
-    # RGT on roads, L2 and MAD: what is false and high under the mask.
+    # RGT on roads, L2 and MAD: high objects that the mask wrongly shows as road.
     "facades": 0.04,
     "false_roofs": 0.005,
-    # No figure of the paper tells: a new surface each 20 years, and surveys 5 years apart.
+    # Assumed: a new surface every 20 years, and surveys 5 years apart. The paper has no figure for it.
     "works": 0.25,
     # The paper's 10 cm of error of its height models, taken as two standard deviations.
     "flight_offset_m": 0.05,
     # The published DSM has 14.482 of 15.0 million cells: 3.5% have no height.
     "voids": 0.4,
 }
-"""Errors of the masks and of the DTM, the same in all strata, with the figure that fixed each.
+"""Errors of the masks and of the DTM, the same in all strata, with the figure to which each was fitted.
 
-RGT and Plane, T and the mask's share depend on the data and the mask alone. FlexRoad's accuracy was not used.
+RGT and Plane, T and the mask's share depend only on the data and the mask. FlexRoad's accuracy was not used.
 """
 
 PRESET: Mapping[str, SceneOptions] = {
@@ -130,8 +130,8 @@ PRESET: Mapping[str, SceneOptions] = {
 def survey(tiles: int = TILES, seed: int = 0) -> list[tuple[str, Grid, str, SceneOptions]]:
     """Return id, grid, stratum and options of the benchmark's tiles, in the paper's shares of the strata.
 
-    The tiles of a smaller survey are a subset of those of a larger one. Tiles lie on the absolute grid, 3 km
-    apart.
+    The tiles of a smaller survey are a subset of the tiles of a larger survey. They lie on the absolute grid,
+    3 km apart.
 
     - `tiles`: number of tiles; 240 as in the paper.
     """

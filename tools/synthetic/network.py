@@ -31,7 +31,7 @@ MEDIAN_M = 1.5
 MEDIAN_END_M = 10.0
 """Distance from a crossing to the end of the median, and from there to its full width (m)."""
 PHASE_SPREAD = 0.6
-"""Greatest phase difference (rad) of a line's bends from the shared phase: keeps lines roughly parallel."""
+"""Greatest phase difference (rad) of a line's bends from the common phase; lines stay roughly parallel."""
 Range = tuple[float, float]
 
 DISTRICT_M = 250
@@ -83,7 +83,7 @@ STRATA = {
                 0.05, 0.02, 0.4, 0.4, 6),
     )
 }  # fmt: skip
-"""Strata by name; the fractions are those of the paper's 168, 23 and 49 tiles."""
+"""Strata by name; the fractions are from the paper's 168, 23 and 49 tiles."""
 
 
 def find_stratum(name: str) -> _Stratum:
@@ -152,7 +152,7 @@ class Street:
         return (low, self.start, high, self.end) if self.runs_along_y else (self.start, low, self.end, high)
 
     def foot(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return the coordinate along of the nearest point of the centre line, and the distance to it (m)."""
+        """Return the coordinate along the line of its nearest point, and the distance to it (m)."""
         along, across = (y, x) if self.runs_along_y else (x, y)
         slope = self.line.slope(along)
         step = (across - self.line.across(along)) * slope / (1 + slope**2)
@@ -162,14 +162,14 @@ class Street:
     def lateral(self, x: Floats, y: Floats, along: Floats) -> Floats:
         """Return the signed offset of points from the centre line, across the street only (m).
 
-        Beyond the street's ends it falls to 0 on the axis, so a dead end has no step between its sides.
+        Beyond the street's ends it is 0 on the axis, so a dead end has no step between its sides.
         """
         across = x if self.runs_along_y else y
         offset: Floats = (across - self.line.across(along)) * np.sqrt(1 + self.line.slope(along) ** 2)
         return offset
 
     def strip(self, along: Floats) -> Floats:
-        """Return half of the median's width (m); 0 near the crossings."""
+        """Return half of the width of the median strip (m); 0 near the crossings."""
         inside = np.minimum(along - self.start, self.end - along) - MEDIAN_END_M
         return self.median_m * np.clip(inside / MEDIAN_END_M, 0, 1)
 
@@ -217,7 +217,7 @@ class Plan:
     turn_deg: float | None = None
     """Direction of the lattice (degrees); None if drawn from the seed."""
     sunken_share: float = 0.0
-    """Fraction of the other gaps with a sunken road, which streets cross on bridges."""
+    """Fraction of the other gaps with a sunken road; streets cross it on bridges."""
     cross_slope: float = 0.0
     """Greatest one-sided slope of a street."""
     medians: float = 0.0
@@ -291,7 +291,7 @@ def _line(plan: Plan, axis: int, index: int) -> _Line:
 
 @lru_cache(maxsize=4096)
 def _crossing(plan: Plan, column: int, row: int) -> tuple[float, float]:
-    """Return where two lines meet, by fixed-point iteration; the slopes' product is far below 1."""
+    """Return the point where two lines meet, by fixed-point iteration (the slopes are small)."""
     upright, level = _line(plan, 0, column), _line(plan, 1, row)
     x, y = upright.position, level.position
     for _ in range(12):
@@ -301,7 +301,7 @@ def _crossing(plan: Plan, column: int, row: int) -> tuple[float, float]:
 
 @lru_cache(maxsize=4096)
 def _street(plan: Plan, axis: int, line: int, piece: int) -> Street | None:
-    """Return piece ``piece`` of a line, up to the next crossing line, or None if there is no street.
+    """Return piece ``piece`` of a line, up to the next crossing line; None without a street.
 
     Lines of even number are main streets, so one end of every side street lies on a main street.
     """

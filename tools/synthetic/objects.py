@@ -3,8 +3,8 @@
 Each street has its own random generator, so an object across a tile border is the same object in both
 tiles. Lengths are in metres, headings in rad, positions in the plan's frame.
 
-An orthophoto is corrected with the terrain model, so whatever stands on the terrain leans outwards in it: on
-the side that leans away, the picture has the facade where the surface model has the roof.
+An orthophoto is corrected with the terrain model, so objects on the terrain lean outwards in it. The picture
+shows the facade where the surface model has the side of the roof near the image's middle.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from flexroad.tools.synthetic.surfaces import Ground
 from flexroad.tools.synthetic.world import generator
 
 GroundAt = Callable[[Floats, Floats], Ground]
-"""x and y in the plan's frame -> the ground there."""
+"""x and y in the plan's frame -> the ground at these points."""
 
 CORNER_M = 8.0
 """Length at both ends of a street without parked cars and street trees (m)."""
@@ -35,7 +35,7 @@ HALF_SIDE_M, HEIGHT_M = (1.5, 7.0), (22.0, 48.0)
 SETBACK_M = (10.0, 24.0)
 """Distance from the carriageway's edge to the middle of a tower (m)."""
 IMAGE_M = 700.0
-"""Side of the part of the orthophoto that is taken from one image (m)."""
+"""Side of the part of the orthophoto that is from one image (m)."""
 
 
 @dataclass(frozen=True)
@@ -89,13 +89,13 @@ class Spot:
     y: float
     radius: float
     road: bool
-    """Its wrong class: True for road."""
+    """The wrong class: True for road."""
 
 
 def houses(
     streets: Sequence[Street], seed: int, ground_at: GroundAt, density: float, storeys: float
 ) -> tuple[House, ...]:
-    """Return the houses along both sides of streets, none of them on a road or in a stream.
+    """Return the houses along both sides of streets, but not on a road or in a stream.
 
     ``density`` is the fraction of the stratum's houses to build, ``storeys`` a factor on their eaves.
     """
@@ -157,7 +157,7 @@ def crowns(
     density: float,
     gardens: float,
 ) -> tuple[Crown, ...]:
-    """Return the trees at the kerbs, whose crowns reach over the road, and those in the gardens.
+    """Return the trees at the kerbs, whose crowns reach over the road, and the trees in the gardens.
 
     ``density`` is the fraction of the stratum's trees to plant, ``gardens`` a factor on the garden trees.
     """
@@ -166,7 +166,7 @@ def crowns(
         return ()
     x, y, radius, height, hides, draw = np.concatenate(planned, axis=1)
     under = ground_at(x, y)
-    # No trunk on the carriageway or inside a house; a crown may touch a facade.
+    # No trunk is on the carriageway or inside a house; a crown may touch a facade.
     free = (under.edge > 0.6) & (draw < density)
     for house in built:
         free &= np.hypot(x - house.x, y - house.y) > house.half_depth + 1.5
@@ -230,7 +230,7 @@ def _moving(street: Street, rng: np.random.Generator, density: float) -> list[Ca
     for _ in range(rng.poisson(street.stratum.moving * density)):
         along, side = rng.uniform(street.start, street.end), rng.choice((-1, 1))
         truck = rng.random() < 0.1
-        # A scan distorts moving cars: some appear longer, some shorter and lower.
+        # A scan distorts moving cars: they appear longer, or shorter and lower.
         length, height = (10.0, 3.4) if truck else (4.4 * rng.uniform(0.6, 1.8), rng.uniform(0.8, 1.6))
         half_width = 1.25 if truck else 0.9
         moving.append(_car(street, along, side * street.half_width_m * 0.4, length, half_width, height, True))
@@ -275,7 +275,7 @@ def spots(street: Street, seed: int, density: float) -> list[Spot]:
 
 
 def towers(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: float) -> tuple[House, ...]:
-    """Return towers, ``mean`` per street on average, none of them on a road or in a stream."""
+    """Return towers, ``mean`` per street on average, but not on a road or in a stream."""
     planned = [house for street in streets for house in _planned(street, seed, mean)] if mean > 0 else []
     if not planned:
         return ()

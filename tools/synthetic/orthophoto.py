@@ -27,9 +27,9 @@ MARGIN_M = 24.0
 """Margin around the tile (m), so that shadows and road edges beyond its border are included."""
 SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG = 145.0, 48.0
 SHADE = np.array([0.42, 0.46, 0.56], np.float32)
-"""Fraction of red, green and blue in a shadow, which only the blue sky lights."""
+"""Fraction of red, green and blue in a shadow: only the blue sky lights it."""
 SENSOR_NOISE = 2.5
-"""Standard deviation, on the scale 0 to 255."""
+"""Standard deviation of the noise, on the scale 0 to 255."""
 PAVEMENT_M = 2.5
 """Width of the pavement beside an urban or suburban road (m)."""
 DASH_M = 3.0
@@ -73,7 +73,7 @@ def orthophoto(
     - result: red, green and blue, 0 to 255, over the grid's bounds.
     """
     pixels = _pixel_grid(grid, gsd)
-    # A photo shows surfaces, without the height noise and the voids of a scan.
+    # A photo has no height noise and no voids.
     noise_free = options.model_copy(update={"dsm_noise_m": (0.0, 0.0), "mixed": 0.0, "voids": 0.0})
     scene = make_scene(pixels.buffered(MARGIN_M), seed, stratum, noise_free)
     rng = generator(seed, "orthophoto", *map(int, grid.origin))
@@ -190,7 +190,7 @@ def _lines(scene: Scene) -> Bools:
         ndimage.gaussian_filter(part, reach) for part in (across.real, across.imag, np.abs(across))
     )
     single = np.hypot(real, imaginary) > 0.8 * total
-    # Eight directions only, so that the dashes of neighbouring cells line up.
+    # Only eight directions, so that the dashes of neighbouring cells are aligned.
     heading = np.round(np.arctan2(imaginary, real) / 2 / (np.pi / 8)) * (np.pi / 8) + np.pi / 2
     x, y = np.meshgrid(grid.eastings, grid.northings)
     along = np.cos(heading) * x + np.sin(heading) * y
@@ -215,7 +215,7 @@ def _shadow(dsm: Floats, cell: float) -> Bools:
     level = np.hypot(east, north)
     shaded = np.zeros(dsm.shape, bool)
     for k in range(1, int(MARGIN_M / cell)):
-        # Cells rolled in from the opposite side only affect the margin.
+        # Cells from the opposite side change only the margin.
         shifted = np.roll(dsm, (round(k * north / level), -round(k * east / level)), (0, 1))
         shaded |= shifted - k * cell * up / level > dsm + 0.3
     return shaded
@@ -228,6 +228,6 @@ def _sun() -> tuple[float, float, float]:
 
 
 def _paint(picture: Picture, cells: Bools, colour: Any, opacity: float) -> None:
-    """Paint cells in place with one colour, or with one per cell."""
+    """Paint cells in place, with one colour or a colour per cell."""
     colours = np.broadcast_to(np.asarray(colour, np.float32), picture.shape)
     picture[cells] = (1 - opacity) * picture[cells] + opacity * colours[cells]

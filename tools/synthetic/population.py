@@ -30,7 +30,7 @@ from flexroad.tools.synthetic.objects import (
 from flexroad.tools.synthetic.world import SceneOptions, generator
 
 KERB_REACH_M = 2.5
-"""Greatest distance of a parked car's centre from the kerb (m); farther ones are in a roundabout's lane."""
+"""Greatest distance of a parked car's centre from the kerb (m); cars farther away are on a roundabout."""
 BAY_M, AISLE_M = 2.6, 16.0
 """Width of a parking bay, and distance between the middles of double rows (m)."""
 OCCUPIED = 0.55
@@ -83,7 +83,7 @@ def populate(
 ) -> Objects:
     """Return the objects of some streets.
 
-    - `farther`: these and more streets; houses do not stand on their car parks and fields.
+    - `farther`: these and more streets; no house is on their car parks and fields.
     - `ground_at`: returns the ground at points, with all streets nearby.
     """
     density, errors = options.density, options.mask_errors
@@ -114,7 +114,7 @@ def populate(
 
 
 def _off_roundabouts(vehicles: Sequence[Car], ground_at: GroundAt) -> list[Car]:
-    """Return the cars without those parked in a roundabout's lanes or standing on its island."""
+    """Return the cars without cars parked in a roundabout's lanes or on its island."""
     if not vehicles:
         return []
     under = ground_at(np.array([car.x for car in vehicles]), np.array([car.y for car in vehicles]))
@@ -163,7 +163,7 @@ def _beside(
     ground_at: GroundAt,
     mean: float,
 ) -> tuple[Area, ...]:
-    """Return areas of a kind of `SIZES`, ``mean`` per street on average; houses may stand on yards."""
+    """Return areas of a kind of `SIZES`, ``mean`` per street on average; houses may be on yards."""
     planned = [
         area
         for street in streets

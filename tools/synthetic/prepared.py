@@ -1,9 +1,9 @@
 """Folders written by FlexRoad itself: ``FOLDER/<layer>/<tile id>.tif``, one GeoTIFF per layer and tile.
 
-`write_tile` returns the tile that it has written, and `with_neighbours` adds the files of the others. Tile
-id, layer, stratum and date are also stored as tags in the files. Heights are float32, which is exact to
-0.03 mm below 512 m and to 0.5 mm anywhere on Earth; NaN is nodata. Masks are 1 where there is road. The
-orthophoto has its own pixel size over the same bounds.
+`write_tile` returns the written tile, and `with_neighbours` adds the files of neighbouring tiles. Tile id,
+layer, stratum and date are also stored as tags in the files. Heights are float32, exact to 0.03 mm below 512
+m and to 0.5 mm anywhere on Earth; NaN is nodata. Masks are 1 on roads. The orthophoto has another pixel size
+over the same bounds.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def write_tile(
     date: datetime | None = None,
     dataset: str = "",
 ) -> Tile:
-    """Write a tile's layers; return the tile, whose layers list its own files only (`with_neighbours`).
+    """Write a tile's layers; return the tile, whose layers list only its own files (see `with_neighbours`).
 
     Existing files are replaced, each atomically.
 
@@ -76,11 +76,11 @@ def write_tile(
 
 
 def with_neighbours(tiles: Iterable[Tile]) -> list[Tile]:
-    """Return tiles of one folder, as `write_tile` returns them, with the files of their neighbours.
+    """Return tiles of one folder, results of `write_tile`, with the files of their neighbours.
 
-    A tile's layers list its own file first, then those of the tiles of the same dataset, CRS and cell size
-    that lie within `REACH_M` of it. Tiles that overlap are other surveys of the same ground, and do not list
-    each other's files. The tiles are ordered by their ids.
+    A tile's layers list its own file first, then the files of tiles within `REACH_M` with the same dataset,
+    CRS and cell size. Tiles that overlap are different surveys of the same ground, and do not list each
+    other's files. The tiles are ordered by their ids.
     """
     ordered = sorted(tiles, key=lambda tile: tile.id)
     groups: dict[tuple[str, float, str], list[Tile]] = {}
@@ -106,7 +106,7 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
     count, height, width = bands.shape
     if name == PHOTO:
         grid = Grid(grid.crs, grid.west, grid.north, grid.width * grid.cell / width, width, height)
-    # Encoded in memory: GDAL does not raise an error where a disk is full when it closes a file.
+    # Encoded in memory: when GDAL closes a file on a full disk, it does not raise an error.
     with MemoryFile() as memory:
         try:
             with memory.open(
@@ -128,7 +128,7 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
 
 
 def _joined(tiles: Sequence[Tile]) -> Tile:
-    """Return the first tile with the files of all of them."""
+    """Return the first tile with the files of all tiles."""
     layers = []
     for name in LAYERS:
         parts = [layer for layer in (tile.layer(name) for tile in tiles) if layer]

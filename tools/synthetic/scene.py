@@ -1,4 +1,4 @@
-"""A scene: the rasters that a survey would deliver for one tile, the true ground and roads, centre lines."""
+"""A scene: the rasters of a survey for one tile, the true ground and roads, and centre lines."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ DTM_GRAIN_M = 3.0
 FLIGHT_WAVES_M = (300.0, 1500.0)
 """Shortest and longest wave of the offset between two surveys (m)."""
 GROUND, DECK, OTHER = 2, 17, 1
-"""Classes by ASPRS LAS 1.4; what is neither ground nor deck is unclassified."""
+"""Classes by ASPRS LAS 1.4; all other points are unclassified."""
 DECK_M = 0.5
 """The true surface is a deck where it is this much above the terrain model (m)."""
 STEP_M = 5.0
@@ -66,7 +66,7 @@ class Scene:
     grid: Grid
     stratum: str
     dsm: Floats
-    """Surface model with houses, crowns, cars and noise, ``(H, W)``, m; NaN where it has no height."""
+    """Surface model with houses, crowns, cars and noise, ``(H, W)``, m; NaN where unknown."""
     dtm: Floats
     """Terrain model without bridges, smoothed and noisy, ``(H, W)``, m."""
     road_mask: Bools
@@ -78,9 +78,9 @@ class Scene:
     reference_road: Bools
     """True road, ``(H, W)``."""
     kind: NDArray[np.uint8]
-    """Object that the surface model shows, a `Kind` per cell, ``(H, W)``."""
+    """Kind of the object in the surface model, a `Kind` per cell, ``(H, W)``."""
     levels: Mapping[int, Floats] = dataclasses.field(default_factory=dict)
-    """True height of each level, ``(H, W)``, m, NaN where it is not; only of `tools.synthetic.crossings`."""
+    """True height of each level, ``(H, W)``, m; NaN outside of it. Only from `tools.synthetic.crossings`."""
 
     @property
     def layers(self) -> Mapping[str, NDArray[np.generic]]:
@@ -106,7 +106,7 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     if seed < 0:
         raise TaskError(f"a seed is 0 or more, not {seed}")
     plan = plan_of(seed, stratum, options)
-    # A margin, so that the smoothing of the terrain model has no edge effect on the tile.
+    # A margin prevents edge effects of the smoothed terrain model on the tile.
     wide = grid.buffered(4 * DTM_BLUR_M)
     canvas, inner = Canvas.of(wide, plan), wide.window(grid)
     ground_at = _ground_near(canvas, options)
@@ -159,7 +159,7 @@ def plan_of(seed: int, stratum: str | None, options: SceneOptions) -> Plan:
 
 
 def _truth(canvas: Canvas, here: Ground, options: SceneOptions) -> Floats:
-    """Return the true height at the time of the DSM, ``(H, W)``, m; the DTM is of the time before."""
+    """Return the true height at the time of the DSM, ``(H, W)``, m; the DTM is from an earlier time."""
     found = changes(canvas.plan.streets(_box(canvas, OBJECT_REACH_M)), canvas.plan.seed, options.works)
     if not found:
         return here.height
@@ -197,7 +197,7 @@ def _ground_near(canvas: Canvas, options: SceneOptions) -> GroundAt:
     """Return the function that gives the ground at points on the canvas and near it."""
     plan = canvas.plan
     land = relief(plan.seed, options.slope, options.roughness_m, options.datum_m, options.embankment_m)
-    # Objects may lie beyond the tile, and the streets that shape their ground even farther.
+    # Objects may lie beyond the tile, and the streets around them even farther away.
     box = _box(canvas, 2 * OBJECT_REACH_M)
     circles = tuple(plan.circles(box, CIRCLE_M + REACH_M))
     return partial(ground, land, plan.streets(box), tuple(plan.streams(box)), circles, options.curb_m)
@@ -226,9 +226,10 @@ def _box(canvas: Canvas, margin_m: float) -> Box:
 def scan(scene: Scene, per_m2: float, noise_m: float, seed: int = 0) -> Points:
     """Return points on a scene's surface, at random positions.
 
-    Heights are those of the true ground, linear between cell centres, plus what stands on the point's cell.
+    A height is the true ground, linear between cell centres, plus the height of the object on the point's
+    cell.
 
-    - `scene`: a scene without noise of its own (`SceneOptions.dsm_noise_m`).
+    - `scene`: a scene without noise (`SceneOptions.dsm_noise_m`).
     """
     grid, rng = scene.grid, generator(seed, "scan", *map(int, scene.grid.origin))
     west, south, east, north = grid.bounds
@@ -262,8 +263,7 @@ def centre_lines(
 ) -> list[CentreLine]:
     """Return the centre lines on and around a grid, in the world of `make_scene` with the same arguments.
 
-    A dual carriageway has two lines. The ends of medians are not represented, nor are the islands of
-    roundabouts where streets join.
+    A dual carriageway has two lines. The ends of medians and the islands of roundabouts are not represented.
     """
     plan = plan_of(seed, stratum, options)
     west, south, east, north = grid.buffered(MARGIN_M).bounds

@@ -38,7 +38,7 @@ MADE = datetime(2025, 1, 1, tzinfo=UTC)
 KNOWN = "known"
 """Folder of the true layers."""
 TRUE_CATALOG = "catalog_true.parquet"
-"""The second catalog: the same layers, with the true heights and roads as reference."""
+"""File of the second catalog: the same layers, with the true heights and roads as reference."""
 TRUE_LAYERS = ("reference", "reference_road")
 STAND_IN = "synthetic photogrammetry, stand-in for DSC3D, seed {}"
 """Name of the data of the preset dsc3d."""
@@ -53,14 +53,14 @@ class _SceneJob:
     grid: Grid
     seed: int
     stratum: str | None
-    """None for a mix of districts."""
+    """Stratum of all districts; None for a mix."""
     options: SceneOptions | CrossingOptions
     name: str
     """Name of the dataset."""
     dop: bool
     """Whether to write an orthophoto."""
     extended_dtm: bool
-    """Whether the reference is the DTM with bridges; the truth is then written to a folder of its own."""
+    """Whether the reference is the DTM with bridges; then the truth is written to another folder."""
 
 
 def write_scenes(
@@ -74,9 +74,9 @@ def write_scenes(
 ) -> Path:
     """Write a block of neighbouring tiles, or the tiles of a preset; return the path of their catalog.
 
-    With decks the true height of level N is the layer ``reference`` of the folder ``known/levelN``. The
-    reference of a preset's tiles is the one that the paper describes. Beside their catalog,
-    ``catalog_true.parquet`` lists them with the truth as reference.
+    With decks the true height of level N is the layer ``reference`` of the folder ``known/levelN``. Tiles of
+    a preset have the reference that the paper describes. Next to their catalog, ``catalog_true.parquet``
+    lists them with the truth as reference.
 
     - `tiles`: number of tiles; if None, 4, or all of the preset.
     - `size_m`: side of a tile (m); 250 if None. The size of a preset's tiles is fixed.
@@ -205,10 +205,10 @@ def _with_truth(tile: Tile, folder: str, dataset: str) -> Tile:
 
 
 def write_stand_in(folder: Path, scenes: int | None, seed: int) -> Path:
-    """Write the stand-in for DSC3D; return the path of the catalog with the paper's reference.
+    """Write the replacement for DSC3D; return the path of the catalog with the paper's reference.
 
     The folder of a scene contains ``mesh.glb``, its true layers (``known/<layer>/<scene>.tif``), and the
-    rasters and catalog that ``prepare`` writes. In the folder above are the catalogs of all scenes.
+    rasters and catalog of ``prepare``. The catalogs of all scenes are in the folder above.
 
     - `scenes`: number of scenes; all five if None.
     """

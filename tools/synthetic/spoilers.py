@@ -1,4 +1,4 @@
-"""The surface model of a survey with the objects that spoil it ("spoilers")."""
+"""The surface model of a survey, with objects that hide the ground ("spoilers")."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flexroad.tools.synthetic.population import Area, Objects
 
 
 class Kind(IntEnum):
-    """Object that the surface model shows in a cell."""
+    """Kind of the object in a cell of the surface model."""
 
     GROUND = 0
     DECK = 1
@@ -120,7 +120,7 @@ def _trace(
     new_kind: Kind,
     rng: np.random.Generator,
 ) -> None:
-    """Raise cells along a thin line, in place; only a fraction of the pulses hits it."""
+    """Raise cells along a thin line, in place; only a fraction of the pulses hits the line."""
     share = RAIL_ECHOES if new_kind == Kind.RAIL else WIRE_ECHOES
     west, south, east, north = canvas.grid.bounds
     easting, northing = canvas.plan.to_map(*points[:2])
@@ -145,7 +145,7 @@ def _roof(canvas: Canvas, house: House, overhang_m: float) -> tuple[tuple[slice,
     reach = float(np.hypot(house.half_length, house.half_depth)) + 2 * overhang_m
     window = canvas.around(house.x, house.y, reach)
     u, v = canvas.local(window, house.x, house.y, house.heading)
-    # A cell has the height of its highest point, so roofs include cells that they cover partly.
+    # A cell has the height of its highest point, so a roof includes partly covered cells.
     grown = canvas.grid.cell / 4 + overhang_m
     inside = (np.abs(u) <= house.half_length + grown) & (np.abs(v) <= house.half_depth + grown)
     ridge = np.clip(1 - np.abs(v) / house.half_depth, 0, 1)
@@ -163,7 +163,7 @@ def _bodywork(canvas: Canvas, car: Car) -> tuple[tuple[slice, slice], Floats]:
 def _foliage(canvas: Canvas, crown: Crown) -> tuple[tuple[slice, slice], Floats]:
     window = canvas.around(crown.x, crown.y, crown.radius)
     out = np.hypot(canvas.x[window] - crown.x, canvas.y[window] - crown.y) / crown.radius
-    # Round on top, low branches at the rim: steps down to the road, as in real scans.
+    # Round on top, with low branches at the rim: so there are steps down to the road, as in real scans.
     fall = 0.85 * crown.height * (1 - np.sqrt(np.clip(1 - out**2, 0, 1)))
     return window, np.where(out <= 1, crown.top - fall, -np.inf)
 

@@ -36,9 +36,9 @@ class Relief:
     """The terrain without streets."""
 
     large: Waves
-    """Hills and valleys (m). Street profiles follow only these, so they are smooth."""
+    """Hills and valleys (m). Streets follow only these, so streets are smooth."""
     small: Waves
-    """Small humps and hollows (m), which streets cut through."""
+    """Small humps and hollows (m); streets cut through them."""
     datum_m: float
     """Mean height of the world (m)."""
     grading: Waves
@@ -73,7 +73,7 @@ class Ground:
     edge: Floats
     """Distance to the nearest carriageway's edge (m), negative on the road, infinite far away."""
     over: Floats
-    """Like ``edge``, without sunken roads (m): only these carriageways may lie on a bridge."""
+    """Like ``edge``, without sunken roads (m): only the other carriageways may lie on a bridge."""
 
     @property
     def bare(self) -> Floats:
@@ -107,9 +107,9 @@ def ground(
 ) -> Ground:
     """Return the ground at points given in the plan's frame, in their shape.
 
-    A street has the height of the hills under its centre line, with a rounded crossfall. Its weight falls
+    A street has the height of the hills under its centre line, with a rounded crossfall. Its weight decreases
     smoothly from its edge into the terrain. Where streets meet, the weighted mean of their heights is used,
-    so there is no step at crossings. Kerbs are added to it.
+    so there is no step at crossings. Kerbs are added.
 
     - `circles`: centres of roundabouts.
     - `curb_m`: height of the pavement over the carriageway's edge (m).
@@ -129,7 +129,7 @@ def ground(
     for stream in streams:
         if stream.paved:
             beyond = stream.distance(x, y) - SUNKEN_M
-            # Streets cross the sunken road at their own height.
+            # Streets cross the sunken road on bridges at their own height.
             blend.add(..., hills, beyond, beyond, 1 - blend.heaviest)
     graded = blend.with_terrain(hills + land.small(x, y)) + land.datum_m
     if curb_m:
@@ -172,10 +172,10 @@ class _Blend:
 
 
 def _street_lift(street: Street, land: Relief, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return by how much a street raises the hills, and the distances to its outer and nearest edge (m).
+    """Return the height of a street above the hills, and the distances to its outer and nearest edge (m).
 
-    Beyond the edge the height difference of the edge is kept. A level continuation would pull a street that
-    climbs away from a crossing down to the crossing's height.
+    Beyond the edge the height difference of the edge is kept. With a level continuation, a street that climbs
+    away from a crossing would be lowered to the crossing's height.
     """
     along, distance = street.foot(x, y)
     beyond = distance - street.half_width_m

@@ -1,11 +1,12 @@
-"""What makes the rasters of a survey differ from the true ground, besides noise and objects.
+"""Differences between the rasters of a survey and the true ground, besides noise and objects.
 
-Changes between two surveys (new road surfaces, new kerbs, excavations), low vegetation that a scan does not
-penetrate, mixed cells at edges and walls, errors of a terrain model under houses, and cells without a height:
+These are changes between two surveys (new road surfaces, new kerbs, excavations), and low vegetation that a
+scan does not penetrate. Others are mixed cells at edges and walls, errors of a terrain model under houses,
+and cells without a height:
 
-- ground that crowns hide. The survey sees a crown from one image, so that the ground at its far side is
-  hidden, the farther the nearer the crown is to the image's edge;
-- water, which gives no echo, and has nothing that two images have in common.
+- ground hidden by crowns. The survey sees a crown from one image, so the ground at its far side is hidden.
+  More ground is hidden if the crown is nearer to the image's edge;
+- water: it gives no echo, and two images of it have no common features.
 """
 
 from __future__ import annotations
@@ -31,29 +32,29 @@ KINDS = ("surface", "kerb", "excavation")
 LENGTH_M = {"surface": (30.0, 100.0), "kerb": (8.0, 30.0), "excavation": (4.0, 20.0)}
 RISE_M = {"surface": (0.02, 0.06), "kerb": (0.10, 0.15), "excavation": (-2.0, -0.6)}
 PAVEMENT_M = 2.2
-"""Width of the carriageway's edge that a new kerb takes (m)."""
+"""Width of a new kerb on the carriageway's edge (m)."""
 TRENCH_M = (1.5, 4.0)
 """Width of an excavation (m)."""
 BESIDE_M = 3.0
 """Greatest distance of an excavation's middle from the carriageway (m)."""
 WALL_M = 1.5
-"""Least height step to a neighbouring cell that counts as a wall (m)."""
+"""Least height step between neighbouring cells at a wall (m)."""
 THICKET_M = (6.0, 60.0)
 """Shortest and longest wave of the thickets (m)."""
 CLEAR_M = 1.5
 """Width of the strip beside a carriageway without vegetation (m)."""
 RIM_M = 1.5
-"""Distance beyond the walls to which the ground was removed with the house (m)."""
+"""Distance beyond the walls within which the ground was removed with the house (m)."""
 TILT = 0.5
 """Tilt of a scar, as a fraction of its depth."""
 SPREAD = 0.5
-"""Greatest deviation of the length of a crown's hidden ground, relative: crowns are not equally dense."""
+"""Greatest relative deviation of the length of a crown's hidden ground: crowns differ in density."""
 WOBBLE_M = (5.0, 40.0)
 """Shortest and longest wave of the offset of the mask's edges (m)."""
 STRETCH_M = (20.0, 120.0)
-"""Shortest and longest wave of the fields that say where the mask reaches beyond the carriageway (m)."""
+"""Shortest and longest wave of the fields for places where the mask reaches beyond the carriageway (m)."""
 SOLID = 0.8
-"""Radius of the part of a crown that hides what is below, as a fraction of the crown's radius."""
+"""Radius of the dense part of a crown, which hides the ground, as a fraction of the crown's radius."""
 FACADE_REACH_M = 8.0
 """Greatest distance from the carriageway of a facade that is mistaken for road (m)."""
 
@@ -72,7 +73,7 @@ class _Change:
 
 
 def changes(streets: Sequence[Street], seed: int, mean: float) -> tuple[_Change, ...]:
-    """Return the changes of some streets, ``mean`` per street on average."""
+    """Return the changes of streets, ``mean`` per street on average."""
     found = list[_Change]()
     for street in streets if mean > 0 else ():
         rng = generator(seed, "works", *street.key)
@@ -95,7 +96,7 @@ def _drawn(street: Street, kind: str, rng: np.random.Generator) -> _Change:
 
 
 def rise(found: Sequence[_Change], x: Floats, y: Floats) -> Floats:
-    """Return by how much the later survey's ground is higher at points in the plan's frame (m)."""
+    """Return the height of the later survey's ground above the earlier at points in the plan's frame (m)."""
     total = np.zeros(np.shape(x))
     for change in found:
         along, _ = change.street.foot(x, y)
@@ -122,7 +123,7 @@ def mixed(dsm: Floats, truth: Floats, share: float, rng: np.random.Generator) ->
 def growth(
     seed: int, x: Floats, y: Floats, edge: Floats, height_m: float, rng: np.random.Generator
 ) -> Floats:
-    """Return the height of low vegetation, ``(H, W)``, m; 0 where there is none.
+    """Return the height of low vegetation, ``(H, W)``, m; 0 without vegetation.
 
     - `x`, `y`, `edge`: coordinates in the plan's frame, and distance to the nearest carriageway (m).
     - `height_m`: mean height inside a thicket (m).
@@ -138,7 +139,7 @@ def growth(
 def scars(canvas: Canvas, houses: Sequence[House], seed: int, depth_m: float) -> Floats:
     """Return the error of the terrain model under houses, ``(H, W)``, m; 0 elsewhere.
 
-    The error under a house is a tilted plane, as interpolation across a hole would give.
+    The error under a house is a tilted plane, as from interpolation across a hole.
     """
     error = np.zeros(canvas.x.shape)
     for house in houses if depth_m > 0 else ():
@@ -152,7 +153,7 @@ def scars(canvas: Canvas, houses: Sequence[House], seed: int, depth_m: float) ->
 
 
 def hidden(canvas: Canvas, dsm: Floats, crowns: Sequence[Crown], seed: int, length: float) -> Bools:
-    """Return the cells that crowns hide, ``(H, W)``: beside a crown, and below the middle of its height.
+    """Return the cells hidden by crowns, ``(H, W)``: beside a crown, and below the middle of its height.
 
     - `length`: mean length of the hidden ground at the edge of an image, per height of the crown.
     """
@@ -188,8 +189,7 @@ def segmentation(
     """Return the road mask with the errors of a segmentation, ``(H, W)``.
 
     - `edge`: distance of the cells to the nearest carriageway's edge, negative on the road (m).
-    - `objects`: objects: crowns hide the road; spots, and some areas, roofs and facades, are classified
-      wrongly.
+    - `objects`: crowns hide the road; spots, and some areas, roofs and facades, are classified wrongly.
     - `ground_at`: returns the ground at points, for patches.
     - `options`: sizes of the errors; ``mask_errors`` 0 gives a perfect mask.
     """
@@ -255,7 +255,7 @@ def _stretches(canvas: Canvas, purpose: str, share: float) -> Bools:
 
 
 def _add(mask: Bools, canvas: Canvas, areas: Iterable[Area], error: Floats) -> None:
-    """Add the areas that are mistaken for road, in place."""
+    """Add the areas that are wrongly classified as road, in place."""
     for area in areas:
         if area.as_road:
             window, inside = covered(canvas, area, error)
@@ -263,7 +263,7 @@ def _add(mask: Bools, canvas: Canvas, areas: Iterable[Area], error: Floats) -> N
 
 
 def _show(roof: Roof, mask: Bools, canvas: Canvas, edge: Floats, overhang_m: float) -> None:
-    """Remove what a roof hides in the photograph, and add its visible facades, in place."""
+    """Remove cells that a roof hides in the photograph, and add its visible facades, in place."""
     house, (east, north) = roof.house, roof.shift
     reach = math.hypot(house.half_length, house.half_depth) + overhang_m + math.hypot(east, north)
     window = canvas.around(house.x, house.y, reach)

@@ -62,7 +62,7 @@ class SceneOptions(Options):
     built: float = Field(1.0, ge=0, le=1, description="fraction of the stratum's houses that exist")
     storeys: float = Field(1.0, gt=0, le=3, description="height of the eaves, as a factor on the stratum's")
     towers: float = Field(0.0, ge=0, le=2, description="towers, chimneys and high-rises per street")
-    overhang_m: float = Field(0.0, ge=0, le=1.5, description="how far roofs reach beyond the walls (m)")
+    overhang_m: float = Field(0.0, ge=0, le=1.5, description="distance that roofs reach beyond the walls (m)")
     trees: float = Field(
         1.0, ge=0, le=20, description="number of trees away from the kerb, as a factor on the stratum's"
     )

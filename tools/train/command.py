@@ -40,7 +40,7 @@ def train(
             "-o",
             "--output",
             metavar="MODEL",
-            help="Model file; the report is written beside it.",
+            help="Model file; the report is written next to it.",
             rich_help_panel=OUTPUTS,
         ),
     ],
@@ -66,7 +66,7 @@ def train(
 
     It is validated on other tiles. The files are MODEL, its report MODEL.html, and MODEL.json.
     """
-    # The options of a training have no stage before a dot.
+    # Options of the training have no stage and no dot in their names.
     changes = [text for text in settings or () if "." in text.partition("=")[0]]
     own = [text for text in settings or () if text not in changes]
     options = replace(options, settings=_settings(own))
@@ -74,7 +74,7 @@ def train(
     check_allowed(tiles)
     output.parent.mkdir(parents=True, exist_ok=True)
     check_writable(output.parent)
-    # Refused before the training and not after it.
+    # Checked before the training, and not only after it.
     for suffix in ("", ".html", ".json"):
         output_file(output.with_name(output.name + suffix))
     try:

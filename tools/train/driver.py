@@ -1,10 +1,10 @@
-"""Train the head of `segment: dinov2` on some tiles of a catalog and validate it on others, which lie apart.
+"""Train the head of `segment: dinov2` on some tiles of a catalog and validate it on other, separate tiles.
 
 Neighbouring tiles show the same streets, so a random split overestimates the quality of a model. Instead one
 straight line divides the tiles, and cells near the validation side are not used for training.
 
-Validation runs the segmenter as a run does, with the trained model but without cleanup: the metrics are those
-of the model alone.
+Validation runs the segmenter like a run, with the trained model but without cleanup. So the metrics are
+metrics of the model alone.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class TrainOptions:
         name="gap-m",
     )
     ignore_m: float = 1.0
-    """Distance of training cells from edges of labels (m): edges are never exact."""
+    """Distance of training cells from edges of labels (m), which are never exact."""
     seed: int = option(0, METHOD, "Seed of the split and of the training.", "N", min=0)
     settings: Mapping[str, Any] | None = None
     """Options of the head's training, by name; None for the defaults."""
@@ -128,7 +128,7 @@ class LabelledTiles:
     vectors: rasterise.Options
 
     def labelled(self, tile: Tile) -> tuple[TileData, Bools] | None:
-        """Return a tile and its labels, ``(H, W)``, or None if it has no labels."""
+        """Return a tile and its labels, ``(H, W)``; None without labels."""
         data = load.load(tile, self.load)
         if self.options.labels == "vector":
             return None if data.roads is None else (data, rasterise.rasterise_roads(data, self.vectors))
@@ -177,11 +177,11 @@ class Outcome:
     notes: tuple[str, ...]
 
     def preview(self, evaluation: Evaluation) -> tuple[NDArray[np.uint8], Bools, Bools, Grid]:
-        """Return photo, road by the labels and by the model, and grid of a tile, which is read again."""
+        """Read a tile again; return photo, road by the labels and by the model, and grid."""
         data, truth = self.tiles.read(evaluation.piece.tile)
         window = data.grid.window(data.core)
         mask = np.unpackbits(evaluation.mask, count=data.core.width * data.core.height).astype(bool)
-        # Tiles without a photo are left out from the start.
+        # Tiles without a photo have been left out before.
         assert data.dop is not None
         photo = read_photo(data.dop, data.core).colour
         return photo, truth[window], mask.reshape(data.core.shape), data.core
@@ -200,7 +200,7 @@ class Outcome:
 def samples(
     tiles: LabelledTiles, blocks: Sequence[Block], select: Callable[[Grid, Bounds], Bools]
 ) -> Iterator[Sample]:
-    """Yield the sample of each block; ``select`` returns the cells of a grid that are used of some bounds."""
+    """Yield the sample of each block; ``select`` returns the cells of a grid that are used within bounds."""
     for block in blocks:
         data, road = tiles.read(block.tile)
         yield Sample(data, road, tiles.usable_cells(data, road) & select(data.grid, block.bounds))
@@ -209,7 +209,7 @@ def samples(
 def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notify) -> Outcome:
     """Train a head on a catalog and validate it.
 
-    - `config`: options of its first exported variant: those of `load`, and those of `segment` if it is
+    - `config`: the options of `load` of its first exported variant are used, and of `segment` if it is
       dinov2.
     - `notify`: called with each line of progress.
     """
@@ -231,7 +231,7 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, notify: Notif
         model = Path(folder, "model.safetensors")
         model.write_bytes(trained)
         given = configured.model_dump() if isinstance(configured, segmenter.Options) else {}
-        # Without cleanup: the figures are those of the model alone.
+        # Without cleanup, so that the figures describe the model alone.
         applied = segmenter.Options(**given | {"model": model, "cleanup": "none"})
         judged = tuple(
             _evaluate(block, tiles, lambda data: segmenter.segment(data, applied)) for block in sides.validate
@@ -248,7 +248,7 @@ def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], 
         mask = segment(data)
         cells, probability = mask.mask, mask.probability
     except TaskError as error:
-        # A tile whose segmentation fails counts as a tile without predicted road.
+        # A tile whose segmentation fails is treated as a tile without predicted road.
         cells, probability, note = np.zeros_like(road), np.zeros(road.shape, np.float32), str(error)
     whole, inner = (
         judge(cells, probability, road, scored, data.grid)
@@ -259,7 +259,7 @@ def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], 
 
 
 def _labelled(catalog: Catalog, tiles: LabelledTiles, notes: list[str]) -> Iterator[Block]:
-    """Yield the tiles with labels, a single tile in two parts; add a note for each that cannot be read."""
+    """Yield the tiles with labels, a single tile in two parts; add a note for each unreadable tile."""
     single = len(catalog.usable) == 1
     for tile in catalog.tiles:
         if tile.layer("dop") is None:
@@ -277,7 +277,7 @@ def _split(pieces: Sequence[Block], options: TrainOptions) -> Split:
     _check_labels(pieces, options)
     if len(pieces) == 1:
         raise ConfigError(
-            f"only tile {pieces[0].tile.id} has labels, none is left for validation: label another one, or "
+            f"only tile {pieces[0].tile.id} has labels, none is left for validation: label another tile, or "
             "make a catalog of this tile alone, which is then split in two"
         )
     sides = split(pieces, options.validation, options.gap_m, options.seed)
@@ -320,10 +320,10 @@ def _settings(options: TrainOptions) -> fit_head.Options:
 def split(pieces: Sequence[Block], share: float, gap_m: float, seed: int) -> Split:
     """Split blocks by a straight line into a training side and a validation side.
 
-    Eight directions of the line are tried in an order drawn from the seed. The first one with road and other
-    ground on both sides is used.
+    Eight directions of the line are tried in an order drawn from the seed. The first direction with road and
+    other ground on both sides is used.
 
-    - `pieces`: at least two, all in one CRS.
+    - `pieces`: at least two blocks, all in one CRS.
     - `share`: fraction of the blocks on the validation side, 0 to 1; each side has at least one block.
     """
     count = min(max(1, round(share * len(pieces))), len(pieces) - 1)

@@ -57,10 +57,10 @@ class Sample:
 
 
 Losses = tuple[float, float]
-"""Mean loss of training and of validation in one epoch."""
+"""Mean loss of training and validation in one epoch."""
 Labels = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""The labelled cells of one window: column and row of their centres, ``(m, 2)``, from -1 to 1 across the
-window; and 1 for road, else 0, ``(m,)``."""
+"""Labelled cells of one window: column and row of their centres, ``(m, 2)``, from -1 to 1 across the window;
+and 1 for road, else 0, ``(m,)``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Windows:
     """``(n, h, w, features)``; may be a memory map."""
     labels: Sequence[Labels]
     tiles: Sequence[str]
-    """Ids of the tiles they were cut from."""
+    """Ids of the tiles from which the windows were cut."""
 
     @property
     def road(self) -> int:
@@ -219,12 +219,12 @@ class _Regression:
         )
 
     def line(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return weight and bias for tokens that are not standardised."""
+        """Return weight and bias for tokens before standardisation."""
         weight = self.weight / self.spread
         return weight, self.bias - weight @ self.centre
 
     def mean_loss(self, windows: Windows, order: NDArray[np.intp], learn: bool) -> float:
-        """Return the mean cross entropy of the labelled cells over windows; each batch is learnt if asked."""
+        """Return the mean cross entropy of the labelled cells over windows; optionally learn each batch."""
         entropy = torch.nn.functional.binary_cross_entropy_with_logits
         sums = np.zeros(2)
         with torch.set_grad_enabled(learn):
@@ -304,5 +304,5 @@ def _moments(tokens: NDArray[np.float16]) -> tuple[Floats, Floats]:
         square += (values**2).sum(axis=0)
     n = tokens[..., 0].size
     centre = total / n
-    # A constant feature must not cause a division by 0.
+    # Avoids a division by 0 for a constant feature.
     return centre, np.sqrt(np.maximum(square / n - centre**2, 1e-12))

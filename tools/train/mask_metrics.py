@@ -29,15 +29,15 @@ class Quality:
     ground: int
     """True negatives: cells that are road in neither."""
     road_by_probability: NDArray[np.int64]
-    """True road cells per hundredth of probability, ``(101,)``; zeros if there is no probability."""
+    """True road cells per hundredth of probability, ``(101,)``; zeros without probabilities."""
     ground_by_probability: NDArray[np.int64]
-    """Cells that are not road in the truth, likewise."""
+    """Other cells of the truth per hundredth of probability, ``(101,)``."""
     edge_m: Floats
     """Distances from edge points of the mask to the nearest of the truth, and vice versa, ``(n,)``, m."""
 
     @property
     def iou(self) -> float:
-        """Intersection over union of the road; NaN if there is no road."""
+        """Intersection over union of the road; NaN without road."""
         return _ratio(self.right, self.right + self.wrong + self.missed)
 
     @property
@@ -57,7 +57,7 @@ class Quality:
 
     @property
     def edge_mean_m(self) -> float:
-        """Mean distance between the edges, both ways; NaN if one of them has no edge."""
+        """Mean distance between the edges, in both directions; NaN if mask or truth has no edge."""
         return float(self.edge_m.mean()) if self.edge_m.size else float("nan")
 
     @property
@@ -81,7 +81,7 @@ def judge(
 
     - `mask`, `truth`: road cells, ``(H, W)``.
     - `probability`: probability of road, ``(H, W)``, 0 to 1.
-    - `valid`: cells to compare, ``(H, W)``; an edge counts if both its cells are valid.
+    - `valid`: cells to compare, ``(H, W)``; an edge is used if both its cells are valid.
     """
     none = np.zeros(STEPS + 1, np.int64)
     road = ground = none
@@ -118,7 +118,7 @@ def edges(mask: Bools, valid: Bools) -> Floats:
 
 
 def _between(a: Floats, b: Floats) -> Floats:
-    """Return the distances from each point to the nearest one of the other set; empty if a set is empty."""
+    """Return the distances from each point to the nearest point of the other set; empty if a set is empty."""
     if not (len(a) and len(b)):
         return np.zeros(0)
     return np.concatenate([cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]])

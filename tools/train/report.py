@@ -26,8 +26,8 @@ from flexroad.tools.train.mask_metrics import Quality
 SHOWN = 3
 """Number of best and of worst tiles in the report."""
 POOR_IOU = 0.5
-"""IoU below which a model is called poor: with precision equal to recall, a third of the cells that it marks
-are no road at 0.5, half of them at 0.33. Centre lines with one width for all roads reach 0.65 to 0.75."""
+"""IoU below which a model is called poor. If precision equals recall, a third of the marked cells is wrong
+at 0.5, half of them at 0.33. Centre lines with one width for all roads reach 0.65 to 0.75."""
 COLUMNS = {
     "iou": "IoU",
     "precision": "precision",
@@ -67,7 +67,7 @@ def summary(outcome: Outcome) -> str:
 
 
 def verdict(outcome: Outcome) -> str:
-    """Return why the model should not be used as it is, and what to do; empty if it can be used."""
+    """Return the reason against using the model, and advice; empty if it can be used."""
     iou = outcome.quality.iou
     if math.isnan(iou):
         return (
@@ -134,7 +134,7 @@ def _curves(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
     overall = outcome.quality
     _, precision, recall = overall.curve()
     valid = np.isfinite(precision) & np.isfinite(recall)
-    # One point is no curve.
+    # A curve needs at least two points.
     if valid.sum() > 1:
         mark = None if math.isnan(overall.precision) else (overall.recall, overall.precision, "the mask")
         line = {"thresholds from 0 to 1": (recall[valid], precision[valid])}

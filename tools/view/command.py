@@ -46,7 +46,7 @@ def view(
         bool,
         typer.Option(
             "--serve",
-            help="Then serve the folder on this computer alone, until Ctrl-C.",
+            help="Then serve the folder, only to this computer, until Ctrl-C.",
             rich_help_panel=OUTPUTS,
         ),
     ] = False,
@@ -60,7 +60,7 @@ def view(
 ) -> None:
     """Write a run as a page for browsers: map and surface in 3D.
 
-    The page opens without a server and without network. The same command goes on after an interruption, and
+    The page opens without a server and without network. The same command continues after an interruption, and
     writes only tiles that have changed.
     """
     if port and not serve:

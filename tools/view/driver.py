@@ -1,6 +1,6 @@
 """A run as a folder that a browser opens without a server: page, scripts, and one script per tile.
 
-The page is written last, and an earlier one is removed first: a folder with a page is complete.
+An earlier page is removed first, and the page is written last: so a folder with a page is complete.
 """
 
 from __future__ import annotations
@@ -76,20 +76,20 @@ QUALITY = 82
 PHOTO_PX = 1024
 """Largest width and height of a tile's photo (pixels): a tile of 250 m takes 0.3 to 0.8 MB."""
 SIMPLIFIED_M = 0.05
-"""Largest distance of a simplified road line from the given one (m)."""
+"""Largest distance of a simplified road line from the original line (m)."""
 
 
 @dataclass(frozen=True)
 class _Written:
-    """What was written."""
+    """The result of writing a viewer."""
 
     page: Location
     tiles: int
-    """Tiles with a script."""
+    """Number of tiles with a script."""
     others: int
-    """Tiles on the map that have no surface."""
+    """Number of tiles on the map without a surface."""
     notes: tuple[str, ...]
-    """What some tiles lack, one line per tile."""
+    """Notes on data that tiles lack, one line per tile."""
 
 
 def write_viewer(
@@ -119,7 +119,7 @@ def write_viewer(
     for file in built_files():
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())
-    # In the order of the catalog: equal viewers are equal byte by byte.
+    # In the order of the catalog, so that equal viewers have equal bytes.
     places = {row["tile"]: row["places"] for row in rows}
     index["tiles"]["places"] = [places.get(tile.id, {}) for tile in tiles]
     found = {row["tile"]: row["picture"] for row in rows if row["picture"]}
@@ -140,7 +140,7 @@ def shown_tiles(run: Run, ids: Sequence[str], bbox: Bounds | None) -> tuple[Tile
         )
     systems = {tile.grid.crs for tile in tiles}
     if len(systems) > 1:
-        raise ConfigError(f"{run.path} has tiles in {len(systems)} CRSs; select tiles of one with --bbox")
+        raise ConfigError(f"{run.path} has tiles in {len(systems)} CRSs; select tiles of one CRS with --bbox")
     return tiles
 
 
@@ -150,15 +150,15 @@ def built_files() -> list[Path]:
 
 
 def _built() -> Path:
-    # In a checkout the package's folders are links; resolve() leads to the root, which has viewer/.
+    # In a checkout the package's folders are links. resolve() follows them to the root with viewer/.
     return Path(__file__).resolve().parents[2] / "viewer" / "dist"
 
 
 def _claim(out: Location, run: Run) -> None:
-    """Take the folder for this run's viewer: remove the page of an earlier one, and note the run."""
+    """Take the folder for this run's viewer: remove an earlier page, and store the run's path."""
     for place in (run.path, run.store, run.path / "tiles"):
         if absolute(out) == absolute(place) or absolute(out) in absolute(place).parents:
-            raise ConfigError(f"{out} is a folder of the run or above it; choose another one with -o")
+            raise ConfigError(f"{out} is a folder of the run or above it; choose another folder with -o")
     for place in (run.store, run.path / "tiles"):
         if absolute(place) in absolute(out).parents:
             raise ConfigError(f"{out} lies in {place}, which belongs to the run; choose another with -o")
@@ -176,7 +176,7 @@ def _claim(out: Location, run: Run) -> None:
 
 
 def _made_of(tile: FinishedTile) -> str:
-    """Return the name of a tile's script by what it is made of."""
+    """Return the hash of the input of a tile's script."""
     photo_and_lines = (layer_state(tile.tile, name) for name in ("dop", "roads"))
     return " ".join((tile.snapshot.nodes["assess"], *photo_and_lines))
 
@@ -230,10 +230,10 @@ def _figure(value: Any) -> float | None:
 
 
 class _Files(SimpleHTTPRequestHandler):
-    """Files of a folder, for requests to this computer by its own name."""
+    """Files of a folder, only for requests that name this computer as host."""
 
     def send_head(self) -> Any:
-        # Else a page of the web could read the folder, by a name of its own that leads here.
+        # Else a web page could read the folder by a host name that points to this computer.
         host = self.headers.get("Host", "").rpartition(":")[0]
         if host not in NAMES:
             self.send_error(403)
@@ -241,7 +241,7 @@ class _Files(SimpleHTTPRequestHandler):
         try:
             contained(Path(self.translate_path(self.path)), Path(self.directory))
         except (OSError, ValueError):
-            # A link that leads out of the folder, or no name of a file, such as /%00.
+            # A link out of the folder, or an invalid file name, such as /%00.
             self.send_error(404)
             return None
         return super().send_head()
@@ -261,15 +261,15 @@ class _Files(SimpleHTTPRequestHandler):
 def server(folder: Path, port: int) -> ThreadingHTTPServer:
     """Return a server of a folder on this computer's loopback address.
 
-    - `port`: 0 for any free one.
+    - `port`: 0 for any free port.
     """
     return ThreadingHTTPServer((LOOPBACK, port), partial(_Files, directory=str(folder)))
 
 
 def script(tile: FinishedTile, look: tuple[tuple[float, float], RoadOptions]) -> TileOutput:
-    """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks.
+    """Return the script of a tile; its row has its picture, the places of its flags, and notes.
 
-    - `look`: the run's origin (easting, northing), and which road lines are shown.
+    - `look`: the run's origin (easting, northing), and the options of the road lines.
     """
     (origin, roads), source, notes = look, tile.tile, list[str]()
     photo = _photo(source, PHOTO_PX, notes)

@@ -1,8 +1,8 @@
 """Scripts of the browser viewer: one per tile, one with the index of the run, one with small pictures.
 
-Browsers read no data files from ``file://``, but they run scripts. Each script hands its data to a function
-of ``viewer.js``: ``FLEXROAD.tile(id, {...})``, ``FLEXROAD.run({...})`` or ``FLEXROAD.pictures({...})``. Data
-are JSON; arrays are base64 of little-endian numbers, of which rasters and mesh are compressed by zlib.
+Browsers do not read data files from ``file://``, but they run scripts. Each script calls a function of
+``viewer.js``: ``FLEXROAD.tile(id, {...})``, ``FLEXROAD.run({...})`` or ``FLEXROAD.pictures({...})``. Data are
+JSON. Arrays are base64 of little-endian numbers; rasters and mesh are compressed by zlib.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Image = lazy("PIL.Image")
 VERSION = 3
 NAME_TILE, NAME_RUN, NAME_PICTURES = ".js", "run.js", "pictures.js"
 MOST_CELLS = 256
-"""Largest width and height of the rasters (cells); finer ones are thinned."""
+"""Largest width and height of the rasters (cells); larger rasters are thinned."""
 STEP_M = 0.001
 """Step of quantised heights (m); larger if heights span more than 65 m."""
 CODES = 65534
@@ -41,7 +41,7 @@ SUN = (-0.5, 0.5, 0.7)
 ROAD_SHADE, TERRAIN_SHADE = 0.45, 0.92
 """Brightness of level ground in the pictures, from 0 to 1."""
 ESTIMATE_STEP_M = 0.002
-"""Step of the error estimate (m): 8 bits, up to 0.5 m; larger ones have the last value."""
+"""Step of the error estimate (m): 8 bits, up to 0.5 m; larger estimates have the last value."""
 
 
 def encode_tile(
@@ -61,12 +61,13 @@ def encode_tile(
 
     Rasters are of the tile's core, ``(H, W)``. Heights are in m, NaN where unknown.
 
-    - `glb`: the mesh, with the orthophoto if there is one.
+    - `glb`: the mesh, with the orthophoto, if any.
     - `corners`: longitude and latitude, ``(4, 2)``: south-west, south-east, north-west, north-east.
     - `height_source`: `tasks.quality.height_source.HeightSource` of each cell.
     - `dsm`, `dtm`, `estimate`: None if the source files cannot be read.
-    - `surface`: None if it is of another kind or has levels: the viewer then takes heights from the mesh.
-    - `top`: height of the highest level; None if there are no levels.
+    - `surface`: None if it is not a NURBS surface, or has levels: the viewer then takes heights from the
+      mesh.
+    - `top`: height of the highest level; None without levels.
     - `lines`: road lines on the tile.
     """
     stride = max(1, -(-max(grid.shape) // MOST_CELLS))
@@ -102,7 +103,7 @@ def encode_tile(
 
 
 def encode_run(content: Mapping[str, Any]) -> bytes:
-    """Return the script with the index of a run: JSON values; NaN is no value."""
+    """Return the script with the index of a run, from JSON values; NaN becomes null."""
     return _call("run", _finite(content))
 
 
@@ -183,7 +184,7 @@ def _surface(surface: NurbsSurface | None) -> dict[str, Any] | None:
 
 
 def _steps(surface: NurbsSurface | None) -> dict[str, Any] | None:
-    """Return the steps of the cells that have one, with their cells, which are never thinned."""
+    """Return the cells with steps, and the steps; these cells are not thinned."""
     if not isinstance(surface, SteppedSurface):
         return None
     steps = _heights(np.where(surface.steps == 0, np.nan, surface.steps))

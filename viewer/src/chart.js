@@ -10,7 +10,7 @@ const SERIES = [
 ];
 const MARGIN = { left: 52, right: 14, top: 24, bottom: 26 };
 
-/** Draws stations into an element; `hover(station)` is called for the one under the pointer, null for none. */
+/** Draws stations into an element; `hover(station)` is called with the station under the pointer, or null. */
 export function chart(element, stations, hover) {
   const [width, height] = [Math.max(element.clientWidth, 260), Math.max(element.clientHeight, 120)];
   const values = stations.flatMap((station) => SERIES.map(({ name }) => station[name])).filter((z) => !Number.isNaN(z));

@@ -1,4 +1,4 @@
-// A drive along a road line: the camera goes at the eye's height of a driver, from line to line where they meet.
+// A drive along a road line at the height of a driver's eyes. Where lines meet, it continues on the next line.
 
 import { continuation, lengths, nearestLine, placeAt } from "./lines.js";
 import { nearest } from "./stage.js";
@@ -9,7 +9,7 @@ const START_WITHIN_M = 400;
 const REPORT_MS = 200;
 
 export class Drive {
-  /** `passed(pick)` is called with the surface below, some times a second; `ended()` where the road line ends. */
+  /** `passed(pick)` is called with the surface below, several times a second; `ended()` at the end of the road line. */
   constructor(stage, { passed, ended }) {
     this.stage = stage;
     this.passed = passed;
@@ -23,7 +23,7 @@ export class Drive {
     return [...this.stage.objects.values()].flatMap((object) => object.data.lines);
   }
 
-  /** Starts at the place nearest to the one looked at; returns whether there is a line. */
+  /** Starts at the place on a line that is nearest to the camera's target; returns whether there is a line. */
   start() {
     const [easting, northing, height] = this.stage.toGround(this.stage.controls.target);
     const found = nearestLine(this.lines, easting, northing, START_WITHIN_M);
@@ -37,7 +37,7 @@ export class Drive {
     this.stage.controls.enabled = false;
     this.last = null;
     this.heights = null;
-    // Where decks lie above streets the drive stays on the level that it is on.
+    // Where decks lie above streets, the drive stays on its level.
     this.ground = height;
     requestAnimationFrame((now) => this.step(now));
     return true;
@@ -59,7 +59,7 @@ export class Drive {
 
   step(now) {
     if (!this.running) return;
-    // After a pause of the page the drive goes on where it was.
+    // After a pause of the page, the drive continues from the same place.
     const seconds = Math.min((now - (this.last ?? now)) / 1000, 0.25);
     this.last = now;
     this.at += this.speed * seconds;
@@ -102,7 +102,7 @@ export class Drive {
     if (near === null) return;
     this.ground = near;
     const far = this.stage.heightAt(...there, near) ?? near;
-    // Seams and lost tiles do not shake the camera.
+    // Seams and missing tiles do not shake the camera.
     const share = this.heights ? 1 - Math.exp(-seconds * 6) : 1;
     const before = this.heights ?? [near, far, ...there];
     this.heights = [near, far, ...there].map((value, i) => before[i] + share * (value - before[i]));

@@ -5,25 +5,25 @@ import { lengthText, roundLength } from "./scale.js";
 import { ViewBox } from "./view_box.js";
 
 const MOST_PIXELS_PER_METRE = 40;
-/** Smallest scale, relative to the one that shows all tiles. */
+/** Smallest scale, relative to the scale that shows all tiles. */
 const LEAST = 0.5;
 const ZOOM = 1.5;
 const PAN_PX = 60;
-/** A selected tile is at least this far from the edge; one that is smaller than DOT_PX is zoomed to SEEN_PX. */
+/** A selected tile is at least this far from the edge. A tile smaller than DOT_PX is zoomed to SEEN_PX. */
 const EDGE_PX = 12;
 const DOT_PX = 14;
 const SEEN_PX = 60;
-/** Places of flags are rings on tiles that are at least so wide, and are chosen within their radius and a little more. */
+/** Places of flags are rings on tiles of at least this width. A click up to a little outside of a ring chooses it. */
 const PLACES_PX = 52;
 const RING_PX = 7;
 const NEAR_PX = 4;
 const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
-/** Subclasses have `paint()`, and `chosen(tile)`, which is called for a tile that an arrow key leads to. */
+/** Subclasses have `paint()`, and `chosen(tile)`, which is called for a tile selected by an arrow key. */
 export class FlatMap {
   /**
    * Tiles and bounds have west, south, east and north (m). `margins(box)` is the room around all tiles;
-   * `point(x, y)`, with null outside, and `choose(x, y)` are those of `gestures`; `wheel(event)` may refuse.
+   * `point(x, y)`, `choose(x, y)` and `wheel(event)` are passed to `gestures`; outside, `point` gets null.
    */
   constructor(canvas, tiles, bounds, { margins, point, choose, wheel }) {
     this.canvas = canvas;
@@ -43,7 +43,7 @@ export class FlatMap {
     });
   }
 
-  /** Draws from now on, in every size of the canvas. */
+  /** Starts to draw, also after changes of the canvas's size. */
   start() {
     new ResizeObserver(() => this.resize()).observe(this.canvas);
     this.resize();
@@ -158,7 +158,7 @@ export class FlatMap {
     }
   }
 
-  /** Strokes a wide line around a thin one, so that it is seen on every colour. */
+  /** Strokes a wide line around a thin line, so that it is visible on every colour. */
   twice({ halo, mark }, [wide, thin], stroke) {
     for (const [colour, line] of [[halo, wide], [mark, thin]]) {
       this.context.strokeStyle = colour;
@@ -167,7 +167,7 @@ export class FlatMap {
     }
   }
 
-  /** Returns length (m) and text of a scale bar of at most so many pixels. */
+  /** Returns length (m) and text of a scale bar with a largest width in pixels. */
   scaleBar(mostPx) {
     const metres = roundLength(mostPx / this.box.scale);
     return [metres, lengthText(metres)];
@@ -211,7 +211,7 @@ export function middle(tile) {
   return [(tile.west + tile.east) / 2, (tile.south + tile.north) / 2];
 }
 
-/** Returns the nearest tile beside one, to the left (-1, 0), above (0, 1) and so on; without one, the nearest to a place. */
+/** Returns the nearest tile in a direction from a tile: left is (-1, 0), up (0, 1). Without a tile: the nearest to a place. */
 export function beside(tiles, from, [dx, dy], place) {
   const [x, y] = from ? middle(from) : place;
   let [best, least] = [null, Infinity];

@@ -2,7 +2,7 @@
 
 const CLICK_PX = 6;
 
-/** Calls move(dx, dy), zoom(factor, x, y), point(x, y or null) and choose(x, y) for what is done on an element; wheel(event) says whether it zooms. */
+/** Calls move(dx, dy), zoom(factor, x, y), point(x, y or null) and choose(x, y) for gestures on an element; wheel(event) returns whether it zooms. */
 export function gestures(element, { move, zoom, point, choose, wheel = () => true }) {
   const down = new Map();
   let travelled = 0;

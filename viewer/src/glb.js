@@ -9,7 +9,7 @@ const WIDTHS = { SCALAR: 1, VEC2: 2, VEC3: 3, VEC4: 4 };
 
 /**
  * Returns the parts of a file, by the names of their node and level: kind, level, positions, normals, uvs, indices
- * and the translation from the scene's origin; with the image's bytes, null if there is none.
+ * and the translation from the scene's origin; with the image's bytes, null without an image.
  */
 export function readGlb(bytes) {
   const { json, binary } = chunks(bytes);

@@ -44,7 +44,7 @@ export function nearestLine(lines, easting, northing, within) {
   return best;
 }
 
-/** Returns the line that goes on where another one ends, in its direction of travel; null if none does. */
+/** Returns the line that continues the end of another line, in the direction of travel; null without one. */
 export function continuation(lines, from, end, direction, within = 1.0, maxTurn = 80) {
   let best = null;
   for (const line of lines) {

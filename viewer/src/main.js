@@ -1,4 +1,4 @@
-// The page: takes the run of run.js, shows the map or a tile by the address, and changes from one to the other.
+// The page: takes the run of run.js, and shows the map or a tile, by the address.
 
 import { byId, el, fill, show } from "./dom.js";
 import { MapView, summary } from "./map_view.js";
@@ -11,7 +11,7 @@ const LAYERS = { road: true, terrain: true, levels: true, wire: false, points: f
 const scripts = new TileScripts();
 let received = null;
 
-// What run.js and tiles/*.js hand over.
+// The functions that run.js and tiles/*.js call.
 window.FLEXROAD = {
   run: (data) => {
     received = data;
@@ -47,7 +47,7 @@ class Page {
     byId("back").addEventListener("click", () => this.showMap());
     byId("help").addEventListener("click", () => byId("help-text").showModal());
     byId("panel-toggle").addEventListener("click", () => byId("panel").classList.toggle("open"));
-    // Unlike hashchange it comes before any timer, which would write the view that was left into the new entry.
+    // Unlike hashchange it comes before any timer. A timer would write the old view into the new entry.
     window.addEventListener("popstate", () => {
       if (window.location.hash !== this.hash) this.obey();
     });
@@ -56,13 +56,13 @@ class Page {
     window.FLEXROAD.inspect = () => this.inspect();
   }
 
-  /** Loads the small pictures of the tiles, when the map is already there. */
+  /** Loads the small pictures of the tiles, after the map is shown. */
   loadPictures() {
     const script = el("script", { src: "pictures.js", load: () => this.maps.map.show(received.pictures) });
     document.head.append(script);
   }
 
-  /** Keys work wherever the focus is, but in fields that use them. */
+  /** Keys work everywhere except in fields that use them. */
   key(event) {
     const own = event.target.closest("input[type=search], input[type=range], select, dialog");
     const pressed = event.key === "Enter" && event.target.closest("button, summary");
@@ -71,13 +71,13 @@ class Page {
     if (used) event.preventDefault();
   }
 
-  /** Shows what the address says. */
+  /** Shows the view of the address. */
   obey() {
     const state = parse(window.location.hash);
     this.hash = window.location.hash;
     this.maps.by(state.by);
     const tile = this.run.byId.get(state.tile);
-    // The address has its entry in the history already.
+    // The address already has an entry in the history.
     this.recorded = tile?.state === DONE;
     if (tile?.state === DONE) {
       this.openTile(tile, state);
@@ -141,13 +141,13 @@ class Page {
     this.tiles?.stage.theme(getComputedStyle(document.documentElement).getPropertyValue("--sky").trim());
   }
 
-  /** Writes what is shown into the address. */
+  /** Writes the view into the address. */
   follow() {
     const by = this.maps.choice.key === "state" ? "" : this.maps.choice.key;
     const hash = format(this.inTile && this.tiles?.tile ? { ...this.tileState(), by } : { by });
     if (hash === this.hash) return;
     this.hash = hash;
-    // Back leads from a tile to the map, and not through each move of the camera.
+    // "Back" leads from a tile to the map, and not through each move of the camera.
     const entered = this.inTile !== this.recorded;
     this.recorded = this.inTile;
     try {
@@ -170,7 +170,7 @@ class Page {
     };
   }
 
-  /** Returns what is shown, for people who script the page, and for tests. */
+  /** Returns the view, for scripts and tests. */
   inspect() {
     const stage = this.tiles?.stage;
     return {

@@ -15,8 +15,8 @@ const MARGINS = { top: 84, bottom: 48, sides: 24 };
 
 export class OverviewMap extends FlatMap {
   /**
-   * Draws into a canvas; `open(tile, place)` is called for a chosen tile, with the place of a flag if that was
-   * chosen; `point(tile, x, y, flag)` for the tile and the flag's place under the pointer.
+   * Draws into a canvas; `open(tile, place)` is called for a chosen tile, with a place if a flag was chosen;
+   * `point(tile, x, y, flag)` for the tile and the flag's place under the pointer.
    */
   constructor(canvas, run, { open, point }) {
     const under = (x, y) => tileAt(run, ...this.box.toGround(x, y));
@@ -103,7 +103,7 @@ export class OverviewMap extends FlatMap {
     this.point(tile, ...this.box.toScreen(...middle(tile)));
   }
 
-  /** Enter opens the selected tile; the other keys are those of every map. */
+  /** Enter opens the selected tile; other keys work as on every map. */
   key(event) {
     if (event.key !== "Enter" || !this.selected) return super.key(event);
     this.open(this.selected);

@@ -1,4 +1,4 @@
-// What the overview map shows by colour: states, one flag, or one measure, with the legend.
+// Colours of the overview map: states, one flag, or one measure, with the legend.
 
 import { DONE, FAILED } from "./run.js";
 import { short } from "./place.js";
@@ -54,7 +54,7 @@ function byMeasure(run, name, { title, unit }) {
     .filter((value) => value != null)
     .sort((a, b) => a - b);
   if (!values.length) return null;
-  // Outliers do not take the colours of the others.
+  // Outliers do not change the colours of other tiles.
   const [low, high] = [quantile(values, 0.02), quantile(values, 0.98)];
   const shade = (value) => ramp(high > low ? (value - low) / (high - low) : 0.5);
   const text = (value) => (unit === "%" ? `${short(100 * value)} %` : `${short(value, unit)}${unit ? ` ${unit}` : ""}`);

@@ -10,7 +10,7 @@ import { count, flagText, isFlagged, stateText } from "./words.js";
 const LISTED = 10;
 
 export class MapView {
-  /** `open(tile, place)` shows a tile in 3D, and a place on it if one is given; `changed()` is called when the address must follow. */
+  /** `open(tile, place)` shows a tile in 3D, at a place on it if one is given; `changed()` is called when the address must be updated. */
   constructor(run, { open, changed }) {
     this.run = run;
     this.open = open;
@@ -24,7 +24,7 @@ export class MapView {
     this.map.colourBy(this.choice.colour);
   }
 
-  /** Does what a key means; returns whether it means anything. */
+  /** Runs the command of a key; returns whether the key has a command. */
   key(event) {
     return this.map.key(event);
   }
@@ -94,13 +94,13 @@ export class MapView {
     fill(this.results, list, more, none);
   }
 
-  /** Says that the run has no such tile, and lists those with a like id. */
+  /** Shows a message that the run has no such tile, and lists tiles with a similar id. */
   lacks(id) {
     this.find(id);
     this.say(el("p", {}, `This run has no tile ${id}.`));
   }
 
-  /** Opens a finished tile; of others, says what is known. */
+  /** Opens a finished tile; shows a message on other tiles. */
   choose(tile, place = null) {
     this.map.select(tile);
     if (tile.state === DONE) {

@@ -1,8 +1,8 @@
-// How the surface is coloured: by class, photo, support or error estimate, with hillshading. Colours are sRGB throughout.
+// Colours of the surface: by class, photo, height source or error estimate, with hillshading. All colours are sRGB.
 
 import { Color, ColorManagement, DoubleSide, ShaderMaterial, Vector3, Vector4 } from "three";
 
-// Before the first colour is made: colours stay as they are written.
+// Before the first colour is made, so that colours are not converted.
 ColorManagement.enabled = false;
 
 export const COLOURS = { class: 0, photo: 1, support: 2, estimate: 3 };
@@ -79,7 +79,7 @@ void main() {
   gl_FragColor = vec4(mix(base * shade, sky, haze), 1.0);
 }`;
 
-/** The uniforms that all tiles share. */
+/** The uniforms shared by all tiles. */
 export function sharedUniforms() {
   return {
     colour: { value: COLOURS.class },
@@ -99,7 +99,7 @@ export function surfaceMaterial(shared, own, box, textures) {
     vertexShader: VERTEX,
     fragmentShader: FRAGMENT,
     side: DoubleSide,
-    // Wires and lines on the surface are then in front of it.
+    // So wires and lines on the surface are in front of it.
     polygonOffset: true,
     polygonOffsetFactor: 1,
     polygonOffsetUnits: 1,

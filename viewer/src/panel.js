@@ -1,4 +1,4 @@
-// The settings beside map and scene, as elements; what they do is passed in.
+// The settings beside map and scene, as elements; the functions that they call are passed in.
 
 import { el } from "./dom.js";
 import { ESTIMATE_COLOURS, ESTIMATE_MOST, SUPPORT_COLOURS } from "./material.js";
@@ -91,7 +91,7 @@ export function surfaceLegend(colour) {
   if (colour === "estimate") {
     const ramp = { stops: ESTIMATE_COLOURS, low: "0 m", high: `${ESTIMATE_MOST} m and more` };
     // Else the colours beside the road seem to contradict the tile's figure.
-    const note = "The figure of a tile is over its road. Where the data have no height, the estimate is 0.3 m or more.";
+    const note = "The figure of a tile is for its road. Where the data have no height, the estimate is 0.3 m or more.";
     return el("div", {}, legend([], ramp), el("p", { class: "quiet small" }, note));
   }
   if (colour === "photo") return null;
@@ -126,7 +126,7 @@ export function tileList(tiles, { mark, value, open }) {
   return el("ol", { class: "list" }, rows);
 }
 
-/** Returns why a tile needs a look, in one line, empty if it does not; flags that have a place may be left out. */
+/** Returns in one line why a tile needs a look, or an empty text; flags with a place may be left out. */
 export function reason(tile, all = true) {
   if (tile.state === FAILED) return tile.error || "failed";
   return tile.flags.filter((flag) => all || !tile.places[flag]).map(flagText).join("; ");
@@ -154,7 +154,7 @@ export function tileHead(tile, go) {
   ];
 }
 
-/** Returns the figures of a tile, folded away; null if it has none. */
+/** Returns the figures of a tile in an element that opens by a click; null without figures. */
 export function tileFigures(tile, choices, open, toggle) {
   const figures = choices.filter((choice) => choice.text).map((choice) => [choice.label, choice.text(tile)]);
   const known = figures.filter(([, text]) => text !== null);

@@ -5,7 +5,7 @@
 const NUMBERS = { camera: 6, z: 1 };
 const TEXTS = ["tile", "by", "colour", "hide", "show"];
 
-/** Returns the state that a hash says; parts that are missing or damaged are left out. */
+/** Returns the state in a hash; missing or damaged parts are left out. */
 export function parse(hash) {
   const state = {};
   for (const part of hash.replace(/^#/, "").split("&")) {
@@ -22,7 +22,7 @@ export function parse(hash) {
   return state;
 }
 
-/** Returns the hash of a state; `parse` gives the state back, but for the rounding of the camera's place. */
+/** Returns the hash of a state; `parse` returns the state, except for the rounding of the camera's place. */
 export function format(state) {
   const parts = [];
   for (const name of [...TEXTS, ...Object.keys(NUMBERS)]) {

@@ -1,12 +1,12 @@
 // Heights and classes of a tile in cells, row 0 in the north.
 
-/** Returns a raster of quantised heights: 0 is no height, others are low + (value - 1) * step (m). */
+/** Returns a raster of quantised heights: 0 is no height, other values are low + (value - 1) * step (m). */
 export function heights(grid, low, step, bytes) {
   const values = new Uint16Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 2);
   return { grid, at: (index) => (values[index] ? low + (values[index] - 1) * step : NaN) };
 }
 
-/** Returns the value of the cell under a place, or of the nearest one: thinned rasters may end before the tile. */
+/** Returns the value of the cell under a place, or of the nearest cell: thinned rasters may end before the tile. */
 export function nearest(raster, easting, northing) {
   const { west, north, cell, rows, cols } = raster.grid;
   const col = Math.min(Math.max(Math.floor((easting - west) / cell), 0), cols - 1);
@@ -14,7 +14,7 @@ export function nearest(raster, easting, northing) {
   return raster.at(row * cols + col);
 }
 
-/** Returns the step of the cell under a place (m): 0 without one, and where tiles meet. */
+/** Returns the step of the cell under a place (m); 0 without a step, and where tiles meet. */
 export function stepAt(steps, easting, northing) {
   const { west, north, cell, rows, cols } = steps.grid;
   const [x, y] = [(easting - west) / cell, (north - northing) / cell];
@@ -22,7 +22,7 @@ export function stepAt(steps, easting, northing) {
   return (inside && nearest(steps, easting, northing)) || 0;
 }
 
-/** Returns the height between cell centres; that of the nearest cell where one of four has none. */
+/** Returns the height between cell centres, or of the nearest cell if one of the four has no height. */
 export function bilinear(raster, easting, northing) {
   const { west, north, cell, rows, cols } = raster.grid;
   const x = Math.min(Math.max((easting - west) / cell - 0.5, 0), cols - 1);

@@ -1,4 +1,4 @@
-// The card with what is under the cursor: coordinates, height, slopes, class, scan and terrain model.
+// The card on the place under the cursor: coordinates, height, slopes, class, scan and terrain model.
 
 import { el, fill } from "./dom.js";
 import { nearestLine } from "./lines.js";
@@ -24,7 +24,7 @@ export class Readout {
     const [longitude, latitude] = lonLat(object.tile, object.data.corners, easting, northing);
     const cells = object.cellsAt(easting, northing);
     const levels = this.stage.levelsAt(easting, northing);
-    // Cells have what is seen from above: it tells nothing of what lies below.
+    // Cells describe the surface seen from above, and not levels below it.
     if (levels.length > 1 && pick.level < levels[0].level) Object.assign(cells, { support: 0, estimate: NaN });
     const rows = [
       ["Height", `${metres(height)} m`, "strong"],
@@ -48,7 +48,7 @@ export class Readout {
     const direction = pick.direction ?? found?.direction;
     if (pick.kind === "road" && direction) {
       const { grade, crossfall } = along(pick, direction);
-      // Beside a standing cursor nobody drives: up and down have no meaning there.
+      // Without a direction of travel, up and down have no meaning.
       return [
         ["Grade along the road", climb(grade, pick.direction)],
         ["Crossfall", fall(crossfall, side(crossfall, direction, pick.direction))],
@@ -59,7 +59,7 @@ export class Readout {
   }
 }
 
-/** Returns where the crossfall leads: to the left or right of a driver, else by the compass. */
+/** Returns the direction of the crossfall: to the left or right of a driver, else by the compass. */
 function side(crossfall, [east, north], driven) {
   if (driven) return crossfall >= 0 ? "the right" : "the left";
   const sign = crossfall >= 0 ? 1 : -1;

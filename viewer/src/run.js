@@ -4,7 +4,7 @@ export const PENDING = 0;
 export const DONE = 1;
 export const FAILED = 2;
 
-/** Returns the run of the columns that run.js hands over. */
+/** Returns the run from the columns of run.js. */
 export function runOf(data) {
   const { tiles: columns } = data;
   const tiles = columns.id.map((id, number) => ({
@@ -42,7 +42,7 @@ export function contains(tile, easting, northing) {
   return tile.west <= easting && easting <= tile.east && tile.south <= northing && northing <= tile.north;
 }
 
-/** Returns the tile under a place; null if there is none. Of two, the one that has a surface. */
+/** Returns the tile under a place; null without a tile. Of two tiles, the tile with a surface. */
 export function tileAt(run, easting, northing) {
   const under = run.tiles.filter((tile) => contains(tile, easting, northing));
   return under.find((tile) => tile.state === DONE) ?? under[0] ?? null;
@@ -66,7 +66,7 @@ export function near(run, easting, northing, within, most) {
     .map(([, , tile]) => tile);
 }
 
-/** Returns the tiles that need a look first: failed ones, up to a half, then those with the largest error estimates. */
+/** Returns the tiles to look at first: failed tiles, up to a half, then tiles with the largest error estimates. */
 export function worst(run, most) {
   const estimate = (tile) => tile.measures.error_estimate_m ?? 0;
   const failed = run.tiles.filter((tile) => tile.state === FAILED);

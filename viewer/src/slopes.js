@@ -1,6 +1,6 @@
 // Slopes of the surface in words that road engineers use. Derivatives are in m/m, results in percent.
 
-/** Returns the steepest slope, and the compass direction that it falls to. */
+/** Returns the steepest slope, and the compass direction in which it falls. */
 export function steepest({ byEasting, byNorthing }) {
   const percent = 100 * Math.hypot(byEasting, byNorthing);
   const bearing = ((Math.atan2(-byEasting, -byNorthing) * 180) / Math.PI + 360) % 360;
@@ -15,13 +15,13 @@ export function along({ byEasting, byNorthing }, [east, north]) {
   };
 }
 
-/** Returns the size of a slope with the direction that it falls to, or "level" if it is 0.0 as shown. */
+/** Returns the size of a slope with the direction in which it falls, or "level" if it is shown as 0.0. */
 export function fall(percent, towards) {
   const size = Math.abs(percent).toFixed(1);
   return `${size} %, ${Number(size) === 0 ? "level" : `falls to ${towards}`}`;
 }
 
-/** Returns the size of a grade, with up or down for a driver unless it is 0.0 as shown. */
+/** Returns the size of a grade, with up or down for a driver unless it is shown as 0.0. */
 export function climb(percent, driven) {
   const size = Math.abs(percent).toFixed(1);
   const sense = Number(size) === 0 ? ", level" : percent < 0 ? " down" : " up";

@@ -1,6 +1,6 @@
 // The fitted surface itself: a NURBS height field, as in flexroad's `NurbsSurface`.
 
-/** Returns the surface of its knots and coefficients; row 0 of `A` and `W` is in the south. */
+/** Returns the surface from its knots and coefficients; row 0 of `A` and `W` is in the south. */
 export function spline({ degree, bounds, datum, knotsU, knotsV, A, W }) {
   const [west, south, east, north] = bounds;
   const [u, v] = [axis(knotsU, degree[0], west, east), axis(knotsV, degree[1], south, north)];

@@ -1,4 +1,4 @@
-// The 3D scene: camera, light, the tiles near the place that is looked at, and what lies under a pixel.
+// The 3D scene: camera, light, the tiles near the camera's target, and the surface under a pixel.
 //
 // x is east, y is up, z is south, all relative to the run's origin; heights are relative to `base`, times the exaggeration.
 
@@ -14,14 +14,14 @@ const EYE = 1.5;
 const MOST_TILES = window.matchMedia("(max-width: 700px)").matches ? 5 : 9;
 const NEARBY = 1.6;
 const FROM_SOUTH = new Vector3(-0.25, 0.8, 0.9);
-// Part of the free height and width that a tile seen as a whole takes.
+// Share of the free height and width that a complete tile takes.
 const FILLED = 0.86;
 // Distance to a place that is looked at from near (m), and points of a tile's edge, each side.
 const CLOSE_M = 40;
 const OUTLINE_POINTS = 64;
 const EDGE_M = 0.05;
 
-/** Returns the pick of several whose height is nearest to a height (m). */
+/** Returns the pick whose height is nearest to a height (m). */
 export function nearest(picks, height) {
   return picks.reduce((best, pick) => (Math.abs(pick.height - height) < Math.abs(best.height - height) ? pick : best));
 }
@@ -57,7 +57,7 @@ export class Stage {
   }
 
   /**
-   * Opens a tile: loads it, looks at it, or at a place (easting, northing) on it, then loads those around.
+   * Opens a tile: loads it, looks at it or at a place (easting, northing) on it, then loads the tiles around.
    * `camera` is easting, northing, height of eye and target.
    */
   async open(tile, { camera = null, place = null }) {
@@ -82,7 +82,7 @@ export class Stage {
     this.missing.clear();
   }
 
-  /** Shows the whole tile in what is free beside the settings, seen from the south. */
+  /** Shows the complete tile in the free space beside the settings, seen from the south. */
   overlook(tile) {
     const [easting, northing] = [(tile.west + tile.east) / 2, (tile.south + tile.north) / 2];
     const target = this.toScene(easting, northing, this.heightAt(easting, northing) ?? this.base);
@@ -113,10 +113,10 @@ export class Stage {
 
   /** Returns the edge of a tile on its surface: places [easting, northing, height] around it; the corners twice. */
   outline({ tile, data }) {
-    // Just inside, where the steps beside roads are those of the tile's cells.
+    // Just inside, where the steps beside roads are from the tile's own cells.
     const [west, south, east, north] = [tile.west + EDGE_M, tile.south + EDGE_M, tile.east - EDGE_M, tile.north - EDGE_M];
     const corners = [[west, south], [east, south], [east, north], [west, north], [west, south]];
-    // Heights of a mesh alone take a search of all its triangles.
+    // For heights of a mesh, all its triangles must be searched.
     const number = data.surface ? OUTLINE_POINTS : OUTLINE_POINTS / 8;
     return corners.slice(1).flatMap(([toX, toY], side) => {
       const [x, y] = corners[side];
@@ -143,7 +143,7 @@ export class Stage {
     });
   }
 
-  /** Puts the camera: easting, northing and height (m) of the eye, then of what it looks at. */
+  /** Places the camera: easting, northing and height (m) of the eye, then of the target. */
   place([easting, northing, height, toEasting, toNorthing, toHeight]) {
     this.camera.position.copy(this.toScene(easting, northing, height));
     this.controls.target.copy(this.toScene(toEasting, toNorthing, toHeight));
@@ -151,7 +151,7 @@ export class Stage {
     this.moved();
   }
 
-  /** Moves to the right and forwards, by a share of the distance that is looked over. */
+  /** Moves to the right and forwards, by a share of the distance to the target. */
   shift(right, forward) {
     const [eye, target] = [this.camera.position, this.controls.target];
     const ahead = new Vector3(target.x - eye.x, 0, target.z - eye.z).normalize();
@@ -163,7 +163,7 @@ export class Stage {
     this.moved();
   }
 
-  /** Turns around what is looked at, by angles in radians. */
+  /** Turns around the target, by angles in radians. */
   turn(around, over) {
     const { target } = this.controls;
     const place = new Spherical().setFromVector3(this.camera.position.clone().sub(target));
@@ -174,12 +174,12 @@ export class Stage {
     this.moved();
   }
 
-  /** Returns where the camera is, as `place` takes it. */
+  /** Returns the place of the camera, as for `place`. */
   where() {
     return [...this.toGround(this.camera.position), ...this.toGround(this.controls.target)];
   }
 
-  /** Changes what is shown; z is the vertical exaggeration. */
+  /** Changes the view; z is the vertical exaggeration. */
   apply(look) {
     const target = this.toGround(this.controls.target);
     const eye = this.camera.position.clone().sub(this.controls.target);
@@ -191,7 +191,7 @@ export class Stage {
     this.ground.position.y = -this.base * this.look.z;
     for (const object of this.objects.values()) object.apply(this.look);
     if (stretched && this.active) {
-      // The eye keeps its distance to what it looks at.
+      // The eye keeps its distance to the target.
       this.controls.target.copy(this.toScene(...target));
       this.camera.position.copy(this.controls.target).add(eye);
       this.controls.update();
@@ -218,8 +218,8 @@ export class Stage {
   }
 
   /**
-   * Returns the height of the surface at a place (m); null where no tile is loaded. With decks or tunnels it is that
-   * of what is seen from above, or of the level that is nearest to a height.
+   * Returns the height of the surface at a place (m); null where no tile is loaded. With decks or tunnels it is
+   * the height seen from above, or of the level that is nearest to a height.
    */
   heightAt(easting, northing, near = null) {
     const levels = near === null ? [] : this.levelsAt(easting, northing);
@@ -231,7 +231,7 @@ export class Stage {
     return this.meshHeight(easting, northing);
   }
 
-  /** Returns what each level has at a place, as `pick`, the highest first; nothing on tiles with level 0 alone. */
+  /** Returns the pick of each level at a place, the highest first; empty on tiles with only level 0. */
   levelsAt(easting, northing) {
     const object = this.objectAt(easting, northing);
     if (!object?.data.top) return [];
@@ -245,7 +245,7 @@ export class Stage {
     return null;
   }
 
-  /** Returns place, height, slopes and tile under a pixel of the canvas, and the height of the mesh; null where the sky is. */
+  /** Returns place, height, slopes and tile under a pixel of the canvas, and the height of the mesh; null for the sky. */
   pick(x, y) {
     const { clientWidth, clientHeight } = this.renderer.domElement;
     const ray = new Raycaster();
@@ -266,7 +266,7 @@ export class Stage {
   }
 
   hit(ray, meshes, exact = true) {
-    // Tiles that were not drawn yet have no places otherwise.
+    // Else tiles that were not drawn yet would have no places.
     this.ground.updateMatrixWorld();
     const [first] = ray.intersectObjects(meshes, false);
     if (!first) return null;
@@ -287,7 +287,7 @@ export class Stage {
     };
   }
 
-  /** Draws the next frame; many calls make one. */
+  /** Requests the next frame; many calls give one frame. */
   draw() {
     if (this.frame || !this.active) return;
     this.frame = requestAnimationFrame(() => {
@@ -307,7 +307,7 @@ export class Stage {
     if (!this.active) return;
     this.stayAbove();
     this.draw();
-    // Not on every step: during a drive or a long drag, too, tiles come and go.
+    // Not on every step. During a drive or a long drag tiles are loaded, too.
     this.later ??= setTimeout(() => {
       this.later = null;
       this.refresh();
@@ -315,7 +315,7 @@ export class Stage {
     }, 120);
   }
 
-  /** Loads the tiles near the target and leaves those far away. */
+  /** Loads the tiles near the target, and removes tiles far away. */
   refresh() {
     if (!this.active) return;
     const [easting, northing] = this.toGround(this.controls.target);
@@ -389,7 +389,7 @@ export class Stage {
     if (!clientWidth || !clientHeight) return;
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / clientHeight;
-    // The middle of what is free beside the settings, not of the canvas.
+    // The middle of the free space beside the settings, not of the canvas.
     this.camera.setViewOffset(clientWidth, clientHeight, this.covered() / 2, 0, clientWidth, clientHeight);
     this.draw();
   }

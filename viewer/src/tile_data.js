@@ -39,7 +39,7 @@ export async function unpacked(tile, data) {
 }
 
 function bitmap(bytes, type) {
-  // glTF's texture coordinates count from the top, as the rows of the image do.
+  // glTF's texture coordinates start at the top, like the rows of the image.
   return createImageBitmap(new Blob([bytes], { type }), { imageOrientation: "none", premultiplyAlpha: "none" });
 }
 

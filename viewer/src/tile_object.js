@@ -1,4 +1,4 @@
-// One tile in the 3D scene: its surface, wires and scan points, and what the surface is at a place.
+// One tile in the 3D scene: its surface, wires and scan points, and values of the surface at a place.
 
 import {
   BufferAttribute,
@@ -73,7 +73,7 @@ export class TileObject {
     this.group.add(mesh, wire);
   }
 
-  /** Shows the parts and layers that are wanted. */
+  /** Shows the selected parts and layers. */
   apply({ road, terrain, levels, wire, points }) {
     const wanted = { road, terrain };
     for (const [name, { kind, level }] of Object.entries(this.data.parts)) {
@@ -84,7 +84,7 @@ export class TileObject {
     if (this.points) this.points.visible = points;
   }
 
-  /** The numbers of its levels: 0, and those of decks and tunnels. */
+  /** The numbers of its levels: 0, decks and tunnels. */
   get levels() {
     return [...new Set(Object.values(this.data.parts).map(({ level }) => level))];
   }
@@ -103,7 +103,7 @@ export class TileObject {
     return steps ? { ...found, height: found.height + stepAt(steps, easting, northing) } : found;
   }
 
-  /** Returns what the rasters have at a place: scan and terrain model (m), support class, error estimate (m). */
+  /** Returns the values of the rasters at a place: scan and terrain model (m), height source, error estimate (m). */
   cellsAt(easting, northing) {
     const { dsm, dtm, support, estimateAt, grid } = this.data;
     return {

@@ -1,4 +1,4 @@
-// Loads tiles/NAME.js: browsers read no other files from file://. Each hands its data to FLEXROAD.tile(id, data).
+// Loads tiles/NAME.js: browsers read no other files from file://. Each calls FLEXROAD.tile(id, data).
 
 const AT_ONCE = 2;
 
@@ -21,7 +21,7 @@ export class TileScripts {
     return job.promise;
   }
 
-  /** Leaves out tiles that are still in the queue and no longer wanted. */
+  /** Removes tiles from the queue that are no longer needed. */
   keepOnly(wanted) {
     for (const job of this.queue.filter(({ tile }) => !wanted.has(tile))) {
       this.waiting.delete(job.tile.id);

@@ -21,7 +21,7 @@ const FLAG_COLOUR = "#e3a02c";
 const SPEEDS = { min: 10, max: 130, step: 5 };
 
 export class TileView {
-  /** `back()` returns to the map; `changed()` is called when the address must follow. */
+  /** `back()` returns to the map; `changed()` is called when the address must be updated. */
   constructor(run, scripts, choices, { back, changed }) {
     this.run = run;
     this.choices = choices;
@@ -42,7 +42,7 @@ export class TileView {
     this.listen();
   }
 
-  /** Shows a tile in 3D; `camera` and `place` are those of `Stage.open`. */
+  /** Shows a tile in 3D; `camera` and `place` are as in `Stage.open`. */
   async open(tile, { camera, place }, colour) {
     this.chosen ||= Boolean(colour);
     this.enter(tile);
@@ -50,7 +50,7 @@ export class TileView {
     if (this.tile === tile) this.redraw();
   }
 
-  /** Takes the tile that is now looked at. */
+  /** Takes the tile under the camera's target. */
   enter(tile) {
     this.tile = tile;
     fill(byId("title"), tile.id);
@@ -83,7 +83,7 @@ export class TileView {
     show(byId("hint"), false);
   }
 
-  /** Returns the settings; called again when a tile has come. */
+  /** Returns the settings; called again when a tile has been loaded. */
   panel() {
     const { look } = this.stage;
     const object = this.stage.objects.get(this.tile);
@@ -159,7 +159,7 @@ export class TileView {
     return el("button", { type: "button", "data-tool": name, "aria-pressed": String(Boolean(pressed)), click }, label);
   }
 
-  /** Changes what is shown. */
+  /** Changes the view. */
   apply(look, quiet = false) {
     if (look.colour) this.chosen = true;
     this.stage.apply(look);
@@ -311,7 +311,7 @@ export class TileView {
     fill(byId("loading"), number === 1 ? "Loading a tile" : `Loading ${number} tiles`);
   }
 
-  /** Does what a key means; returns whether it means anything. */
+  /** Runs the command of a key; returns whether the key has a command. */
   key(event) {
     const name = event.key.toLowerCase();
     const { controls } = this.stage;

@@ -1,4 +1,4 @@
-// Which part of the ground a map shows, as numbers: no page is needed.
+// The part of the ground that a map shows, as numbers, without a page.
 
 export class ViewBox {
   constructor() {

@@ -46,7 +46,7 @@ test("failed tiles need a look first, then large error estimates", () => {
 test("files of an earlier result are told", () => {
   const [done, failed] = run().tiles;
   assert.equal(stateText(done), "done");
-  assert.equal(stateText(failed), "failed; its files are of an earlier result");
+  assert.equal(stateText(failed), "failed; its files are from an earlier result");
 });
 
 test("each choice colours all tiles, and tiles without a value differ from the others", () => {

@@ -13,6 +13,9 @@ from rasterio.errors import RasterioError
 from flexroad.catalog.guard import open_raster
 from flexroad.catalog.guard.open_raster import kept_raster
 from flexroad.catalog.guard.source_files import InputRejected
+from tests.make_rasters import damage, write
+
+ONES = np.ones((3, 4), np.float32)
 
 
 @pytest.fixture
@@ -23,21 +26,13 @@ def kept(monkeypatch):
     return idle
 
 
-def write(path, value, **profile):
-    shape = {"driver": "GTiff", "width": 4, "height": 3, "count": 1, "dtype": "float32"} | profile
-    transform = rasterio.Affine(1, 0, 500000, 0, -1, 5600000)
-    with rasterio.open(path, "w", crs="EPSG:25832", transform=transform, **shape) as raster:
-        raster.write(np.full((1, 3, 4), value, shape["dtype"]))
-    return path
-
-
 def value_of(path):
     with kept_raster(path) as raster:
         return raster.read(1)[0, 0]
 
 
 def test_file_that_is_read_twice_is_opened_once(kept, tmp_path, monkeypatch):
-    path = write(tmp_path / "a.tif", 1)
+    path = write(tmp_path / "a.tif", ONES)
     opened, open_alone = [], open_raster.open_alone
     monkeypatch.setattr(open_raster, "open_alone", lambda path: opened.append(path) or open_alone(path))
     assert [value_of(path), value_of(path)] == [1, 1]
@@ -46,9 +41,9 @@ def test_file_that_is_read_twice_is_opened_once(kept, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("replaced", [True, False], ids=["replaced", "rewritten"])
 def test_changed_file_is_read_again(kept, tmp_path, replaced):
-    path = write(tmp_path / "a.tif", 1)
+    path = write(tmp_path / "a.tif", ONES)
     assert value_of(path) == 1
-    other = write(tmp_path / "b.tif", 2)
+    other = write(tmp_path / "b.tif", 2 * ONES)
     if replaced:
         # Of the same size and time.
         os.utime(other, ns=(0, path.stat().st_mtime_ns))
@@ -59,7 +54,7 @@ def test_changed_file_is_read_again(kept, tmp_path, replaced):
 
 
 def test_removed_file_is_missing(kept, tmp_path):
-    path = write(tmp_path / "a.tif", 1)
+    path = write(tmp_path / "a.tif", ONES)
     assert value_of(path) == 1
     path.unlink()
     with pytest.raises(FileNotFoundError), kept_raster(path):
@@ -67,10 +62,10 @@ def test_removed_file_is_missing(kept, tmp_path):
 
 
 def test_side_car_file_that_comes_later_is_read_and_checked(kept, tmp_path):
-    path = write(tmp_path / "a.tif", 1)
+    path = write(tmp_path / "a.tif", ONES)
     with kept_raster(path) as raster:
         assert raster.read_masks(1).all()
-    mask = write(tmp_path / "mask.tif", 0, dtype="uint8", photometric="minisblack")
+    mask = write(tmp_path / "mask.tif", np.zeros((3, 4), np.uint8), photometric="minisblack")
     with rasterio.open(mask, "r+") as raster:
         raster.update_tags(INTERNAL_MASK_FLAGS_1=2)
     mask.rename(tmp_path / "a.tif.msk")
@@ -83,8 +78,8 @@ def test_side_car_file_that_comes_later_is_read_and_checked(kept, tmp_path):
 
 
 def test_damaged_file_is_not_kept(kept, tmp_path):
-    path = write(tmp_path / "a.tif", 1, compress="deflate")
-    path.write_bytes(path.read_bytes()[:-8])
+    path = write(tmp_path / "a.tif", ONES, compress="deflate")
+    damage(path, 0, 0)
     with pytest.raises(RasterioError), kept_raster(path) as raster:
         raster.read(1)
     assert path not in kept.files
@@ -92,7 +87,7 @@ def test_damaged_file_is_not_kept(kept, tmp_path):
 
 
 def test_number_of_open_files_is_bounded(kept, tmp_path):
-    paths = [write(tmp_path / f"{i}.tif", i) for i in range(open_raster.MOST_KEPT + 3)]
+    paths = [write(tmp_path / f"{i}.tif", i * ONES) for i in range(open_raster.MOST_KEPT + 3)]
     assert [value_of(path) for path in paths] == list(range(len(paths)))
     assert list(kept.files) == paths[3:]
     # Of the files written here: what earlier tests left open may be closed at any time.
@@ -102,7 +97,7 @@ def test_number_of_open_files_is_bounded(kept, tmp_path):
 
 
 def test_file_that_is_in_use_is_opened_a_second_time(kept, tmp_path):
-    path = write(tmp_path / "a.tif", 1)
+    path = write(tmp_path / "a.tif", ONES)
     with kept_raster(path) as first, kept_raster(path) as second:
         assert first is not second
         assert first.read(1)[0, 0] == second.read(1)[0, 0] == 1
@@ -112,7 +107,7 @@ def test_file_that_is_in_use_is_opened_a_second_time(kept, tmp_path):
 
 
 def test_forked_process_opens_its_own_file(kept, tmp_path):
-    path = write(tmp_path / "a.tif", 1)
+    path = write(tmp_path / "a.tif", ONES)
     assert value_of(path) == 1
     (_, dataset) = kept.files[path]
     if child := os.fork():

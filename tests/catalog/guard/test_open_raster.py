@@ -1,15 +1,12 @@
 """Source rasters are opened only in known formats; neither they nor their side-cars lead to other files."""
 
-import os
-import shutil
-import socket
-
 import numpy as np
 import pytest
 import rasterio
 
 from flexroad.catalog.guard.open_raster import open_raster
 from flexroad.catalog.guard.source_files import InputRejected
+from tests.builders import make_special
 from tests.make_rasters import UTM, write, write_xyz
 
 FLAT = np.full((32, 32), 7.0, np.float32)
@@ -44,16 +41,7 @@ def test_formats_are_read_whatever_the_suffix(tmp_path, driver):
         assert src.driver == driver
         np.testing.assert_allclose(src.read(1), FLAT, atol=1)
         assert src.transform.c == 295500
-
-
-def test_points_are_read(tmp_path):
     assert (read(write_xyz(tmp_path / "a.xyz", FLAT, 295500, 5629500))[0] == 7).all()
-
-
-def test_vrt_is_refused_with_the_remedy(tmp_path):
-    write(tmp_path / "a.tif", FLAT)
-    (tmp_path / "a.vrt").write_text('<?xml version="1.0"?>\n' + vrt(tmp_path / "a.tif"))
-    check_refused(tmp_path / "a.vrt", "is a VRT, which only names other files; give those files by a pattern")
 
 
 CONTENT = {
@@ -81,53 +69,55 @@ def test_content_under_another_name_asks_no_server(tmp_path, web, content, name)
     assert web.requests == []
 
 
-def test_image_with_mark_of_a_vrt_is_refused(tmp_path):
-    """GDAL searches the mark of a VRT before the first zero byte."""
-    path = tmp_path / "a.jpg"
-    path.write_bytes(b"\xff\xd8\xff\xfe<V<VRTDataset></VRTDataset>\0\0")
-    check_refused(path, "it is no GeoTIFF")
+VRT = b'<?xml version="1.0"?><VRTDataset></VRTDataset>'
+MARK = b"\xff\xd8\xff\xfe<V<VRTDataset></VRTDataset>\0\0"
+"""An image; GDAL searches the mark of a VRT before the first zero byte."""
+UNKNOWN = "cannot be read: it is no GeoTIFF.* fetch it again"
 
 
-@pytest.mark.parametrize("broken", [b"", b"\0" * 99, b"<html>not found</html>", b"PK\3\4"])
-def test_files_of_no_known_format_are_named_as_such(tmp_path, broken):
-    (tmp_path / "a.tif").write_bytes(broken)
-    check_refused(tmp_path / "a.tif", "cannot be read: it is no GeoTIFF.* fetch it again")
+@pytest.mark.parametrize(
+    ("name", "content", "match"),
+    [
+        *[("a.tif", broken, UNKNOWN) for broken in (b"", b"\0" * 99, b"<html>not found</html>", b"PK\3\4")],
+        ("a.jpg", MARK, UNKNOWN),
+        ("a.vrt", VRT, "is a VRT, which only names other files; give those files by a pattern"),
+    ],
+)
+def test_files_of_no_known_format_are_named_as_such(tmp_path, name, content, match):
+    (tmp_path / name).write_bytes(content)
+    check_refused(tmp_path / name, match)
 
 
-def overviews(url):
-    return (
-        '<PAMDataset><Metadata domain="OVERVIEWS">'
-        f'<MDI key="&#79;VERVIEW_FILE">/vsicurl/{url}/o.tif</MDI></Metadata></PAMDataset>'
-    )
+VRT_ELSEWHERE = vrt("/vsicurl/WEB/x.tif")
+OVERVIEWS = (
+    '<PAMDataset><Metadata domain="OVERVIEWS"><MDI key="&#79;VERVIEW_FILE">/vsicurl/WEB/o.tif</MDI>'
+    "</Metadata></PAMDataset>"
+)
 
 
-def test_side_cars_that_lead_elsewhere_are_refused(tmp_path, web):
-    raster = write(tmp_path / "a.tif", FLAT)
-    for name, content in {
-        "a.tif.ovr": vrt(f"/vsicurl/{web.url}/x.tif"),
-        "a.tif.msk": vrt(f"/vsicurl/{web.url}/x.tif"),
-        "a.tif.aux.xml": overviews(web.url),
-        "a.aux": "EHFA_HEADER_TAG",
-    }.items():
-        side = tmp_path / name
-        side.write_text(content)
-        check_refused(raster, "side-car file|overviews")
-        side.unlink()
-    assert (read(raster)[0] == 7).all()
-    with rasterio.open(raster, "r+") as src:
-        src.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"/vsicurl/{web.url}/x.tif")
-    check_refused(raster, "names another file as its overviews")
-    assert web.requests == []
-
-
-def test_overviews_of_overviews_are_checked(tmp_path, web):
+@pytest.mark.parametrize(
+    ("name", "content", "match"),
+    [
+        ("a.tif.ovr", VRT_ELSEWHERE, "side-car file"),
+        ("a.tif.msk", VRT_ELSEWHERE, "side-car file"),
+        ("a.tif.aux.xml", OVERVIEWS, "side-car file|overviews"),
+        ("a.aux", "EHFA_HEADER_TAG", "side-car file"),
+        ("a.tif.ovr.aux.xml", OVERVIEWS, "a.tif.ovr, which names another file"),
+        ("a.tif.ovr.ovr", VRT_ELSEWHERE, "a.tif.ovr, which has the side-car file a.tif.ovr.ovr, which is no"),
+        ("", "", "names another file as its overviews"),
+    ],
+)
+def test_side_cars_that_lead_elsewhere_are_refused(tmp_path, web, name, content, match):
     path = write(tmp_path / "a.tif", FLAT)
-    write(tmp_path / "a.tif.ovr", FLAT[:16, :16], driver="GTiff")
-    (tmp_path / "a.tif.ovr.aux.xml").write_text(overviews(web.url))
-    check_refused(path, "a.tif.ovr, which names another file")
-    (tmp_path / "a.tif.ovr.aux.xml").unlink()
-    (tmp_path / "a.tif.ovr.ovr").write_text(vrt(f"/vsicurl/{web.url}/x.tif"))
-    check_refused(path, "a.tif.ovr, which has the side-car file a.tif.ovr.ovr, which is no TIFF")
+    if name.startswith("a.tif.ovr."):
+        write(tmp_path / "a.tif.ovr", FLAT[:16, :16], driver="GTiff")
+    assert (read(path)[0] == 7).all()
+    if name:
+        (tmp_path / name).write_text(content.replace("WEB", web.url))
+    else:
+        with rasterio.open(path, "r+") as src:
+            src.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"/vsicurl/{web.url}/x.tif")
+    check_refused(path, match)
     assert web.requests == []
 
 
@@ -142,29 +132,11 @@ def test_harmless_side_cars_are_used(tmp_path):
         assert (src.transform.c, src.crs) == (295500, UTM)
 
 
-def irregular(path, kind):
-    """Put something at a path that is no regular file."""
-    path.unlink(missing_ok=True)
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "link to a pipe":
-        os.mkfifo(path.with_name("pipe"))
-        path.symlink_to(path.with_name("pipe"))
-    elif kind == "socket":
-        with socket.socket(socket.AF_UNIX) as made:
-            # The name of a socket may have about 100 characters.
-            here = os.open(path.parent, os.O_RDONLY)
-            made.bind(f"/proc/self/fd/{here}/{path.name}")
-            os.close(here)
-    else:
-        os.mkfifo(path)
-
-
 @pytest.mark.parametrize("kind", ["folder", "pipe", "link to a pipe", "socket"])
 @pytest.mark.parametrize("name", ["a.tif", "a.tif.aux.xml", "a.tfw", "a.tif.msk", "a.prj"])
 def test_only_regular_files_are_opened(tmp_path, kind, name):
     path = write(tmp_path / "a.tif", FLAT)
-    irregular(tmp_path / name, kind)
+    make_special(tmp_path / name, kind)
     check_refused(path, "is not a regular file")
 
 
@@ -189,6 +161,3 @@ def test_side_car_of_a_folder_of_links_is_used(tmp_path):
 def test_missing_file_is_told_from_a_refused_one(tmp_path):
     with pytest.raises(FileNotFoundError):
         read(tmp_path / "a.tif")
-    path = write(tmp_path / "a.tif", FLAT)
-    shutil.copy(path, tmp_path / "b.tif")
-    assert (read(tmp_path / "b.tif")[0] == 7).all()

@@ -62,21 +62,15 @@ def test_newest_by_the_date_in_the_name_is_used(tmp_path, older, newer):
     ]
 
 
-def test_newest_by_tag_is_used_if_names_do_not_tell(tmp_path):
-    edition(tmp_path / "dsm" / "a.tif", 0.5, days=100, tags={"ACQUISITIONDATE": "2016-05-01"})
-    edition(tmp_path / "dsm" / "b.tif", tags={"ACQUISITIONDATE": "2022-05-01"})
+@pytest.mark.parametrize(("tagged", "what"), [(True, "in their tags"), (False, "of the files")])
+def test_newest_by_tag_or_else_by_time_is_used_if_names_do_not_tell(tmp_path, tagged, what):
+    older, newer = ({"tags": {"ACQUISITIONDATE": f"{year}-05-01"}} if tagged else {} for year in (2016, 2022))
+    edition(tmp_path / "dsm" / "a.tif", 0.5, days=100 if tagged else 0, **older)
+    edition(tmp_path / "dsm" / "b.tif", days=2, **newer)
     result = catalog(tmp_path)
     assert used(result) == 0
-    assert "by the dates in their tags, dsm/b.tif is used before dsm/a.tif" in of_editions(result)[0]
-    assert result.tiles[0].datetime.year == 2022
-
-
-def test_newest_by_time_is_used_if_nothing_else_tells(tmp_path):
-    edition(tmp_path / "dsm" / "a.tif", 0.5)
-    edition(tmp_path / "dsm" / "b.tif", days=2)
-    result = catalog(tmp_path)
-    assert used(result) == 0
-    assert "by the dates of the files, dsm/b.tif is used before dsm/a.tif" in of_editions(result)[0]
+    assert f"by the dates {what}, dsm/b.tif is used before dsm/a.tif" in of_editions(result)[0]
+    assert result.tiles[0].datetime.year == (2022 if tagged else 2023)
 
 
 def test_files_of_unknown_age_that_differ_are_refused(tmp_path):
@@ -89,11 +83,8 @@ def test_files_of_unknown_age_that_differ_are_refused(tmp_path):
         "by more than 0.05 in 100% of the cells, and no date in their names, tags or times tells which is "
         "newer; leave one out, or write the year into their names"
     )
-
-
-def test_equal_files_of_unknown_age_are_used_without_a_word(tmp_path):
+    # Equal ones are used without a word.
     edition(tmp_path / "dsm" / "a.tif")
-    edition(tmp_path / "dsm" / "b.tif")
     assert of_editions(catalog(tmp_path)) == []
 
 

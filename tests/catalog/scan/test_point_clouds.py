@@ -36,20 +36,17 @@ def test_inspect_returns_header_fields(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
-@pytest.mark.parametrize("size", [N, 50_000, 7919])
-def test_chunks_any_size_gives_same_points(tmp_path, suffix, size):
+def test_chunks_and_parts_of_any_size_give_same_points(tmp_path, suffix):
     rng = np.random.default_rng(6)
     xyz, kind, colour = some_points(), rng.integers(0, 7, N), rng.integers(0, 65536, (N, 3))
-    got = joined(write_cloud(tmp_path / f"a.{suffix}", xyz, kind, colour=colour), size=size)
-    assert np.abs(got[0] - xyz).max() < 1e-6
-    assert np.array_equal(got[1], kind)
-    assert np.array_equal(got[2], colour)
-
-
-@pytest.mark.parametrize("suffix", ["las", "laz"])
-def test_parts_of_any_size_read_apart_give_same_points(tmp_path, suffix):
-    path = write_cloud(tmp_path / f"a.{suffix}", some_points(), np.arange(N) % 30)
-    cloud, whole = inspect(path), joined(path, drop=())
+    path = write_cloud(tmp_path / f"a.{suffix}", xyz, kind, colour=colour)
+    cloud, whole = inspect(path), joined(path)
+    assert np.abs(whole[0] - xyz).max() < 1e-6
+    for got, expected in zip(whole[1:], (kind, colour), strict=True):
+        np.testing.assert_array_equal(got, expected)
+    for size in (50_000, 7919):
+        for got, expected in zip(joined(path, size=size), whole, strict=True):
+            np.testing.assert_array_equal(got, expected)
     for size in (7919, 60_000, 10**6):
         parts = cloud.parts(size)
         assert np.array_equal(np.concatenate(parts), np.arange(N))
@@ -68,7 +65,7 @@ def test_chunks_drop_noise_and_withheld_points(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
-@pytest.mark.parametrize("part", [0.0, 0.0001, 0.3, 0.7, 0.999])
+@pytest.mark.parametrize("part", [0.0, 0.0001, 0.3, 0.999])
 def test_truncated_file_raises_one_line(tmp_path, suffix, part):
     path = write_cloud(tmp_path / f"a.{suffix}", some_points())
     whole = path.read_bytes()
@@ -93,23 +90,6 @@ def test_damaged_bytes_raise_error(tmp_path, part):
     assert inspect(path).points == N
     with pytest.raises(CatalogError, match=r"a\.laz (is damaged|cannot be read).*; download it again"):
         list(chunks(path))
-
-
-def test_points_outside_header_bounds_raise_error(tmp_path):
-    xyz = some_points(100)
-    path = write_cloud(tmp_path / "a.las", xyz)
-
-    def spoil(value):
-        spoiled, east = bytearray(path.read_bytes()), 179
-        spoiled[east : east + 8] = np.float64(value).tobytes()
-        path.write_bytes(spoiled)
-
-    spoil(xyz[:, 0].max() - 200)
-    with pytest.raises(CatalogError, match=r"a\.las is damaged: its header gives .* download it again"):
-        list(chunks(path))
-    spoil(np.nan)
-    with pytest.raises(CatalogError, match=r"a\.las is damaged: its header gives no bounds"):
-        inspect(path)
 
 
 def test_inspect_not_a_cloud_raises_error(tmp_path):

@@ -1,5 +1,7 @@
-"""Rasters without heights or without a place are named, by `flexroad catalog` and by the tile's load."""
+"""Rasters without heights or a place are named by `flexroad catalog` and by `load`; messages of GDAL."""
 
+import subprocess
+import sys
 from datetime import UTC, datetime
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 import rasterio
 
 from flexroad.catalog import CatalogError, Grid, Layer, Tile
+from flexroad.catalog.scan.rasters import quiet
 from flexroad.catalog.sources import rasters
 from flexroad.tasks import TaskError
 from flexroad.tasks.load import Options, load
@@ -17,10 +20,9 @@ HEIGHTS = np.full((20, 20), 100, np.float32)
 
 
 def bands(path, count, dtype="uint8", **profile):
-    profile |= {"count": count, "dtype": dtype, "width": 20, "height": 20, "crs": UTM}
-    with rasterio.open(path, "w", driver="GTiff", transform=GRID.transform, **profile) as raster:
-        raster.write(np.ones((count, 20, 20), dtype))
-        if "photometric" in profile and count == 1:
+    write(path, np.ones((20, 20), dtype), count=count, **profile)
+    if profile.get("photometric") == "PALETTE":
+        with rasterio.open(path, "r+") as raster:
             raster.write_colormap(1, {0: (0, 0, 0), 1: (9, 9, 9)})
 
 
@@ -41,7 +43,7 @@ def refused(root, name, match):
         (
             3,
             {"photometric": "RGB"},
-            r"has 3 bands \(red, green, blue\), but heights are one; keep theirs with",
+            r"has 3 bands \(red, green, blue\), but heights are one; keep theirs",
         ),
         (2, {"photometric": "MINISBLACK"}, r"has 2 bands \(gray, undefined\), but heights are one"),
         (1, {"photometric": "PALETTE"}, "has a palette of colours, no heights; give a raster of heights"),
@@ -54,16 +56,9 @@ def test_raster_without_heights_is_refused(tmp_path, count, more, match):
     refused(tmp_path, "a.tif", match)
 
 
-def test_alpha_band_and_mask_are_no_heights(tmp_path):
+def test_alpha_band_is_no_height_and_bands_described_as_road_height_are_heights(tmp_path):
     write(tmp_path / "dtm.tif", HEIGHTS)
-    bands(tmp_path / "a.tif", 2, "uint8", photometric="MINISBLACK", alpha="YES")
-    (tile,) = rasters.index(tmp_path, {"dsm": "a.tif", "dtm": "dtm.tif"}, tile_size_m=20, min_cover=0).tiles
-    assert tile.layer("dsm").files == ("a.tif",)
-
-
-def test_bands_described_as_road_height_have_heights(tmp_path):
-    for name in ("dsm.tif", "dtm.tif"):
-        write(tmp_path / name, HEIGHTS)
+    bands(tmp_path / "dsm.tif", 2, "uint8", photometric="MINISBLACK", alpha="YES")
     bands(tmp_path / "road_height.tif", 3, "float32")
     patterns = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_height": "road_height.tif"}
     with pytest.raises(CatalogError, match="road_height.*has 3 bands"):
@@ -81,7 +76,7 @@ def test_bands_described_as_road_height_have_heights(tmp_path):
         ("295500, 1, 0, 5629500, 0, 0", "has cells of 1 x 0; give it"),
         (
             "nan, 1, 0, 5629500, 0, -1",
-            "has the origin nan, 5.6295e.06 and cells of 1 x -1, which is no place",
+            "has the origin nan, 5.6295e.06 and cells of 1 x -1, which is no",
         ),
         ("295500, 1, 0, inf, 0, -1", "has the origin 295500, inf and cells of"),
         ("295500, inf, 0, 5629500, 0, -1", "has the origin .* and cells of inf x -1, which is no place"),
@@ -91,12 +86,48 @@ def test_bands_described_as_road_height_have_heights(tmp_path):
 def test_raster_at_no_place_is_refused(tmp_path, numbers, match):
     write(tmp_path / "dtm.tif", HEIGHTS)
     place = f"<SRS>{UTM}</SRS><GeoTransform>{numbers}</GeoTransform>"
-    write(
-        tmp_path / "a.png",
-        HEIGHTS.astype(np.uint8),
-        driver="PNG",
-        crs=None,
-        transform=rasterio.Affine.identity(),
-    )
+    nowhere = {"crs": None, "transform": rasterio.Affine.identity()}
+    write(tmp_path / "a.png", HEIGHTS.astype(np.uint8), driver="PNG", **nowhere)
     (tmp_path / "a.png.aux.xml").write_text(f"<PAMDataset>{place}</PAMDataset>")
     refused(tmp_path, "a.png", match)
+
+
+VRT = b"""<VRTDataset rasterXSize="9" rasterYSize="9">
+<VRTRasterBand dataType="\xff" band="1"/></VRTDataset>"""
+READ = """
+import sys, rasterio
+from flexroad.catalog.scan.rasters import quiet
+try:
+    with quiet(), rasterio.open(sys.argv[1]):
+        pass
+except (rasterio.RasterioIOError, UnicodeDecodeError):
+    print("refused")
+"""
+
+
+def test_message_that_is_no_text_prints_nothing(tmp_path):
+    (tmp_path / "a.vrt").write_bytes(VRT)
+    words = (sys.executable, "-c", READ, tmp_path / "a.vrt")
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("refused\n", "")
+
+
+def test_other_errors_are_still_printed(monkeypatch):
+    seen = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda event: seen.append(event.exc_type))
+    monkeypatch.setattr(sys, "excepthook", lambda kind, value, trace: seen.append(kind))
+    before = sys.unraisablehook, sys.excepthook
+
+    class Fails:
+        def __del__(self):
+            raise UnicodeDecodeError("utf-8", b"\xff", 0, 1, "no text")
+
+    with quiet(), quiet():
+        assert (sys.unraisablehook, sys.excepthook) != before
+        Fails()
+        sys.excepthook(KeyError, KeyError("a"), None)
+        with pytest.raises(UnicodeDecodeError) as error:
+            b"\xff".decode()
+        sys.excepthook(UnicodeDecodeError, error.value, error.tb)
+    assert seen == [UnicodeDecodeError, KeyError, UnicodeDecodeError]
+    assert (sys.unraisablehook, sys.excepthook) == before

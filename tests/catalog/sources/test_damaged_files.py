@@ -1,6 +1,7 @@
 """Surveys with one damaged file: it is left out with a line, and the catalog has all others."""
 
 import contextlib
+import os
 import re
 import shutil
 import struct
@@ -25,6 +26,7 @@ SIDE = 32
 """Cells of a file along an axis, one tile."""
 BAD = "4.tif"
 PATTERNS = {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif"}
+ONES = np.ones((SIDE, SIDE), np.float32)
 GEO_KEYS, PIXEL_SCALE, TIE_POINT = 34735, 33550, 33922
 
 
@@ -62,42 +64,49 @@ def overwritten(path: Path, position: int, new: bytes) -> None:
         file.write(new)
 
 
-def in_other_place(path: Path, place: bytes) -> None:
+def with_tag(path: Path, number: int, skipped: int, values: bytes) -> None:
+    """Overwrite the values of a tag after the first bytes."""
+    overwritten(path, tag(path.read_bytes(), number)[0] + skipped, values)
+
+
+def replaced(path: Path, target: str) -> None:
+    """Put a folder, or a link to a file, in the place of a file."""
     path.unlink()
-    path.symlink_to(place.decode())
-
-
-def with_keys(path: Path, values: bytes) -> None:
-    """Overwrite the geographic keys after their header."""
-    overwritten(path, tag(path.read_bytes(), GEO_KEYS)[0] + 8, values)
-
-
-def with_scale(path: Path, metres: float) -> None:
-    overwritten(path, tag(path.read_bytes(), PIXEL_SCALE)[0], struct.pack("<2d", metres, metres))
-
-
-def with_origin(path: Path, east: float) -> None:
-    overwritten(path, tag(path.read_bytes(), TIE_POINT)[0] + 24, struct.pack("<d", east))
-
-
-def as_folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
+    path.symlink_to(target) if target else path.mkdir()
 
 
 DAMAGES = {
     "empty": (lambda path: path.write_bytes(b""), "it cannot be read: it is no GeoTIFF"),
-    "truncated": (lambda path: path.write_bytes(path.read_bytes()[:100]), "not a raster that GDAL can read"),
+    "truncated": (lambda path: os.truncate(path, 100), "not a raster that GDAL can read"),
     "zeros": (lambda path: overwritten(path, 0, bytes(path.stat().st_size)), "it cannot be read"),
     "header": (lambda path: overwritten(path, 4, b"\xff" * 60), "not a raster that GDAL can read"),
-    "keys of zeros": (lambda path: with_keys(path, bytes(24)), "it has no CRS; give it with --crs"),
-    "huge cells": (lambda path: with_scale(path, 1e6), r"it has cells of 1e\+06 m, while most .* 1 m;"),
-    "tiny cells": (lambda path: with_scale(path, 1e-9), "it has cells of 1e-09 x -1e-09"),
-    "far away": (lambda path: with_origin(path, 1e300), "it reaches from 1e"),
-    "folder": (as_folder, "it is not a regular file"),
-    "link to nothing": (lambda path: in_other_place(path, b"gone.tif"), "it cannot be read: No such file"),
-    "link to itself": (lambda path: in_other_place(path, BAD.encode()), "it cannot be read: Too many levels"),
+    "keys of zeros": (
+        lambda path: with_tag(path, GEO_KEYS, 8, bytes(24)),
+        "it has no CRS; give it with --crs",
+    ),
+    "huge cells": (
+        lambda path: with_tag(path, PIXEL_SCALE, 0, struct.pack("<2d", 1e6, 1e6)),
+        r"it has cells of 1e\+06 m, while most .* 1 m;",
+    ),
+    "tiny cells": (
+        lambda path: with_tag(path, PIXEL_SCALE, 0, struct.pack("<2d", 1e-9, 1e-9)),
+        "it has cells of 1e-09 x -1e-09",
+    ),
+    "far away": (lambda path: with_tag(path, TIE_POINT, 24, struct.pack("<d", 1e300)), "it reaches from 1e"),
+    "folder": (lambda path: replaced(path, ""), "it is not a regular file"),
+    "link to nothing": (lambda path: replaced(path, "gone.tif"), "it cannot be read: No such file"),
+    "link to itself": (lambda path: replaced(path, BAD), "it cannot be read: Too many levels"),
     "side-car": (lambda path: path.with_name(f"{BAD}.ovr").write_bytes(b"damaged"), "it has the side-car"),
+    "other zone": (
+        lambda path: write(path, ONES, 1e8, 9e7, crs="EPSG:25833"),
+        "in EPSG:25833 it has no position in EPSG:25832, the CRS of the dsm; "
+        "correct its CRS with `gdal_edit.py -a_srs`$",
+    ),
+    "degrees": (
+        lambda path: write(path, ONES, 1e7, 9e7, crs="EPSG:4326"),
+        "it has the CRS EPSG:4326, but 10000032 is no longitude; "
+        "give its CRS with --crs, or declare it with gdal_edit.py -a_srs$",
+    ),
 }
 
 
@@ -135,35 +144,8 @@ def test_survey_with_a_randomly_damaged_file_has_a_catalog_of_the_others(survey,
     assert len(result.tiles) < 30
 
 
-def test_survey_without_any_crs_is_refused(survey):
-    for path in (survey / "dsm").iterdir():
-        with_keys(path, bytes(24))
-    with pytest.raises(CatalogError, match=r"no usable file for --dsm .* it has no CRS; give it with --crs"):
-        index(survey, PATTERNS, tile_size_m=SIDE)
-    assert len(index(survey, PATTERNS, crs=UTM, tile_size_m=SIDE).tiles) == 9
-
-
-def test_file_whose_place_is_not_in_the_crs_of_the_others_is_left_out(survey):
-    write(survey / "dsm" / BAD, np.ones((SIDE, SIDE), np.float32), 1e8, 9e7, crs="EPSG:25833")
-    result = index(survey, PATTERNS, tile_size_m=SIDE)
-    assert result.left_out == (
-        f"skipped dsm/{BAD} (dsm): in EPSG:25833 it has no position in EPSG:25832, the CRS of the dsm; "
-        "correct its CRS with `gdal_edit.py -a_srs`",
-    )
-    assert len(result.tiles) == 8
-
-
-def test_file_in_degrees_with_metres_is_left_out(survey):
-    write(survey / "dsm" / BAD, np.ones((SIDE, SIDE), np.float32), 1e7, 9e7, crs="EPSG:4326")
-    result = index(survey, PATTERNS, tile_size_m=SIDE)
-    assert result.left_out == (
-        f"skipped dsm/{BAD} (dsm): it has the CRS EPSG:4326, but 10000032 is no longitude; "
-        "give its CRS with --crs, or declare it with gdal_edit.py -a_srs",
-    )
-    assert len(result.tiles) == 8
-
-
-def test_vrt_is_left_out_and_the_remedy_named(survey):
+def test_vrt_is_left_out_with_the_remedy_and_a_folder_is_passed_over(survey):
+    (survey / "dsm" / "old").mkdir()
     (survey / "dsm" / "more.vrt").write_text("<VRTDataset></VRTDataset>")
     result = index(survey, {**PATTERNS, "dsm": "dsm/*"}, tile_size_m=SIDE)
     (line,) = result.left_out
@@ -173,47 +155,39 @@ def test_vrt_is_left_out_and_the_remedy_named(survey):
     assert len(result.tiles) == 9
 
 
-def test_folder_that_matches_a_pattern_without_suffix_is_passed_over(survey):
-    (survey / "dsm" / "old").mkdir()
-    assert not index(survey, {**PATTERNS, "dsm": "dsm/*"}, tile_size_m=SIDE).left_out
+@contextlib.contextmanager
+def forbidden(folder: Path, mode: int = 0):
+    """Take all permissions of a folder away, or leave those of ``mode``."""
+    folder.chmod(mode)
+    with permissions_enforced():
+        yield
+    folder.chmod(0o755)
 
 
 @pytest.mark.parametrize("pattern", ["dsm/*.tif", "dsm/**/*.tif", "*sm/*.tif"])
 def test_file_and_folder_without_permission_are_left_out(survey, pattern):
-    (survey / "dsm" / BAD).chmod(0)
     patterns = {**PATTERNS, "dsm": pattern}
-    with permissions_enforced():
+    with forbidden(survey / "dsm" / BAD):
         result = index(survey, patterns, tile_size_m=SIDE)
-        assert result.left_out == (f"skipped dsm/{BAD} (dsm): it cannot be read: Permission denied",)
-        assert len(result.tiles) == 8
-        with forbidden(survey / "dsm"), pytest.raises(CatalogError, match="folder dsm .* Permission denied"):
-            index(survey, patterns, tile_size_m=SIDE)
+    assert result.left_out == (f"skipped dsm/{BAD} (dsm): it cannot be read: Permission denied",)
+    assert len(result.tiles) == 8
+    with forbidden(survey / "dsm"), pytest.raises(CatalogError, match="folder dsm .* Permission denied"):
+        index(survey, patterns, tile_size_m=SIDE)
 
 
-def test_one_of_two_folders_without_permission_is_left_out(survey):
+@pytest.mark.parametrize(("mode", "what"), [(0o000, "folder more "), (0o600, "more/0.tif, more/1.tif ")])
+def test_one_of_two_folders_without_permission_is_left_out(survey, mode, what):
     (survey / "more").mkdir()
     for number in (0, 1):
         (survey / "dsm" / f"{number}.tif").rename(survey / "more" / f"{number}.tif")
     patterns = {**PATTERNS, "dsm": "[dm][so]*/*.tif"}
     assert len(index(survey, patterns, tile_size_m=SIDE).tiles) == 9
-    with permissions_enforced():
-        for mode in (0o000, 0o600):
-            with forbidden(survey / "more", mode):
-                result = index(survey, patterns, tile_size_m=SIDE)
-            assert len(result.tiles) == 7
-            (line,) = result.left_out
-            assert line.startswith("skipped folder more " if not mode else "skipped more/0.tif, more/1.tif ")
-            assert line.endswith("it cannot be read: Permission denied")
-
-
-@contextlib.contextmanager
-def forbidden(folder: Path, mode: int = 0):
-    """Take all permissions of a folder away, or leave those of ``mode``."""
-    folder.chmod(mode)
-    try:
-        yield
-    finally:
-        folder.chmod(0o755)
+    with forbidden(survey / "more", mode):
+        result = index(survey, patterns, tile_size_m=SIDE)
+    assert len(result.tiles) == 7
+    (line,) = result.left_out
+    assert line.startswith(f"skipped {what}")
+    assert line.endswith("it cannot be read: Permission denied")
 
 
 def test_damaged_file_of_roads_is_left_out(survey):
@@ -229,23 +203,6 @@ def test_damaged_file_of_roads_is_left_out(survey):
     damaged, far = result.left_out
     assert damaged.startswith(f"skipped --roads {survey / 'r1.gpkg'} is not a vector file")
     assert far.startswith(f"skipped --roads {survey / 'r9.gpkg'} reaches no tile")
-
-
-def test_damaged_download_of_nrw_is_left_out(tmp_path):
-    heights = np.ones((50, 50), np.float32)
-    for product in ("dom1", "dgm1"):
-        for east in (356, 357):
-            write(tmp_path / f"{product}_32_{east}_5699_1_nw_2020.tif", heights, east * 1000, 5700000)
-    name = "dom1_32_356_5699_1_nw_2020.tif"
-    for make, reason in (
-        (lambda path: overwritten(path, 4, b"\xff" * 60), "not a raster"),
-        (as_folder, "it is"),
-    ):
-        make(tmp_path / name)
-        result = nrw.index(tmp_path, tile_size_m=50)
-        assert [tile.id for tile in result.tiles] == ["357000_5699950"]
-        (line,) = result.left_out
-        assert line.startswith(f"skipped {name} (dsm): {reason}")
 
 
 def test_damaged_bridge_raster_beside_the_catalog_is_made_anew(tmp_path):

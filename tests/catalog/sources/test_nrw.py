@@ -1,19 +1,19 @@
 import gzip
-import os
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from affine import Affine
 from hypothesis import given
 from hypothesis import strategies as st
+from shapely import box
 
 from flexroad.catalog import CatalogError
 from flexroad.catalog.sources.nrw import index, parse
 from flexroad.tasks.load import Options, load
+from tests.make_clouds import write_cloud
 from tests.make_rasters import UTM, write, write_xyz
+from tests.make_roads import write as write_roads
 
 WEST, NORTH = 356000, 5700000
 
@@ -22,42 +22,28 @@ def heights(rows=500, columns=500):
     return np.random.default_rng(0).uniform(87, 168, (rows, columns)).astype(np.float32)
 
 
-def packed(path: Path, values, west=WEST, north=NORTH) -> Path:
-    """Write a gzipped XYZ file, as the state delivers it."""
-    plain = write_xyz(path.with_suffix(""), values, west, north)
-    path.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
-    plain.unlink()
-    return path
+SQUARE = (356e3, 5699e3, 357e3, 5700e3)
 
 
 @pytest.mark.parametrize(
-    ("name", "layer", "square", "year"),
+    ("name", "expected"),
     [
-        ("dom1_32_356_5699_1_nw_2020.tif", "dsm", (356e3, 5699e3, 357e3, 5700e3), 2020),
-        ("dom1_32_356_5699_1_nw.xyz.gz", "dsm", (356e3, 5699e3, 357e3, 5700e3), 0),
-        ("dgm1_32_280_5652_2_nw.xyz", "dtm", (280e3, 5652e3, 282e3, 5654e3), 0),
-        ("dop10rgbi_32_356_5699_1_nw_2021.jp2", "dop", (356e3, 5699e3, 357e3, 5700e3), 2021),
-        ("3dm_32_356_5699_1_nw.laz", None, (356e3, 5699e3, 357e3, 5700e3), 0),
-        ("DGM1_32_356_5699_1_NW_2022.TIF", "dtm", (356e3, 5699e3, 357e3, 5700e3), 2022),
+        ("dom1_32_356_5699_1_nw_2020.tif", ("dsm", SQUARE, 2020)),
+        ("dom1_32_356_5699_1_nw.xyz.gz", ("dsm", SQUARE, 0)),
+        ("dgm1_32_280_5652_2_nw.xyz", ("dtm", (280e3, 5652e3, 282e3, 5654e3), 0)),
+        ("dop10rgbi_32_356_5699_1_nw_2021.jp2", ("dop", SQUARE, 2021)),
+        ("3dm_32_356_5699_1_nw.laz", (None, SQUARE, 0)),
+        ("DGM1_32_356_5699_1_NW_2022.TIF", ("dtm", SQUARE, 2022)),
+        ("dom1_32_356_5699_1_nw_2020.tif.aux.xml", None),
+        ("dom1_33_356_5699_1_nw_2020.tif", None),
+        ("dom1_32_356_5699_1_he_2020.tif", None),
+        ("dom1_32_356_5699_1_nw_2020.csv", None),
+        ("dom_356.tif", None),
     ],
 )
-def test_parse_name_gives_layer_square_and_year(name, layer, square, year):
+def test_parse_name_gives_layer_square_and_year(name, expected):
     download = parse(Path("below") / name)
-    assert (download.layer, download.square, download.year) == (layer, square, year)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "dom1_32_356_5699_1_nw_2020.tif.aux.xml",
-        "dom1_33_356_5699_1_nw_2020.tif",
-        "dom1_32_356_5699_1_he_2020.tif",
-        "dom1_32_356_5699_1_nw_2020.csv",
-        "dom_356.tif",
-    ],
-)
-def test_parse_other_name_returns_none(name):
-    assert parse(Path(name)) is None
+    assert (download and (download.layer, download.square, download.year)) == expected
 
 
 @given(st.integers(100, 999), st.integers(1000, 9999), st.sampled_from(["dom1", "dgm1", "dop10rgbi", "3dm"]))
@@ -70,13 +56,11 @@ def test_index_square_gives_tiles_of_250_m(tmp_path):
     """DSM as GeoTIFF, DTM as gzipped XYZ without a CRS, DOP as JP2 of four bands."""
     dom, dgm = heights(), heights() - 10
     write(tmp_path / "dom" / "dom1_32_356_5699_1_nw_2020.tif", dom, WEST, NORTH)
-    packed(tmp_path / "dgm1_32_356_5699_1_nw.xyz.gz", dgm)
-    rgbi = np.random.default_rng(1).integers(0, 255, (4, 500, 500), dtype=np.uint8)
-    form = {"count": 4, "dtype": "uint8", "width": 500, "height": 500, "crs": UTM}
-    place = Affine(1, 0, WEST, 0, -1, NORTH)
+    plain = write_xyz(tmp_path / "dgm1_32_356_5699_1_nw.xyz", dgm, WEST, NORTH)
+    Path(f"{plain}.gz").write_bytes(gzip.compress(plain.read_bytes()))
+    plain.unlink()
     photo = tmp_path / "dop10rgbi_32_356_5699_1_nw_2021.jp2"
-    with rasterio.open(photo, "w", driver="JP2OpenJPEG", transform=place, **form) as dst:
-        dst.write(rgbi)
+    write(photo, np.ones((500, 500), np.uint8), WEST, NORTH, driver="JP2OpenJPEG", count=4)
     (tmp_path / "dom" / "dom1_nw.csv").write_text("metadata")
     before = sorted(tmp_path.rglob("*"))
     result = index(tmp_path)
@@ -97,31 +81,6 @@ def test_index_square_gives_tiles_of_250_m(tmp_path):
     assert np.array_equal(data.dsm, dom[:250, :250].astype(np.float64))
     assert np.allclose(data.dtm, dgm[:250, :250], atol=0.0051)
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_index_several_years_uses_newest(tmp_path):
-    for year in (2016, 2022, 2019):
-        write(tmp_path / f"dom1_32_356_5699_1_nw_{year}.tif", np.full((250, 250), year - 2000.0), WEST, NORTH)
-    write(tmp_path / "dgm1_32_356_5699_1_nw_2016.tif", np.zeros((250, 250)), WEST, NORTH)
-    result = index(tmp_path)
-    (tile,) = result.tiles
-    assert tile.datetime.year == 2022
-    assert (load(tile, Options()).dsm == 22).all()
-    (note,) = (note for note in result.notes if "same ground" in note)
-    assert note.startswith(
-        "dsm: 3 pairs of files cover the same ground; by the dates in their names, "
-        "dom1_32_356_5699_1_nw_2022.tif is used before "
-    )
-
-
-def test_index_files_of_unknown_age_that_differ_are_refused(tmp_path):
-    for folder, height in (("a", 20.0), ("b", 21.0)):
-        path = tmp_path / folder / "dom1_32_356_5699_1_nw.tif"
-        write(path, np.full((250, 250), height), WEST, NORTH)
-        os.utime(path, (1.7e9, 1.7e9))
-    write(tmp_path / "dgm1_32_356_5699_1_nw_2016.tif", np.zeros((250, 250)), WEST, NORTH)
-    with pytest.raises(CatalogError, match="dsm: a/dom1_32_356_5699_1_nw.tif and b/.* cover the same ground"):
-        index(tmp_path)
 
 
 def test_index_date_tag_in_year_of_name_is_used(tmp_path):
@@ -152,11 +111,13 @@ def test_index_unusable_files_are_left_out(tmp_path):
     assert result.tiles[0].layer("dsm").files == ("dom1_32_356_5699_1_nw_2020.tif",)
 
 
-def test_index_road_mask_pattern_adds_layer(tmp_path):
+def test_index_road_mask_and_roads_add_layers(tmp_path):
     write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     write(tmp_path / "atkis.tif", np.full((250, 250), 3, np.uint8), WEST, NORTH)
     mask = index(tmp_path, road_mask="atkis.tif", road_values=(3, 4)).tiles[0].layer("road_mask")
     assert (mask.files, mask.values) == (("atkis.tif",), (3, 4))
+    write_roads(tmp_path / "r.gpkg", [box(WEST, NORTH - 200, WEST + 100, NORTH - 100)], UTM)
+    assert index(tmp_path, roads="r.gpkg").tiles[0].layer("roads").files == ("r.gpkg",)
     with pytest.raises(CatalogError, match="no file matches --road-mask 'osm.tif'"):
         index(tmp_path, road_mask="osm.tif")
 
@@ -171,33 +132,22 @@ def test_index_folder_without_dsm_raises_error(tmp_path):
         index(tmp_path / "nowhere")
 
 
-def cloud(path: Path, x, y, z, classes) -> Path:
-    """Write a classified point cloud in centimetres, as the state delivers it."""
-    import laspy
-
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales, header.offsets = [0.01] * 3, [WEST, NORTH - 1000, 0]
-    points = laspy.LasData(header)
-    points.x, points.y, points.z = (np.asarray(axis) for axis in (x, y, z))
-    points.classification = np.asarray(classes, np.uint8)
-    points.write(path)
-    return path
-
-
 def test_index_bridge_points_extend_reference(tmp_path):
-    """The reference is the DTM with the mean of class 17 per cell; the DTM itself does not change."""
+    """The reference is the DTM with the newest mean of class 17 per cell; the DTM itself does not change."""
     root, derived = tmp_path / "nrw", tmp_path / "derived"
     dgm = heights(250, 250)
     write(root / "dom1_32_356_5699_1_nw_2020.tif", dgm + 5, WEST, NORTH)
     write(root / "dgm1_32_356_5699_1_nw_2020.tif", dgm, WEST, NORTH)
     x = WEST + np.array([10.2, 10.8, 20.5, 30.5])
     y = NORTH - np.array([5.5, 5.5, 7.5, 8.5])
-    cloud(root / "3dm_32_356_5699_1_nw.laz", x, y, [200.0, 201.0, 202.0, 203.0], [17, 17, 2, 17])
+    points = np.stack([x, y, [200.0, 201.0, 202.0, 203.0]], axis=1)
+    write_cloud(root / "3dm_32_356_5699_1_nw.laz", points + np.array([0, 0, 9]), [17, 17, 2, 17])
+    write_cloud(root / "3dm_32_356_5699_1_nw_2022.laz", points, [17, 17, 2, 17])
     result = index(root, derived=derived)
     assert result.notes == ()
     (tile,) = result.tiles
-    raster = derived / "3dm_32_356_5699_1_nw_bridges.tif"
-    assert tile.layer("bridges").files == (str(raster),)
+    raster = derived / "3dm_32_356_5699_1_nw_2022_bridges.tif"
+    assert tile.layer("bridges").files == (str(raster), str(derived / "3dm_32_356_5699_1_nw_bridges.tif"))
     data = load(tile, Options())
     truth = dgm.astype(np.float64)
     truth[5, 10], truth[8, 30] = 200.5, 203.0
@@ -211,7 +161,7 @@ def test_index_bridge_points_extend_reference(tmp_path):
 def test_index_cloud_without_bridges_or_broken_keeps_tile(tmp_path):
     write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     write(tmp_path / "dgm1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
-    cloud(tmp_path / "3dm_32_356_5699_1_nw_2020.laz", [WEST + 1.0], [NORTH - 1.0], [100.0], [2])
+    write_cloud(tmp_path / "3dm_32_356_5699_1_nw_2020.laz", [WEST + 1.0, NORTH - 1.0, 100.0], 2)
     bad = tmp_path / "3dm_32_356_5699_1_nw_2021.laz"
     bad.write_bytes(b"points")
     result = index(tmp_path, derived=tmp_path / "derived")

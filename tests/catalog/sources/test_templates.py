@@ -89,15 +89,12 @@ def test_read_folder_not_matching_layout_raises_error(tmp_path):
         index(tmp_path, {"layers": TWO | {"dsm": "{tile}.tif"}}, DSC3D)
     with pytest.raises(CatalogError, match="is not a path below"):
         index(tmp_path, {"layers": TWO | {"dsm": "/{tile}.tif"}}, DSC3D)
+    write_tiles(tmp_path / "feet", crs="EPSG:2994")
+    with pytest.raises(CatalogError, match="whose unit is feet; reproject"):
+        index(tmp_path / "feet", {"layers": TWO}, DSC3D)
     both = {"dsm": "urban/{tile}/d*.tif", "dtm": "urban/{tile}/dtm_*.tif"}
     with pytest.raises(CatalogError, match=r"dsm.tif and .*dtm_2020.tif are both the dsm of tile 295500"):
         index(tmp_path, {"layers": both}, DSC3D)
-
-
-def test_read_crs_in_feet_raises_error(tmp_path):
-    write_tiles(tmp_path, crs="EPSG:2994")
-    with pytest.raises(CatalogError, match="whose unit is feet; reproject"):
-        index(tmp_path, {"layers": TWO}, DSC3D)
 
 
 def test_gerod_tile_not_at_its_id_is_noted(tmp_path):

@@ -1,13 +1,15 @@
-"""Lists of files in buckets: the same as those of the folders, at a memory that does not grow."""
+"""Settings of buckets, and lists of their files: as those of folders, at a memory that does not grow."""
 
 import tracemalloc
 from types import SimpleNamespace
 
 import pytest
 
+from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.buckets import ListedFiles, StatCache
-from flexroad.catalog.storage.paths import FileStat
+from flexroad.catalog.storage.paths import FileStat, parse_location
+from flexroad.catalog.storage.settings import gdal_options, s3_options
 
 PAGE, PAGES = 1000, 100
 
@@ -43,11 +45,7 @@ def test_files_of_many_pages_are_kept_outside_memory():
     assert listed.files("012345") == {f"file_{number}": FileStat(size, "abc") for number in range(5)}
     assert listed.get("019999", "file_4") == FileStat(size, "abc")
     assert listed.get("019999", "file_5") is None
-    assert listed.files("020000") == {}
-
-
-def test_listing_of_missing_folder_is_empty():
-    assert ListedFiles().files("a") == {}
+    assert listed.files("020000") == ListedFiles().files("a") == {}
 
 
 @pytest.mark.slow
@@ -72,9 +70,42 @@ def test_entries_of_bucket_equal_files_written(bucket):
 
 
 @pytest.mark.slow
-def test_stat_cache_of_bucket_equals_stat(bucket):
+def test_stat_cache_of_bucket_equals_stat_and_lists_a_folder_once(bucket, storage):
     for name in ("a/b", "a/c", "d"):
         paths.write(bucket / name, name.encode())
     stat_of = StatCache()
     for name in ("a/b", "a/c", "d", "a/none", "none/a"):
         assert stat_of(bucket / name) == paths.stat(bucket / name)
+    storage.requests()
+    stat_of = StatCache()
+    assert stat_of(bucket / "a" / "b")
+    assert stat_of(bucket / "a" / "c")
+    assert len(storage.requests()) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("AWS_ENDPOINT_URL", "localhost:9000"),
+        ("AWS_ENDPOINT_URL_S3", "localhost"),
+        ("AWS_ENDPOINT_URL", "://x"),
+        ("AWS_ENDPOINT_URL", "http://"),
+        ("AWS_ENDPOINT_URL", "ftp://a"),
+        ("AWS_ENDPOINT_URL", "http://localhost:99999"),
+        ("AWS_MAX_ATTEMPTS", "many"),
+    ],
+)
+def test_wrong_setting_gives_one_line_with_remedy_for_buckets_only(name, value, monkeypatch, tmp_path):
+    monkeypatch.setenv(name, value)
+    with pytest.raises(CatalogError, match=f"{name} is '{value}'; set it to"):
+        parse_location("s3://bucket/name")
+    assert parse_location(tmp_path) == tmp_path
+    # GDAL's options are set for files on disk, too.
+    assert "AWS_S3_ENDPOINT" not in gdal_options()
+
+
+def test_endpoint_in_upper_case_is_used(monkeypatch):
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "HTTPS://storage.example.org")
+    assert gdal_options()["AWS_HTTPS"] == "YES"
+    assert gdal_options()["AWS_S3_ENDPOINT"] == "storage.example.org"
+    assert s3_options()["endpoint_url"] == "HTTPS://storage.example.org"

@@ -1,7 +1,7 @@
-"""Files behave the same on disk and in a bucket."""
+"""Files behave the same on disk and in a bucket; links that lead out, and folders that are made."""
 
+import itertools
 import os
-import socket
 import sys
 from pathlib import Path
 
@@ -11,7 +11,9 @@ from fsspec.registry import _registry
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.buckets import StatCache
-from flexroad.catalog.storage.paths import parse_location
+from flexroad.catalog.storage.outputs import made_folder
+from flexroad.catalog.storage.paths import contained, parse_location
+from tests.builders import make_special
 from tests.s3_server import Fault
 
 
@@ -34,6 +36,11 @@ def test_written_files_can_be_listed_and_read(folder):
         assert paths.stat(folder / name) is None
         assert not paths.exists(folder / name)
     assert paths.exists(folder / "a.bin")
+    before = paths.stat(folder / "a.bin")
+    paths.write(folder / "a.bin", b"other")
+    after = paths.stat(folder / "a.bin")
+    assert before.size == after.size
+    assert before.version != after.version
 
 
 def test_visible_entry_leaves_out_hidden_and_given_names(folder):
@@ -45,15 +52,6 @@ def test_visible_entry_leaves_out_hidden_and_given_names(folder):
     assert paths.visible_entry(folder / "lock.json") is None
     paths.write(folder / "z" / "c.bin", b"x")
     assert paths.visible_entry(folder, {"lock.json"}) == "z"
-
-
-def test_changed_content_changes_version(folder):
-    paths.write(folder / "a", b"one")
-    before = paths.stat(folder / "a")
-    paths.write(folder / "a", b"two")
-    after = paths.stat(folder / "a")
-    assert before.size == after.size
-    assert before.version != after.version
 
 
 def test_missing_file_is_named_and_remove_ignores_it(folder):
@@ -104,16 +102,6 @@ def test_normalise_does_not_follow_links(tmp_path):
 
 
 @pytest.mark.slow
-def test_stat_cache_lists_bucket_folder_once(bucket, storage):
-    for i in range(20):
-        paths.write(bucket / "data" / f"{i}.tif", b"x")
-    storage.requests()
-    stat_of = StatCache()
-    assert all(stat_of(bucket / "data" / f"{i}.tif") for i in range(20))
-    assert len(storage.requests()) == 1
-
-
-@pytest.mark.slow
 def test_write_and_read_are_one_request_each(bucket, storage):
     storage.requests()
     paths.write(bucket / "a", b"x" * 1_000_000)
@@ -123,21 +111,15 @@ def test_write_and_read_are_one_request_each(bucket, storage):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("answer", ["slow", "error", "cut"])
+@pytest.mark.parametrize("answer", ["slow", "error", "cut", "half"])
 def test_storage_fails_twice_request_is_retried(bucket, storage, answer):
-    storage.fail(Fault(answer, first=2))
-    paths.write(bucket / "a" / "b", b"whole")
-    assert paths.read(bucket / "a" / "b") == b"whole"
-    assert paths.stat(bucket / "a" / "b").size == 5
-    assert list(paths.listing(bucket)) == ["a/b"]
-
-
-@pytest.mark.slow
-def test_read_truncated_answer_is_retried(bucket, storage):
     data = bytes(range(256)) * 1000
-    paths.write(bucket / "a", data)
-    storage.fail(Fault("half", method="GET", first=1))
-    assert paths.read(bucket / "a") == data
+    half = {"method": "GET", "first": 1} if answer == "half" else {"first": 2}
+    storage.fail(Fault(answer, **half))
+    paths.write(bucket / "a" / "b", data)
+    assert paths.read(bucket / "a" / "b") == data
+    assert paths.stat(bucket / "a" / "b").size == len(data)
+    assert list(paths.listing(bucket)) == ["a/b"]
 
 
 @pytest.mark.slow
@@ -156,32 +138,17 @@ def test_storage_always_fails_error_names_bucket(bucket, storage, answer):
         assert isinstance(caught.value, PermissionError) == (answer == "denied")
 
 
-def special(kind, tmp_path):
-    """Make something in a folder that is no regular file; never a real device."""
-    name = tmp_path / "there"
-    if kind == "pipe":
-        os.mkfifo(name)
-    elif kind == "folder":
-        name.mkdir()
-    elif kind == "loop":
-        name.symlink_to(name)
-    else:
-        with socket.socket(socket.AF_UNIX) as server:
-            server.bind(str(name))
-    return name
-
-
 @pytest.mark.parametrize(
     ("kind", "reason"),
     [
         ("pipe", "is a device, pipe or socket and is not replaced"),
         ("socket", "is a device, pipe or socket and is not replaced"),
         ("folder", "Is a directory"),
-        ("loop", "Too many levels of symbolic links"),
+        ("link to itself", "Too many levels of symbolic links"),
     ],
 )
 def test_write_does_not_replace_special_file(kind, reason, tmp_path):
-    name = special(kind, tmp_path)
+    make_special(name := tmp_path / "there", kind)
     before = name.lstat()
     with pytest.raises(OSError, match=reason) as caught:
         paths.write(name, b"new")
@@ -189,6 +156,15 @@ def test_write_does_not_replace_special_file(kind, reason, tmp_path):
     after = name.lstat()
     assert (after.st_mode, after.st_ino) == (before.st_mode, before.st_ino)
     assert list(tmp_path.iterdir()) == [name]
+
+
+def test_write_failed_keeps_existing_file(tmp_path):
+    path = tmp_path / "a" / "b.json"
+    paths.write(path, b"old")
+    with pytest.raises(TypeError):
+        paths.write(path, "not bytes")
+    assert path.read_bytes() == b"old"
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_write_through_link_keeps_link(tmp_path):
@@ -219,3 +195,66 @@ def test_pipe_is_no_file(tmp_path):
     assert paths.stat(tmp_path) is None
     with pytest.raises(IsADirectoryError):
         paths.read(tmp_path)
+
+
+PARTS = ("a", "b", "..", "file", "up", "inside", "outside", "lost", "round", "missing")
+
+
+def test_contained_takes_what_is_below_the_folder_with_all_links_resolved(tmp_path):
+    """The folder has links in it, and is behind a link; beside the literal definition."""
+    real, home = tmp_path / "real", tmp_path / "home"
+    (real / "a" / "b").mkdir(parents=True)
+    (real / "a" / "file").touch()
+    (tmp_path / "other").mkdir()
+    for link, target in {
+        real / "inside": real / "a",
+        real / "outside": tmp_path / "other",
+        real / "a" / "up": "..",
+        real / "a" / "lost": tmp_path / "missing",
+        real / "round": real / "round",
+        home: real,
+    }.items():
+        link.symlink_to(target)
+    tried = [Path(home, *parts) for count in range(4) for parts in itertools.product(PARTS, repeat=count)]
+    tried += [real / "a", tmp_path / "homes", tmp_path]
+    taken = 0
+    for path in tried:
+        below = os.path.relpath(os.path.realpath(path), os.path.realpath(home))
+        if below.split("/")[0] == "..":
+            with pytest.raises(OSError, match="a link leads to"):
+                contained(path, home)
+        else:
+            assert contained(path, home) == path
+            taken += 1
+    assert len(tried) / 4 < taken < len(tried)
+    for path in (home / "a" / "b\0", home / ".." / "\0"):
+        with pytest.raises(ValueError, match="null byte"):
+            contained(path, home)
+
+
+def test_made_folder_stays_with_its_parents(tmp_path):
+    for _ in range(2):
+        with made_folder(tmp_path / "new" / "city"):
+            assert (tmp_path / "new" / "city").is_dir()
+    assert (tmp_path / "new" / "city").is_dir()
+
+
+def fails_after(*files):
+    for file in files:
+        file.write_text("mine")
+    raise KeyboardInterrupt
+
+
+def test_made_folder_of_failed_block_is_removed_if_new_and_empty(tmp_path):
+    with pytest.raises(KeyboardInterrupt), made_folder(tmp_path / "new" / "city"):
+        fails_after()
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(KeyboardInterrupt), made_folder(tmp_path / "new" / "city"):
+        fails_after(tmp_path / "new" / "notes.txt")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["new", "notes.txt"]
+    with pytest.raises(FileExistsError, match="notes"), made_folder(tmp_path / "new" / "notes.txt"):
+        pass
+    (tmp_path / "new" / "notes.txt").unlink()
+    with pytest.raises(KeyboardInterrupt), made_folder(tmp_path / "new"):
+        fails_after()
+    assert (tmp_path / "new").is_dir()

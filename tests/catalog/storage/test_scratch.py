@@ -1,10 +1,10 @@
 """Temporary folders are removed when their process ends; those of killed processes by a later one."""
 
 import os
-import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -43,46 +43,43 @@ def test_folder_is_removed_at_the_end(temporary):
     assert names(temporary) == []
 
 
+@contextmanager
+def waiting(*parents, code=PROCESS):
+    """Start a process that has a folder; yield it with the folder's path."""
+    command = [sys.executable, "-c", code, "wait", *parents]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process, Path(process.stdout.readline().strip())
+        finally:
+            process.kill()
+
+
 def test_folder_of_killed_process_is_removed_and_that_of_living_kept(temporary):
-    process = subprocess.Popen([sys.executable, "-c", PROCESS, "wait"], stdout=subprocess.PIPE, text=True)
-    try:
-        name = process.stdout.readline().strip()
-        with ScratchFolder() as own:
-            assert remove_abandoned() == 0
-            process.send_signal(signal.SIGKILL)
-            process.wait()
-            assert list(map(str, abandoned())) == [name]
-            assert remove_abandoned() == 1
-            assert names(temporary) == [Path(own).name]
-    finally:
+    with waiting() as (process, path), ScratchFolder() as own:
+        assert remove_abandoned() == 0
         process.kill()
         process.wait()
-        process.stdout.close()
+        assert list(abandoned()) == [path]
+        assert remove_abandoned() == 1
+        assert names(temporary) == [Path(own).name]
 
 
 def test_folder_in_parent_is_hidden_and_those_of_killed_processes_are_removed(temporary):
     parent = temporary / "parent"
     parent.mkdir()
-    command = [sys.executable, "-c", PROCESS, "wait", parent]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        name = Path(process.stdout.readline().strip()).name
+    with waiting(parent) as (process, path):
         with ScratchFolder(parent) as first, ScratchFolder(parent) as second:
-            living = {Path(first).name, Path(second).name, name}
+            living = {Path(first).name, Path(second).name, path.name}
             assert set(names(parent)) == living
             assert all(hidden.startswith(".flexroad-") for hidden in living)
-        assert names(parent) == [name]
-        process.send_signal(signal.SIGKILL)
+        assert names(parent) == [path.name]
+        process.kill()
         process.wait()
         (parent / ".flexroad-before-its-lock").mkdir()
         (parent / ".flexroad-data").mkdir()
         (parent / ".flexroad-data" / "file").touch()
         with ScratchFolder(parent) as own:
             assert names(parent) == sorted([Path(own).name, ".flexroad-data"])
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
 
 
 @pytest.mark.parametrize("at", ["open", "flock", "fstat"])
@@ -132,10 +129,6 @@ def test_other_folders_and_links_are_kept(temporary):
 def test_child_without_own_folder_does_not_keep_it(temporary):
     """Programs that a process starts, and that live longer, do not inherit the lock."""
     start = "    import subprocess; subprocess.Popen(['sleep', '5'], stdout=subprocess.DEVNULL)\n"
-    code = PROCESS.replace("    print", f"{start}    print")
-    process = subprocess.Popen([sys.executable, "-c", code, "wait"], stdout=subprocess.PIPE, text=True)
-    process.stdout.readline()
-    process.kill()
-    process.wait()
-    process.stdout.close()
+    with waiting(code=PROCESS.replace("    print", f"{start}    print")):
+        pass
     assert remove_abandoned() == 1

@@ -11,6 +11,7 @@ import pytest
 from flexroad.catalog import CatalogError
 from flexroad.catalog.storage import unpack as module
 from flexroad.catalog.storage.unpack import unpack
+from tests.builders import make_special
 
 CONTENT = {"GeRoD/readme.txt": b"heights " * 40, "GeRoD/dsm/a.tif": bytes(range(256)) * 20}
 
@@ -53,74 +54,57 @@ def test_archive_is_unpacked_beside_itself_with_estimate_and_progress(tmp_path):
     assert said[1].startswith(f"{folder} is there and is read in place of GeRoD.zip")
 
 
-def half(path):
-    path.write_bytes(path.read_bytes()[:2000])
-
-
 def flipped(path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
 
 
-def outside(path):
-    zipped(path, {"GeRoD/a": b"a", "../b": b"b"})
-
-
-def absolute(path):
-    zipped(path, {"/etc/b": b"b"})
-
-
-def bomb(path):
-    zipped(path, {"a": bytes(10_000_000)}, zipfile.ZIP_DEFLATED)
+OUTSIDE = "has a file outside its folder: {}; download it again"
 
 
 @pytest.mark.parametrize(
-    ("damage", "line"),
+    ("damage", "published", "line"),
     [
-        (half, "is no complete zip file (0.00 GB); finish its download"),
-        (bomb, "times its size: it is not the dataset; download it again"),
-        (flipped, "the published file 0000; download it again, or unpack it and name the folder"),
-        (outside, "has a file outside its folder: ../b; download it again"),
-        (absolute, "has a file outside its folder: /etc/b; download it again"),
-        (lambda path: path.unlink(), "cannot be read: No such file or directory"),
-        (lambda path: path.write_bytes(b""), "is no complete zip file"),
+        (
+            lambda path: os.truncate(path, 2000),
+            "0000",
+            "is no complete zip file (0.00 GB); finish its download",
+        ),
+        (lambda path: path.write_bytes(b""), "0000", "is no complete zip file"),
+        (
+            lambda path: zipped(path, {"a": bytes(10**7)}, zipfile.ZIP_DEFLATED),
+            "0000",
+            "times its size: it is not the dataset; download it again",
+        ),
+        (flipped, "0000", "the published file 0000; download it again, or unpack it and name the folder"),
+        (flipped, "", "is damaged: Bad CRC-32 for file 'GeRoD/dsm/a.tif'; download it again"),
+        (lambda path: zipped(path, {"GeRoD/a": b"a", "../b": b"b"}), "0000", OUTSIDE.format("../b")),
+        (lambda path: zipped(path, {"/etc/b": b"b"}), "0000", OUTSIDE.format("/etc/b")),
+        (lambda path: path.unlink(), "0000", "cannot be read: No such file or directory"),
+        (lambda path: make_special(path, "pipe"), "0000", "is not a regular file; replace it by one"),
     ],
 )
-def test_wrong_archive_is_one_line_and_leaves_nothing(tmp_path, damage, line):
+def test_wrong_archive_is_one_line_and_leaves_nothing(tmp_path, damage, published, line):
+    """Where no checksum is given, the archive is damaged as published."""
     archive = zipped(tmp_path / "GeRoD.zip")
     damage(archive)
     with pytest.raises(CatalogError) as raised:
-        unpack(archive, "0000", quietly, lambda line: None)
+        unpack(archive, published or sha256(archive), quietly, lambda line: None)
     assert line in str(raised.value)
     assert str(archive) in str(raised.value)
     assert "\n" not in str(raised.value)
     assert [path.name for path in tmp_path.iterdir()] in ([], ["GeRoD.zip"])
 
 
-def test_archive_damaged_as_published_is_one_line_and_leaves_nothing(tmp_path):
-    archive = zipped(tmp_path / "GeRoD.zip")
-    flipped(archive)
-    with pytest.raises(
-        CatalogError, match="is damaged: Bad CRC-32 for file 'GeRoD/dsm/a.tif'; download it again"
-    ):
-        unpack(archive, sha256(archive), quietly, lambda line: None)
-    assert [path.name for path in tmp_path.iterdir()] == ["GeRoD.zip"]
-
-
-def test_pipe_with_the_name_of_an_archive_is_refused(tmp_path):
-    os.mkfifo(tmp_path / "GeRoD.zip")
-    with pytest.raises(CatalogError, match=r"GeRoD.zip is not a regular file; replace it by one"):
-        unpack(tmp_path / "GeRoD.zip", "0000", quietly, lambda line: None)
-
-
-def test_archive_larger_than_the_free_disk_is_refused_before_its_checksum(tmp_path, monkeypatch):
+def test_archive_too_large_for_the_disk_or_of_many_files_is_refused_first(tmp_path, monkeypatch):
     archive = zipped(tmp_path / "GeRoD.zip")
     usage = namedtuple("usage", "free")(100)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(
-        CatalogError, match=r"needs 0.00 GB, but only 0.00 GB are free in .*; move it to a larger"
-    ):
+    with pytest.raises(CatalogError, match=r"needs 0.00 GB, but only 0.00 GB are free in .*; move it to a"):
+        unpack(archive, "0000", quietly, lambda line: None)
+    monkeypatch.setattr(module, "MAX_FILES", 1)
+    with pytest.raises(CatalogError, match="in 2 files"):
         unpack(archive, "0000", quietly, lambda line: None)
 
 
@@ -130,10 +114,3 @@ def test_part_of_a_killed_command_is_replaced(tmp_path):
     (tmp_path / ".GeRoD.part" / "old").write_text("old")
     assert files(unpack(archive, sha256(archive), quietly, lambda line: None)) == CONTENT
     assert not (tmp_path / ".GeRoD.part").exists()
-
-
-def test_many_files_are_no_dataset(tmp_path, monkeypatch):
-    archive = zipped(tmp_path / "GeRoD.zip")
-    monkeypatch.setattr(module, "MAX_FILES", 1)
-    with pytest.raises(CatalogError, match="in 2 files"):
-        unpack(archive, sha256(archive), quietly, lambda line: None)

@@ -37,43 +37,40 @@ def found(tiles):
 
 
 @pytest.mark.parametrize(
-    ("dsm", "expected"),
+    ("dsm", "dtm", "expected"),
     [
-        (PLANE + 47, "the DSM lies 47.0 m above the DTM on 2 of 2 tiles: ellipsoidal heights?"),
+        (PLANE + 0.1, PLANE, ""),
+        (PLANE + 47, PLANE, "the DSM lies 47.0 m above the DTM on 2 of 2 tiles: ellipsoidal heights?"),
         (
             PLANE - 10,
+            PLANE,
             "the DSM lies 10.0 m below the DTM on 2 of 2 tiles: "
             "ellipsoidal heights, or are their files swapped?",
         ),
-        (PLANE + 20 * EAST, "the DSM lies 20.0 m above the DTM on 1 of 2 tiles: ellipsoidal heights?"),
+        (PLANE + 20 * EAST, PLANE, "the DSM lies 20.0 m above the DTM on 1 of 2 tiles: ellipsoidal heights?"),
         (
             PLANE / 0.3048,
+            PLANE,
             "the heights of the DSM are 3.28 times the DTM heights on 2 of 2 tiles: "
             "the DSM in feet, the DTM in metres?",
         ),
+        (
+            PLANE,
+            {"west": (0, PLANE[:, :60]), "east": (60, PLANE[:, 60:] + np.float32(0.4))},
+            "DSM minus DTM is -0.40 m on 1 tile (dtm east.tif) and 0.00 m on 1 tile (dtm west.tif): "
+            "files of two vertical references?",
+        ),
+        (
+            PLANE + 0.4 * EAST,
+            PLANE,
+            "DSM minus DTM is 0.00 m on 1 tile (499980_5599980) and 0.40 m on 1 tile (500040_5599980): "
+            "files of two vertical references?",
+        ),
     ],
+    ids=["clean", "above", "below", "on one tile", "feet", "step between sheets", "step in a file"],
 )
-def test_offset_or_ratio_is_one_line_with_its_number(tmp_path, dsm, expected):
-    assert said(tmp_path, dsm, PLANE) == [expected]
-
-
-def test_dsm_on_the_ground_is_clean(tmp_path):
-    assert said(tmp_path, PLANE + 0.1, PLANE) == []
-
-
-def test_step_between_sheets_names_them(tmp_path):
-    sheets = {"west": (0, PLANE[:, :60]), "east": (60, PLANE[:, 60:] + np.float32(0.4))}
-    assert said(tmp_path, PLANE, sheets) == [
-        "DSM minus DTM is -0.40 m on 1 tile (dtm east.tif) and 0.00 m on 1 tile (dtm west.tif): "
-        "files of two vertical references?"
-    ]
-
-
-def test_step_within_a_file_names_the_tiles(tmp_path):
-    assert said(tmp_path, PLANE + 0.4 * EAST, PLANE) == [
-        "DSM minus DTM is 0.00 m on 1 tile (499980_5599980) and 0.40 m on 1 tile (500040_5599980): "
-        "files of two vertical references?"
-    ]
+def test_offset_ratio_or_step_is_one_line_with_its_number(tmp_path, dsm, dtm, expected):
+    assert said(tmp_path, dsm, dtm) == ([expected] if expected else [])
 
 
 def test_heights_in_feet_are_noted_and_a_single_band_in_feet_would_fail(tmp_path):
@@ -104,6 +101,16 @@ def test_sample_has_a_tile_of_each_sheet(tmp_path, monkeypatch):
     assert line.startswith("DSM minus DTM is -0.50 m on 1 tile (dtm 2.tif) and 0.00 m on 3 tiles (")
 
 
+def with_road(folder, dsm, dtm):
+    """Return the tiles of a DSM and a DTM with a road from west to east."""
+    road = np.zeros(PLANE.shape)
+    road[26:34] = 1
+    layers = {"dsm": dsm, "dtm": dtm, "road_mask": road}
+    for name, values in layers.items():
+        write(folder / f"{name}.tif", values.astype(np.float32), WEST, NORTH)
+    return index(folder, {name: f"{name}.tif" for name in layers}, tile_size_m=60).tiles
+
+
 @pytest.mark.parametrize(
     ("step", "line"),
     [
@@ -116,13 +123,7 @@ def test_sample_has_a_tile_of_each_sheet(tmp_path, monkeypatch):
     ],
 )
 def test_run_names_a_step_between_tiles(tmp_path, flexroad, step, line):
-    write(tmp_path / "dsm.tif", PLANE, WEST, NORTH)
-    write(tmp_path / "dtm.tif", (PLANE + step * EAST).astype(np.float32), WEST, NORTH)
-    road = np.zeros(PLANE.shape, np.uint8)
-    road[26:34] = 1
-    write(tmp_path / "road.tif", road, WEST, NORTH)
-    layers = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_mask": "road.tif"}
-    Catalog(index(tmp_path, layers, tile_size_m=60).tiles).write(tmp_path / "catalog.json")
+    Catalog(with_road(tmp_path, PLANE, PLANE + step * EAST)).write(tmp_path / "catalog.json")
     run = ["run", "--catalog", tmp_path / "catalog.json", "--out", tmp_path / "run", "--executor", "serial"]
     for _ in ("computed", "up to date"):
         notes = [text for text in flexroad(*run).expected(0).err.splitlines() if text.startswith("note: ")]
@@ -131,15 +132,8 @@ def test_run_names_a_step_between_tiles(tmp_path, flexroad, step, line):
 
 def test_road_off_the_dtm_on_all_tiles_is_a_remark(tmp_path):
     """Without a step, fields of crops would be off, too, but a road is not."""
-    write(tmp_path / "dsm.tif", PLANE + np.float32(0.6), WEST, NORTH)
-    write(tmp_path / "dtm.tif", PLANE, WEST, NORTH)
-    road = np.zeros(PLANE.shape, np.uint8)
-    road[26:34] = 1
-    write(tmp_path / "road.tif", road, WEST, NORTH)
-    layers = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_mask": "road.tif"}
-    findings = list(
-        expected_failures(index(tmp_path, layers, tile_size_m=60).tiles, load_config("paper"), LAYERS)
-    )
+    tiles = with_road(tmp_path, PLANE + 0.6, PLANE)
+    findings = list(expected_failures(tiles, load_config("paper"), LAYERS))
     assert [(one.text, one.fault) for one in findings] == [
         ("the road lies 0.60 m above the DTM on 2 of 2 tiles: another vertical reference?", False)
     ]

@@ -12,10 +12,14 @@ from tests.builders import LIGHT
 
 
 @pytest.fixture
-def run(flexroad, survey, tmp_path):
+def config(tmp_path):
+    (tmp_path / "light.yaml").write_text(yaml.safe_dump(LIGHT, sort_keys=False))
+    return tmp_path / "light.yaml"
+
+
+@pytest.fixture
+def run(flexroad, survey, config, tmp_path):
     """Run the survey with a light configuration into ``tmp_path/run``."""
-    config = tmp_path / "light.yaml"
-    config.write_text(yaml.safe_dump(LIGHT, sort_keys=False))
 
     def call(*words):
         out = ("--out", tmp_path / "run", "--executor", "serial")
@@ -70,17 +74,13 @@ def test_reasons_name_changed_files_and_failures(run, reasons, survey, tmp_path)
     assert computed(run().expected(0)) == 1
 
 
-def last_line(said) -> str:
-    return said.out.splitlines()[-1]
-
-
 @pytest.mark.slow
 def test_file_that_comes_and_goes_is_told_by_dry_run_counts_and_rerun(survey, flexroad, tmp_path):
     """In production a file also belongs to the neighbours: only the tile that it lies on fails."""
     out = tmp_path / "run"
     words = ("run", "--catalog", survey, "--out", out)
     run = (*words, "--executor", "serial")
-    assert last_line(flexroad(*words, "--dry-run").expected(0)) == "expected exit code: 0"
+    assert flexroad(*words, "--dry-run").expected(0).out.splitlines()[-1] == "expected exit code: 0"
     flexroad(*run).expected(0)
     first, *others = (tile.id for tile in Catalog.read(survey).tiles)
     file = survey.parent / "dsm" / f"{first}.tif"
@@ -91,14 +91,14 @@ def test_file_that_comes_and_goes_is_told_by_dry_run_counts_and_rerun(survey, fl
     beside = f"source changed: {file}, which is missing"
     assert lines[:4] == [f"{first}: file missing: {file}", *(f"{other}: {beside}" for other in others)]
     assert lines[4] == "4 tiles: 3 source changed, 1 file missing"
-    assert last_line(dry) == "expected exit code: 1 (1 tile would fail)"
+    assert dry.out.splitlines()[-1] == "expected exit code: 1 (1 tile would fail)"
     said = flexroad(*run).expected(1)
     assert "4 tiles: 3 done (0 cached), 1 failed, 0 pending; 0 new, 4 changed, 0 vanished; " in said.out
     said = flexroad(*run).expected(1)
     assert "4 tiles: 3 done (3 cached), 1 failed, 0 pending; 0 new, 0 changed, 0 vanished; " in said.out
 
     shutil.move(kept, file)
-    assert last_line(flexroad(*words, "--dry-run").expected(0)) == "expected exit code: 0"
+    assert flexroad(*words, "--dry-run").expected(0).out.splitlines()[-1] == "expected exit code: 0"
     said = flexroad("rerun", out, "--tile", first, "--executor", "serial").expected(1)
     assert "4 tiles: 1 done (0 cached), 0 failed, 3 pending; 0 new, 4 changed, 0 vanished; " in said.out
     why = f"  {', '.join(others)}: source changed: dsm/{file.name}, which was missing"
@@ -108,7 +108,7 @@ def test_file_that_comes_and_goes_is_told_by_dry_run_counts_and_rerun(survey, fl
     ]
     assert f"{why}; `flexroad rerun {out}` computes it" in flexroad("status", out).expected(0).out
     dry = flexroad(*words, "--tile", first, "--dry-run").expected(1)
-    assert last_line(dry) == "expected exit code: 1 (3 other tiles pending or failed)"
+    assert dry.out.splitlines()[-1] == "expected exit code: 1 (3 other tiles pending or failed)"
     flexroad("rerun", out, "--executor", "serial").expected(0)
 
     (survey.parent / "dsm").rename(tmp_path / "unmounted")
@@ -140,20 +140,11 @@ def test_missing_file_that_is_back_is_no_change_of_checksum(run, reasons, survey
         (("--checksum",), "settings or version changed: --checksum"),
     ],
 )
-def test_reasons_name_the_first_stage_that_changed(made_survey, flexroad, tmp_path, words, line, light):
-    out = shutil.copytree(light, tmp_path / "run")
-    config = light.with_name("light.yaml")
-    run = ("run", "--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out, *words)
+def test_reasons_name_the_first_stage_that_changed(
+    survey, flexroad, tmp_path, words, line, light_run, config
+):
+    out = shutil.copytree(light_run.path, tmp_path / "run")
+    run = ("run", "--config", config, "--catalog", survey, "--out", out, *words)
     said = flexroad(*run, "--dry-run").expected(0).out.splitlines()
     assert [text.partition(": ")[2] for text in said[:4]] == [line] * 4
     assert computed(flexroad(*run, "--executor", "serial").expected(0)) == 4
-
-
-@pytest.fixture(scope="module")
-def light(made_survey, flexroad, tmp_path_factory):
-    """The folder of a finished run, which tests must not change."""
-    folder = tmp_path_factory.mktemp("light")
-    (folder / "light.yaml").write_text(yaml.safe_dump(LIGHT, sort_keys=False))
-    words = ("--catalog", made_survey / "catalog.parquet", "--out", folder / "run", "--executor", "serial")
-    flexroad("run", "--config", folder / "light.yaml", *words).expected(0)
-    return folder / "run"

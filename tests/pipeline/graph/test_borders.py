@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 from collections import Counter, defaultdict
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from random import Random
 
@@ -30,7 +31,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import stage_module
 from flexroad.tasks.spline.space import Lattice
 from flexroad.tools.synthetic import prepared
-from flexroad.tools.synthetic.scenes import MADE, write_scenes
+from flexroad.tools.synthetic.scenes import MADE
 
 PRODUCTION = load_config("production")
 SIZE_M = 250
@@ -109,15 +110,11 @@ def test_borders_see_as_far_as_the_halo_and_as_they_act(halo_m, spacing_m, reach
     assert BorderStages.of(config.chains["flexroad"]).reach_m == reach_m
 
 
-def touch(path):
-    os.utime(path, (1_700_000_000, 1_700_000_000))
-
-
 @CATALOGS
 def test_changed_file_changes_only_what_it_reaches(catalog_of, survey):
     """The DSM of the middle tile reaches all tiles' halos, and the borders within 100 m of it."""
     tiles, parts = names(catalog_of(survey))
-    touch(survey / "dsm" / "500250_5600250.tif")
+    os.utime(survey / "dsm" / "500250_5600250.tif", (1, 1))
     new_tiles, new_parts = names(catalog_of(survey))
     assert all(new_tiles[tile] != tiles[tile] for tile in tiles)
     changed = {part for part in parts if parts[part] != new_parts[part]}
@@ -131,7 +128,7 @@ def test_changed_file_changes_only_what_it_reaches(catalog_of, survey):
 
 def test_changed_file_at_rim_leaves_far_tiles(survey):
     tiles, parts = names(by_prepared(survey))
-    touch(survey / "dtm" / "500000_5600000.tif")
+    os.utime(survey / "dtm" / "500000_5600000.tif", (1, 1))
     new_tiles, new_parts = names(by_prepared(survey))
     changed = {tile for tile in tiles if tiles[tile] != new_tiles[tile]}
     assert changed == {"500000_5600000", "500250_5600000", "500000_5600250", "500250_5600250"}
@@ -274,17 +271,16 @@ def square(west, south, size=250, cell=1.0, crs="EPSG:25832"):
     return Grid(crs, west, south + size * cell, cell, size, size)
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
-        square(250, 0, 125),
-        square(250, 0, 500, 0.5),
-        square(250, 100),
-        square(240, 0),
-        square(250, -125, 125, 2.0),
-    ],
-    ids=["smaller", "finer", "shifted along", "overlapping", "coarser"],
-)
+OTHERS = {
+    "smaller": square(250, 0, 125),
+    "finer": square(250, 0, 500, 0.5),
+    "shifted along": square(250, 100),
+    "overlapping": square(240, 0),
+    "coarser": square(250, -125, 125, 2.0),
+}
+
+
+@pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS)
 def test_tiles_that_meet_on_different_lattices_are_refused(other):
     with pytest.raises(ConfigError, match=r"tiles t0 \(250 x 250 cells of 1 m from 0 0\) and t1 \(.*\) meet"):
         check_tiles(PRODUCTION, placed(square(0, 0), other))
@@ -298,36 +294,28 @@ def test_tiles_on_one_lattice_or_apart_are_accepted():
     check_tiles(PRODUCTION, placed(square(0, 0), square(100, 0, crs="EPSG:25833")))
 
 
+BEYOND = r"act farther than the 200 m .*; lower fit\.spacing_m"
+CLOSE = r"^fit\.spacing_m is .* m, less than a cell of 1 m; raise it$"
+
+
 @pytest.mark.parametrize(
-    ("spacing_m", "size", "accepted"), [(60, 250, True), (80, 250, False), (80, 100, True)]
+    ("spacing_m", "grid", "refused"),
+    [
+        (60, square(0, 0), ""),
+        (80, square(0, 0), BEYOND),
+        (80, square(0, 0, 100), ""),
+        (0.9, square(0, 0), CLOSE),
+        (1e-9, square(0, 0), CLOSE),
+        (0.1, square(0, 0, 25, 0.1), ""),
+    ],
 )
-def test_control_points_that_act_beyond_listed_files_are_refused(spacing_m, size, accepted):
-    config = compose({"fit": {"method": "smoothing_spline", "spacing_m": spacing_m}}, "coarse")
-    if accepted:
-        check_tiles(config, placed(square(0, 0, size)))
-    else:
-        with pytest.raises(ConfigError, match=r"act farther than the 200 m .*; lower fit\.spacing_m"):
-            check_tiles(config, placed(square(0, 0, size)))
-
-
-@pytest.mark.parametrize("spacing_m", [0.9, 1e-9])
-def test_control_points_closer_than_cells_are_refused(spacing_m):
-    config = compose({"fit": {"method": "smoothing_spline", "spacing_m": spacing_m}}, "fine")
-    with pytest.raises(ConfigError, match=r"^fit\.spacing_m is .* m, less than a cell of 1 m; raise it$"):
-        check_tiles(config, placed(square(0, 0)))
-    with pytest.raises(TaskError, match="less than a cell of 1 m"):
-        Lattice.of((250, 250), 1.0, 3, spacing_m)
-
-
-def test_control_points_as_close_as_cells_are_accepted():
-    config = compose({"fit": {"method": "smoothing_spline", "spacing_m": 0.1}}, "fine")
-    check_tiles(config, placed(square(0, 0, 25, 0.1)))
-
-
-def test_dry_run_counts_shared_nodes_once(survey, flexroad, tmp_path):
-    words = ("--catalog", survey / "catalog.json", "--out", tmp_path / "run", "--dry-run")
-    out = flexroad("run", "--config", "production", "--set", "fit.spacing_m=10", *words).expected(0).out
-    assert "  border   40 to do" in out.splitlines()
+def test_control_points_beyond_listed_files_or_closer_than_cells_are_refused(spacing_m, grid, refused):
+    config = compose({"fit": {"method": "smoothing_spline", "spacing_m": spacing_m}}, "x")
+    with pytest.raises(ConfigError, match=refused) if refused else nullcontext():
+        check_tiles(config, placed(grid))
+    if refused == CLOSE:
+        with pytest.raises(TaskError, match="less than a cell of 1 m"):
+            Lattice.of((250, 250), 1.0, 3, spacing_m)
 
 
 def test_dry_run_looks_up_shared_nodes_once(survey, flexroad, tmp_path, monkeypatch):
@@ -346,16 +334,12 @@ def test_dry_run_looks_up_shared_nodes_once(survey, flexroad, tmp_path, monkeypa
     assert set(looked_up.values()) == {1}
 
 
-def test_run_refuses_tiles_of_different_size(tmp_path, flexroad):
-    write_scenes(tmp_path / "survey", 1, seed=0, size_m=60)
-    catalog = Catalog.read(tmp_path / "survey" / "catalog.parquet")
-    tile = catalog.tiles[0]
-    smaller = replace(
-        tile, id="smaller", grid=Grid("EPSG:25832", tile.grid.east, tile.grid.north, 1.0, 30, 30)
-    )
-    Catalog((tile, smaller)).write(tmp_path / "mixed.json")
-    arguments = ("--catalog", tmp_path / "mixed.json", "--out", tmp_path / "run")
-    (line,) = flexroad("--allow", tmp_path, "run", "--config", "production", *arguments).expected(2).errors
+def test_run_refuses_tiles_of_different_size(made_survey, tmp_path, flexroad):
+    tile = Catalog.read(made_survey / "catalog.parquet").tiles[0]
+    smaller = replace(tile.grid, west=tile.grid.east, width=30, height=30)
+    Catalog((tile, replace(tile, id="smaller", grid=smaller))).write(tmp_path / "mixed.json")
+    words = ("--catalog", tmp_path / "mixed.json", "--out", tmp_path / "run")
+    (line,) = flexroad("--allow", made_survey, "run", "--config", "production", *words).expected(2).errors
     assert "set fit.method to nurbs, which fits each tile alone" in line
 
 

@@ -14,12 +14,7 @@ from flexroad.catalog import Catalog, Layer
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.config.stages import STAGE_NAMES, STAGES, stage_head, stage_version
-from flexroad.pipeline.graph.graph import (
-    Pattern,
-    any_file_missing,
-    layers_read,
-    own_files_missing,
-)
+from flexroad.pipeline.graph.graph import Pattern, any_file_missing, layers_read, own_files_missing
 from flexroad.pipeline.graph.sources import SourceFiles
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.options import stage_module
@@ -35,18 +30,18 @@ PAPER = {
 }
 
 
-def names(catalog, raw=PAPER, variant="flexroad", **options) -> dict[str, str]:
+def graph_of(tile, raw=PAPER, **options):
+    return Pattern.of(compose(raw, "x")).graph(tile, **options)
+
+
+def names(catalog, raw=PAPER, **options) -> dict[str, str]:
     """Return stage -> fingerprint of the first tile."""
-    return Pattern.of(compose(raw, "x")).graph(Catalog.read(catalog).tiles[0], **options).variants[variant]
+    return graph_of(Catalog.read(catalog).tiles[0], raw, **options).variants["flexroad"]
 
 
 def changed(before: dict[str, str], after: dict[str, str]) -> list[str]:
     """Return the stages whose fingerprints differ."""
     return [stage for stage in STAGE_NAMES if before[stage] != after[stage]]
-
-
-def test_equal_inputs_give_equal_fingerprints(survey):
-    assert names(survey) == names(survey)
 
 
 @pytest.mark.parametrize(
@@ -59,6 +54,8 @@ def test_equal_inputs_give_equal_fingerprints(survey):
         ({"evaluate": {"nearest": True}}, ["evaluate"]),
         ({"assess": {"dsm_dtm_tolerance_m": 0.2}}, ["assess"]),
         ({"export": {"formats": ["glb"]}}, []),
+        ({"fit": {"method": "nurbs", "degree": 3}}, []),  # the defaults
+        ({}, []),
     ],
 )
 def test_changed_option_changes_its_stage_and_dependents(survey, override, stages):
@@ -95,10 +92,6 @@ def test_fingerprint_is_hash_of_stage_version_options_and_inputs(name, survey):
         assert graph.variants == reference_fingerprints(graph, config)
 
 
-def test_option_at_default_keeps_fingerprints(survey):
-    assert names(survey) == names(survey, {**PAPER, "fit": {"method": "nurbs", "degree": 3}})
-
-
 def test_changed_version_changes_its_stage_and_dependents(survey, monkeypatch):
     before = names(survey)
     monkeypatch.setattr(ecsrc, "VERSION", ecsrc.VERSION + 1)
@@ -106,23 +99,20 @@ def test_changed_version_changes_its_stage_and_dependents(survey, monkeypatch):
 
 
 def test_stage_under_another_module_name_keeps_its_fingerprint(survey, monkeypatch):
-    before = Pattern.of(compose(PAPER, "x")).graph(Catalog.read(survey).tiles[0])
+    before = graph_of(Catalog.read(survey).tiles[0])
     monkeypatch.setitem(sys.modules, "elsewhere", ecsrc)
     monkeypatch.setattr(ecsrc, "__name__", "elsewhere")
     monkeypatch.setattr(ecsrc.Options, "__module__", "elsewhere")
-    after = Pattern.of(compose(PAPER, "x")).graph(Catalog.read(survey).tiles[0])
+    after = graph_of(Catalog.read(survey).tiles[0])
     moved = after.nodes[after.variants["flexroad"]["ecsrc"]]
     assert stage_module(moved.options).__name__ == "elsewhere"
     assert after == before
-    assert dict(map(versions_of, after.nodes.values())) == dict(map(versions_of, before.nodes.values()))
-
-
-def versions_of(node) -> tuple[str, int]:
-    return stage_version(node.stage, node.options)
+    for node, moved in zip(before.nodes.values(), after.nodes.values(), strict=True):
+        assert stage_version(moved.stage, moved.options) == stage_version(node.stage, node.options)
 
 
 def test_variants_share_equal_nodes(survey):
-    graph = Pattern.of(compose(PAPER, "x")).graph(Catalog.read(survey).tiles[0])
+    graph = graph_of(Catalog.read(survey).tiles[0])
     assert len(graph.nodes) == 3 + 3 * 4
     stages = [node.stage for node in graph.nodes.values()]
     assert sorted(set(stages), key=stages.index) == list(STAGE_NAMES)
@@ -133,8 +123,7 @@ def test_variants_share_equal_nodes(survey):
 
 def test_fingerprint_differs_by_tile_and_not_by_folder(survey, tmp_path):
     tiles = Catalog.read(survey).tiles
-    config = compose(PAPER, "x")
-    assert Pattern.of(config).graph(tiles[0]).fingerprint != Pattern.of(config).graph(tiles[1]).fingerprint
+    assert graph_of(tiles[0]).fingerprint != graph_of(tiles[1]).fingerprint
     before = names(survey)
     # copytree keeps the file times, and fingerprints hash relative paths.
     moved = shutil.copytree(survey.parent, tmp_path / "moved") / survey.name
@@ -163,7 +152,7 @@ def test_changed_layer_changes_only_stages_that_read_it(survey, monkeypatch):
     tile = replace(tile, layers=(*tile.layers, Layer("dop", (str(photo),))))
 
     def fingerprints():
-        return Pattern.of(compose(PAPER, "x")).graph(tile).variants["flexroad"]
+        return graph_of(tile).variants["flexroad"]
 
     unread = fingerprints()
     photo.write_bytes(b"newer")
@@ -209,7 +198,7 @@ def test_neighbours_files_count_only_with_a_halo(survey):
 
 def test_graph_without_halo_holds_only_the_files_of_its_tile(survey):
     tile = Catalog.read(survey).tiles[0]
-    graph = Pattern.of(compose(PAPER, "x")).graph(tile)
+    graph = graph_of(tile)
     # No stage reads the roads.
     read = [layer for layer in tile.layers if layer.name != "roads"]
     assert set(graph.file_stats) == {str(tile.paths(layer)[0]) for layer in read}
@@ -218,15 +207,17 @@ def test_graph_without_halo_holds_only_the_files_of_its_tile(survey):
     ]
 
     assert graph.tile == tile.within(tile.grid.bounds)
-    wide = Pattern.of(compose(HALO, "x")).graph(tile)
-    assert wide.tile == tile
-    assert len(wide.file_stats) > len(read)
+    # The largest halo of the variants counts.
+    for raw in (HALO, {"variants": {"flexroad": {}, "wide": {"load": {"halo_m": 50}}}}):
+        wide = graph_of(tile, raw)
+        assert wide.tile == tile
+        assert len(wide.file_stats) > len(read)
 
 
 def test_files_of_layers_that_no_stage_reads_may_lie_anywhere(survey):
     (tile, *_) = Catalog.read(survey).tiles
     tile = replace(tile, layers=(*tile.layers, Layer("dop", ("/elsewhere/dop.tif",))))
-    graph = Pattern.of(compose(PAPER, "x")).graph(tile)
+    graph = graph_of(tile)
     assert "dop" not in {layer.name for layer in graph.readable.layers}
     assert own_files_missing(replace(graph, file_stats={"/missing": None})) == ["/missing"]
     node = graph.nodes[graph.variants["flexroad"]["load"]]
@@ -251,7 +242,7 @@ def test_photo_changes_fingerprint_of_tile_only_as_its_texture(survey, checksum)
     tile = with_photo(Catalog.read(survey).tiles[0], survey.parent, "own.tif", "beside.tif")
 
     def prints(raw):
-        graph = Pattern.of(compose(raw, "x")).graph(tile, checksum)
+        graph = graph_of(tile, raw, checksum=checksum)
         return graph.fingerprint, graph.variants
 
     plain, textured = prints(PAPER), prints(TEXTURED)
@@ -268,31 +259,20 @@ def test_photo_changes_fingerprint_of_tile_only_as_its_texture(survey, checksum)
     assert prints(TEXTURED)[0] != newer[0]
 
 
-def test_options_of_texture_change_fingerprint_only_with_a_texture(survey):
-    tile = Catalog.read(survey).tiles[0]
+def test_photo_and_options_of_texture_count_only_for_products_with_a_texture(survey):
+    tile = with_photo(Catalog.read(survey).tiles[0], survey.parent, "own.tif")
+    graph = graph_of(tile, TEXTURED)
+    assert "dop" in graph.reads & layers_read(compose(TEXTURED, "x"))
+    assert "dop" not in {layer.name for layer in graph.readable.layers}
+    (survey.parent / "own.tif").unlink()
+    assert own_files_missing(graph_of(tile, TEXTURED)) == [str(survey.parent / "own.tif")]
+    assert own_files_missing(graph_of(tile)) == []
 
     def fingerprint(**export):
-        return Pattern.of(compose({**PAPER, "export": export}, "x")).graph(tile).fingerprint
+        return graph_of(tile, {**PAPER, "export": export}).fingerprint
 
     assert fingerprint(texture_px=512) == fingerprint()
     assert fingerprint(texture=True, texture_px=512) != fingerprint(texture=True)
-
-
-def test_photo_of_texture_is_read_for_products_and_by_no_stage(survey):
-    tile = with_photo(Catalog.read(survey).tiles[0], survey.parent, "own.tif")
-    config = compose(TEXTURED, "x")
-    graph = Pattern.of(config).graph(tile)
-    assert "dop" in graph.reads & layers_read(config)
-    assert "dop" not in {layer.name for layer in graph.readable.layers}
-    (survey.parent / "own.tif").unlink()
-    assert own_files_missing(Pattern.of(config).graph(tile)) == [str(survey.parent / "own.tif")]
-    assert own_files_missing(Pattern.of(compose(PAPER, "x")).graph(tile)) == []
-
-
-def test_largest_halo_of_the_variants_counts(survey):
-    tile = Catalog.read(survey).tiles[0]
-    raw = {"variants": {"flexroad": {}, "wide": {"load": {"halo_m": 50}}}}
-    assert Pattern.of(compose(raw, "x")).graph(tile).tile == tile
 
 
 def test_tile_of_a_raster_catalog_depends_on_files_that_reach_it(tmp_path):
@@ -301,27 +281,26 @@ def test_tile_of_a_raster_catalog_depends_on_files_that_reach_it(tmp_path):
             width = (200, 300, 250)[number]
             write(tmp_path / name / f"{number}.tif", np.ones((250, width), np.float32), west)
     tiles = rasters.index(tmp_path, {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif"}).tiles
-    read = [
-        [file for file, *_ in Pattern.of(compose(PAPER, "x")).graph(tile).sources[0][1]] for tile in tiles
-    ]
-    assert read == [["dsm/0.tif", "dsm/1.tif"], ["dsm/1.tif"], ["dsm/2.tif"]]
-    wide = [[file for file, *_ in Pattern.of(compose(HALO, "x")).graph(tile).sources[0][1]] for tile in tiles]
+
+    def read(raw):
+        return [[file for file, *_ in graph_of(tile, raw).sources[0][1]] for tile in tiles]
+
+    assert read(PAPER) == [["dsm/0.tif", "dsm/1.tif"], ["dsm/1.tif"], ["dsm/2.tif"]]
     # The halo of the second tile ends where the first file does.
-    assert wide == [["dsm/0.tif", "dsm/1.tif"], ["dsm/1.tif", "dsm/2.tif"], ["dsm/1.tif", "dsm/2.tif"]]
+    assert read(HALO) == [["dsm/0.tif", "dsm/1.tif"], ["dsm/1.tif", "dsm/2.tif"], ["dsm/1.tif", "dsm/2.tif"]]
 
 
 def test_missing_files_around_the_tile_are_not_its_own(survey):
     tile = Catalog.read(survey).tiles[0]
     own, (beside, *_) = own_and_neighbours(tile)
-    config = compose(HALO, "x")
     beside.unlink()
-    graph = Pattern.of(config).graph(tile)
+    graph = graph_of(tile, HALO)
     assert any_file_missing(graph)
     assert own_files_missing(graph) == []
     own.unlink()
-    assert own_files_missing(Pattern.of(config).graph(tile)) == [str(own)]
+    assert own_files_missing(graph_of(tile, HALO)) == [str(own)]
     unknown = replace(tile, layers=tuple(replace(layer, extents=()) for layer in tile.layers))
-    assert set(own_files_missing(Pattern.of(config).graph(unknown))) == {str(own), str(beside)}
+    assert set(own_files_missing(graph_of(unknown, HALO))) == {str(own), str(beside)}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The database returns what was recorded, also after damage to its file and on a full disk."""
+"""The database, and JSON files with a checksum: damage is noticed, and records wait on a full disk."""
 
 import errno
 import json
@@ -7,9 +7,11 @@ import resource
 from dataclasses import replace
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from flexroad.pipeline.store.database import NAME, RunDatabase
-from flexroad.pipeline.store.records import Failure, TileRecord
+from flexroad.pipeline.store.records import CHECKSUM, Failure, TileRecord, dump_checked, load_checked
 
 TILES = [f"{i}_{i}" for i in range(100)]
 DONE = ("1_1", "2_2")
@@ -80,7 +82,7 @@ def test_any_changed_byte_makes_the_database_empty(small):
     whole = small.read_bytes()
     assert lines(small) == [(tile, "done", entry(tile)) for tile in DONE]
     for position in range(len(whole)):
-        for bits in (1, 0x80, 0xFF):
+        for bits in (1 << position % 8, 0xFF):
             damaged = bytearray(whole)
             damaged[position] ^= bits
             small.write_bytes(damaged)
@@ -166,12 +168,9 @@ def test_reader_has_one_state_of_a_file_that_is_written(full):
         assert {state for _, state, _ in lines(full)} == {"pending"}
 
 
-def test_open_readonly_missing_database_creates_no_file(tmp_path):
+def test_open_readonly_missing_database_creates_no_file_and_opens_no_pipe(tmp_path):
     assert lines(tmp_path / NAME) == []
     assert not list(tmp_path.iterdir())
-
-
-def test_pipe_in_place_of_the_database_is_not_opened(tmp_path):
     os.mkfifo(tmp_path / NAME)
     assert lines(tmp_path / NAME) == []
 
@@ -198,3 +197,49 @@ def test_records_wait_while_disk_is_full(tmp_path):
         assert caught.value.errno == errno.EFBIG
         assert database.get(TILES[0]) == entry(TILES[0])
     assert [record for _, _, record in lines(tmp_path / NAME)] == [entry(tile) for tile in TILES]
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+CONTENT = {"id": "a", "rows": [{"road_l2": 0.0281, "tile": "ä"}], "size": 17}
+
+
+@given(content=st.dictionaries(st.text(), values, max_size=5).filter(lambda c: CHECKSUM not in c))
+def test_loads_what_was_dumped(content):
+    assert load_checked(dump_checked(content)) == content
+
+
+def test_any_flipped_bit_is_noticed_or_changes_no_value():
+    data = dump_checked(CONTENT)
+    noticed = 0
+    for at in range(len(data)):
+        for bit in range(8):
+            copy = bytearray(data)
+            copy[at] ^= 1 << bit
+            try:
+                assert load_checked(bytes(copy)) == CONTENT
+            except ValueError:
+                noticed += 1
+    assert noticed > 7 * len(data)
+
+
+def test_format_and_order_of_keys_do_not_matter():
+    content = json.loads(dump_checked(CONTENT))
+    again = json.dumps(dict(reversed(content.items())), separators=(",", ":"), ensure_ascii=False)
+    assert load_checked(again.encode()) == CONTENT
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"[]", b"{}", b"1", b"null", json.dumps(CONTENT).encode(), b"[" * 100_000, b"\xff\xfe{"]
+)
+def test_other_files_raise_value_error(data):
+    with pytest.raises(ValueError, match="."):
+        load_checked(data)
+
+
+def test_numbers_that_json_lacks_raise_error():
+    with pytest.raises(ValueError, match="JSON"):
+        dump_checked({"height": float("inf")})

@@ -39,19 +39,17 @@ def events(monkeypatch) -> list[tuple[str, str]]:
     return events
 
 
-def test_finish_flushes_products_then_item_then_folders(tmp_path, events):
+def test_finish_and_fail_flush_products_then_marker_then_folders(tmp_path, events):
     folder = TileProducts.of(tmp_path, "a")
     folder.finish({"id": "a"}, {"a.glb": b"mesh", "a.tif": b"heights"}, flushed=True)
     products = [(event, name) for event in ("name", "flush") for name in ("a.glb", "a.tif")]
     marker = [("flush", "item.json"), ("name", "item.json")]
     folders = [("flush", "a"), ("flush", "tiles"), ("flush", tmp_path.name)]
     assert events == [*products, ("flush", "a"), *marker, *folders]
-
-
-def test_fail_flushes_marker_then_folders(tmp_path, events):
-    TileProducts.of(tmp_path, "a").fail({"tile": "a"}, flushed=True)
-    folders = [("flush", "a"), ("flush", "tiles"), ("flush", tmp_path.name)]
-    assert events == [("flush", "failed.json"), ("name", "failed.json"), *folders]
+    events.clear()
+    (tmp_path / "failed").mkdir()
+    TileProducts.of(tmp_path / "failed", "a").fail({"tile": "a"}, flushed=True)
+    assert events == [("flush", "failed.json"), ("name", "failed.json"), *folders[:2], ("flush", "failed")]
 
 
 def test_finish_on_share_that_cannot_flush_folders_completes(tmp_path, monkeypatch):

@@ -42,7 +42,7 @@ FORMULAS = ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\t=1", "\n=1"]
 PLAIN = ["", "a=1", "'quoted'", "-5", "+1.5e-3", "-81%", "-500_5600", "-1,5", "1-2", "-81% to -79%", "é"]
 
 
-def test_texts_that_are_formulas_get_an_apostrophe_in_csv():
+def test_texts_that_are_formulas_get_an_apostrophe_in_csv(tmp_path):
     texts = FORMULAS + PLAIN
     table = pd.DataFrame({"=text": texts, "number": [-1.5] * len(texts), "count": [-2] * len(texts)})
     table["mixed"] = pd.Series([None, "=1", *[-3.0] * (len(texts) - 2)], dtype=object)
@@ -56,9 +56,6 @@ def test_texts_that_are_formulas_get_an_apostrophe_in_csv():
     # Outside quotes a line break would begin a new row.
     assert csv_text(pd.DataFrame({"a": ["x\r=1", "\r\n=1"]})) == 'a\n"x\n=1"\n"\'\n=1"\n'
     assert [with_formula(row[0]) for row in rows[1:]] == texts
-
-
-def test_failures_in_csv_are_no_formulas(tmp_path):
     write_tables(tmp_path, [], [Failure("=1", "load", "TaskError", "@message", "-file")])
     with (tmp_path / "failures.csv").open(newline="") as file:
         assert list(csv.reader(file))[1] == ["'=1", "load", "TaskError", "'@message", "'-file"]
@@ -82,13 +79,11 @@ def test_levels_have_a_table_of_their_own_while_tiles_have_some(tmp_path):
     assert not (tmp_path / "levels.csv").exists()
 
 
-def test_read_metrics_missing_column_raises(tmp_path):
-    pd.DataFrame({"tile_id": ["a"]}).to_parquet(tmp_path / "metrics.parquet")
-    with pytest.raises(ConfigError, match=r"is damaged: .*'variant'.*not in index.*flexroad rerun"):
-        read_metrics(tmp_path)
-
-
-def test_read_metrics_unknown_column_raises(tmp_path):
-    pd.DataFrame({"tile_ie": ["a"]}).to_parquet(tmp_path / "metrics.parquet")
-    with pytest.raises(ConfigError, match=r"is damaged: it has the columns 'tile_ie'.*flexroad rerun"):
+@pytest.mark.parametrize(
+    ("column", "reason"),
+    [("tile_id", ".*'variant'.*not in index"), ("tile_ie", "it has the columns 'tile_ie'")],
+)
+def test_read_metrics_missing_or_unknown_column_raises(tmp_path, column, reason):
+    pd.DataFrame({column: ["a"]}).to_parquet(tmp_path / "metrics.parquet")
+    with pytest.raises(ConfigError, match=f"is damaged: {reason}.*flexroad rerun"):
         read_metrics(tmp_path)

@@ -139,7 +139,7 @@ def test_wrong_crs_and_places_elsewhere_are_refused(run, flexroad, tmp_path):
     assert_refused(flexroad("lift", source, run, "-o", out, "--offset", 0, 0), out, *elsewhere)
     assert_refused(flexroad("lift", source, run, "-o", out, "--crs", "EPSG:0"), out, "PROJ")
     written(source, net(crs="DHDN_UTM"))
-    assert_refused(flexroad("lift", source, run, "-o", out), out, str(source), "give another one with --crs")
+    assert_refused(flexroad("lift", source, run, "-o", out), out, str(source), "give another CRS with --crs")
 
 
 def test_network_without_crs_needs_one(run, flexroad, tmp_path):
@@ -155,8 +155,8 @@ def test_network_without_crs_needs_one(run, flexroad, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda data: data[:-20], "is not whole XML"),
-        (lambda data: data.replace(b"</", b"<", 1), "is not whole XML"),
+        (lambda data: data[:-20], "is not complete XML"),
+        (lambda data: data.replace(b"</", b"<", 1), "is not complete XML"),
         (
             lambda data: b'<!DOCTYPE a [<!ENTITY b "c"><!ENTITY d "&b;&b;">]>' + data,
             "declares the entity 'b'",

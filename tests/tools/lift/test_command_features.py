@@ -308,10 +308,10 @@ def test_columns_and_report_have_grade_crossfall_and_error(run, flexroad, tmp_pa
 
 BAD = {
     "cut.gpkg": (lambda data: data[: len(data) // 2], "GeoPackage"),
-    "cut.geojson": (lambda data: data[: len(data) // 2], "is not whole JSON"),
+    "cut.geojson": (lambda data: data[: len(data) // 2], "is not complete JSON"),
     "cut.fgb": (lambda data: data[:-20], "is cut off: it has 1 of 2 features"),
     "cut.shp": (lambda data: data[:-20], "is a damaged Shapefile"),
-    "broken.geojson": (lambda data: data.replace(b'": [ [', b'": [ [ ['), "is not whole JSON"),
+    "broken.geojson": (lambda data: data.replace(b'": [ [', b'": [ [ ['), "is not complete JSON"),
     "other.geojson": (lambda data: data.replace(b'"LineString"', b'"Polygon"'), "(feature 0) has a damaged"),
     "curve.gpkg": (
         lambda data: data.replace(struct.pack("<BI", 1, 2), struct.pack("<BI", 1, 8)),

@@ -69,7 +69,7 @@ def test_roads_that_stay_are_named_with_the_reason(run, flexroad, tmp_path):
     [
         (None, [], "carries no CRS; give it with --crs"),
         (None, ["--crs", "EPSG:25832"], "does not lie on the finished tiles"),
-        ("<OpenDRIVE><road>", ["--crs", "EPSG:25832"], "is not whole XML"),
+        ("<OpenDRIVE><road>", ["--crs", "EPSG:25832"], "is not complete XML"),
         ("<OpenDRIVE/>", ["--crs", "EPSG:25832"], "has no road or feature with coordinates"),
         ("<OpenDRIVE><header><geoReference>+proj=what</geoReference></header></OpenDRIVE>", [], "not read"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><OpenDRIVE>&b;</OpenDRIVE>', [], "declares the entity 'b'"),

@@ -419,8 +419,8 @@ BAD = [
     (road(length=0.0), "has a length of 0 m"),
     (road().replace('length="60.0" id', "id"), "has road without length"),
     (road().replace('length="60.0" id', 'length="1e9" id'), "has a length of 1e+09 m"),
-    (road().replace('x="10"', 'x="nan"'), "x 'nan', which is no number"),
-    (road().replace("<line/>", ""), "no line, arc"),
+    (road().replace('x="10"', 'x="nan"'), "x 'nan', which is not a number"),
+    (road().replace("<line/>", ""), "not a line, arc"),
     (road(plan=""), "no planView with a geometry"),
     (road(plan=LINE.replace('s="0"', 's="9"') + LINE), "s that does not ascend"),
     (road().replace('b="0.01"', 'b="x"'), "elevation with b 'x'"),
@@ -492,7 +492,7 @@ def test_large_roads_have_no_more_points_than_they_need(tmp_path):
 def test_places_that_are_no_numbers_leave_the_road(tmp_path):
     huge = LINE.replace('hdg="0"', 'hdg="1e308"').replace("<line/>", '<arc curvature="1e308"/>')
     _, (bad, good) = lifted(write(tmp_path, road(huge, name="8"), road()), plane)
-    assert "places that are no numbers" in bad.note
+    assert "places that are not numbers" in bad.note
     assert good.note == ""
 
 

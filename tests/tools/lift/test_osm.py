@@ -273,7 +273,7 @@ def test_bridges_and_tunnels_without_their_level_are_told(lifted):
 
 @pytest.mark.parametrize("name", ['id="1"', 'ref="2"'])
 def test_ids_that_are_no_numbers_are_refused_in_one_line(lifted, name):
-    with pytest.raises(TaskError, match="has the id 'x', which is no whole number"):
+    with pytest.raises(TaskError, match="has the id 'x', which is not a whole number"):
         lifted(over(plane), OSM.replace(name, name.split("=")[0] + '="x"'))
 
 

@@ -111,10 +111,10 @@ def test_each_distance_has_the_geometry_that_it_lies_in():
     [
         ("<road/>", "no planView with a geometry"),
         ("<road><planView/></road>", "no planView with a geometry"),
-        (ET.tostring(road("<circle/>")).decode(), "no line, arc, spiral, poly3 or paramPoly3"),
+        (ET.tostring(road("<circle/>")).decode(), "not a line, arc, spiral, poly3 or paramPoly3"),
         (ET.tostring(road("<arc/>")).decode(), "has arc without curvature"),
-        (ET.tostring(road('<arc curvature="nan"/>')).decode(), "curvature 'nan', which is no number"),
-        (ET.tostring(road("<line/>", length=float("inf"))).decode(), "length 'inf', which is no number"),
+        (ET.tostring(road('<arc curvature="nan"/>')).decode(), "curvature 'nan', which is not a number"),
+        (ET.tostring(road("<line/>", length=float("inf"))).decode(), "length 'inf', which is not a number"),
         (ET.tostring(road("<line/>", length=-1)).decode(), "does not ascend"),
     ],
 )

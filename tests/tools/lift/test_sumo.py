@@ -224,7 +224,7 @@ def test_places_above_the_limit_are_listed(lifted):
     ("before", "after", "words"),
     [
         ("60.00,28.40 80.00,42.00", "60.00,28.40 80.00", "lane 'bc_0': '60.00,28.40 80.00 95"),
-        ("60.00,28.40 80.00", "60.00,x 80.00", "has coordinates that are no numbers"),
+        ("60.00,28.40 80.00", "60.00,x 80.00", "has coordinates that are not numbers"),
         ("-500000.00,-5600000.00", "-500000.00", "has the netOffset '-500000.00', not two or three numbers"),
         ("-500000.00,", "nan,", "has the netOffset"),
     ],

@@ -66,8 +66,8 @@ def test_children_are_added_at_the_end(before, after):
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (b"<net><a>", "not whole XML: no element found, line 1, column 9"),
-        (b"", "not whole XML"),
+        (b"<net><a>", "not complete XML: no element found, line 1, column 9"),
+        (b"", "not complete XML"),
         (b"<a/><b/>", "junk after document element"),
         (b'<!DOCTYPE n [<!ENTITY a "b">]><n/>', "declares the entity 'a'"),
         (b'<!DOCTYPE n [<!ENTITY a SYSTEM "/etc/hostname">]><n>&a;</n>', "declares the entity 'a'"),

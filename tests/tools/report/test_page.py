@@ -282,4 +282,4 @@ def test_viewer_is_found_in_the_run_or_given_and_its_address_is_relative(run, tm
 
 def test_flags_of_decks_name_the_command_that_finds_them():
     for flag in ("patch", "off-dtm"):
-        assert "`flexroad catalog check` maps unnamed ones" in MEANINGS[flag].remedy
+        assert "`flexroad catalog check` maps bridges" in MEANINGS[flag].remedy

@@ -20,7 +20,7 @@ Offset = tuple[float, float, float]
 """Easting, northing and height of the mesh's origin, in units of its CRS."""
 
 LOCAL_BELOW = 10_000.0
-"""If all plan coordinates are smaller than this, they are taken as local, not as coordinates of a CRS."""
+"""If all plan coordinates are smaller than this, they are local, not in a CRS."""
 MOST_CHARACTERS = 2**20
 """Longest sidecar file that is read."""
 SRS = re.compile(r"<SRS>\s*([^<]+?)\s*</SRS>")
@@ -31,13 +31,13 @@ SEARCHED_FOLDERS = 3
 
 @dataclass(frozen=True)
 class Georeference:
-    """CRS and offset of a mesh, each None if not given."""
+    """CRS and offset of a mesh; None where unknown."""
 
     crs: str | None = None
     offset: Offset | None = None
 
     def with_fallback(self, other: Georeference) -> Georeference:
-        """Return a copy with missing values taken from another one."""
+        """Return a copy with missing values taken from another georeference."""
         return Georeference(
             other.crs if self.crs is None else self.crs, other.offset if self.offset is None else self.offset
         )
@@ -46,7 +46,7 @@ class Georeference:
         """Return the CRS and the vertices with the offset added, ``(V, 3)``."""
         if self.offset is not None and not all(abs(axis) <= FARTHEST for axis in self.offset):
             raise TaskError(
-                f"{path} has the offset {self.offset}, which is no place; give --offset EASTING NORTHING "
+                f"{path} has the offset {self.offset}, which is not a place; give --offset EASTING NORTHING "
                 "HEIGHT",
                 file=str(path),
             )
@@ -65,11 +65,11 @@ class Georeference:
 
 
 def read_sidecar(path: Path) -> Georeference:
-    """Read the nearest sidecar file of a mesh, in its folder or up to two above; empty if there is none.
+    """Read the nearest sidecar file of a mesh, in its folder or up to two above; empty if not found.
 
-    Supported are ``data_meta.json`` (DeepScenario: UTM zone and offset), ``coords.txt``, also in
-    ``odm_georeferencing`` (OpenDroneMap: UTM zone, then an offset in plan, none in height), ``metadata.xml``
-    (ContextCapture, DJI Terra and others: ``SRS`` and ``SRSOrigin``), and ``.prj`` (only the CRS).
+    Supported are ``data_meta.json`` (DeepScenario: UTM zone and offset), ``metadata.xml`` (ContextCapture,
+    DJI Terra and others: ``SRS`` and ``SRSOrigin``), and ``.prj`` (only the CRS). ``coords.txt``, also in
+    ``odm_georeferencing``, is from OpenDroneMap: UTM zone, and an offset in plan but not in height.
     """
     result = Georeference()
     for folder in path.resolve().parents[:SEARCHED_FOLDERS]:

@@ -1,8 +1,8 @@
 """Textured meshes of OBJ, PLY and glTF files.
 
 A mesh that cannot be used is an error: no faces, no area, coordinates that are not finite, a wrong upward
-axis, missing colours. Defects that change neither points nor orthophoto are not: a mesh that is inside out
-gives a note, and edges with more or fewer than two faces are not checked.
+axis, missing colours. Defects that change neither points nor orthophoto are accepted. A mesh that is inside
+out gives a note; edges with more or fewer than two faces are not checked.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from flexroad.tools.prepare.mesh.textures import FACTOR, Beside, Textures
 trimesh = lazy("trimesh")
 
 UPRIGHT = 2.0
-"""Limit of side area to plan area; above it the upward axis of the mesh is wrong."""
+"""Largest ratio of side area to plan area; above it the upward axis of the mesh is wrong."""
 AXES = "xyz"
 MOST_REPEATS = 1e6
-"""Largest texture coordinate: how often a texture is repeated across a mesh."""
+"""Largest texture coordinate: number of repeats of a texture across a mesh."""
 FACE_BYTES = 200
-"""Memory that a face takes with its corners, colours and copies (bytes)."""
+"""Memory of a face with its corners, colours and copies (bytes)."""
 SMALLER = "divide the mesh, or use a coarser one"
 MAGIC = b"glTF"
 MOST_NODES = 100_000
-"""Largest number of nodes and of primitives: trimesh makes an object of each."""
+"""Largest number of nodes and of primitives: trimesh makes an object for each."""
 DEEPEST = 100
-"""Largest number of levels of nodes: the place of each is the product of those above it."""
+"""Largest depth of nodes: the place of a node is the product of all transforms above it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class _Part:
     uv: NDArray[np.float32] | None
     """Texture coordinates of the corners, ``(F, 3, 2)``; None without a texture."""
     image: NDArray[np.uint8] | None
-    """The texture, ``(h, w, 3)``; None if there is none."""
+    """The texture, ``(h, w, 3)``; None without a texture."""
     colours: NDArray[np.uint8] | None
     """Colours of the corners, ``(F, 3, 3)``; None with a texture."""
 
@@ -72,7 +72,7 @@ def read_mesh(
 
     - `path`: OBJ with its MTL and textures, PLY or glTF; may have several materials, and colours of vertices.
     - `up`: the file's upward axis; by default y in glTF, as its standard requires, and z elsewhere.
-    - `crs`: CRS of the mesh; by default that in the file (FlexRoad's own GLB has one) or in its sidecar.
+    - `crs`: CRS of the mesh; by default from the file (FlexRoad's GLB has a CRS) or its sidecar.
     - `offset`: easting, northing and height of the mesh's origin; by default from the same sources.
     - `colours`: whether colours are needed; if not, textures are not read.
     - result: in units of its CRS, which may be feet; every face has a colour if ``colours`` is True.
@@ -107,7 +107,7 @@ def _errors(path: Path, resolver: Beside) -> Iterator[None]:
             yield
     except (TaskError, ImportError):
         raise
-    # For a broken file, its readers raise exceptions of many types.
+    # For a damaged file, its readers raise exceptions of many types.
     except Exception as error:
         if resolver.refused is not None:
             raise resolver.refused from error
@@ -138,7 +138,7 @@ def _scene(path: Path, resolver: Beside) -> Any:
 
 
 def _parts(path: Path, scene: Any, images: Textures | None) -> Iterator[_Part]:
-    """Yield the geometries of a scene; one may be placed many times."""
+    """Yield the geometries of a scene; a geometry may be placed many times."""
     placed = [scene.graph[node] for node in sorted(scene.graph.nodes_geometry)]
     count = sum(len(getattr(scene.geometry[name], "faces", ())) for _, name in placed)
     memory.check(FACE_BYTES * count, f"{path} with {count:,} faces", SMALLER, str(path))
@@ -221,7 +221,7 @@ def _colours(
 
 
 def _in_scene(scene: Any) -> Georeference:
-    """Return the georeference in a GLB written by FlexRoad (`tasks.products.glb`); empty if there is none."""
+    """Return the georeference in a GLB written by FlexRoad (`tasks.products.glb`); empty in other files."""
     crs, origin = (scene.metadata.get(key) for key in ("crs", "run_origin"))
     if not isinstance(crs, str) or origin is None:
         return Georeference()
@@ -230,7 +230,7 @@ def _in_scene(scene: Any) -> Georeference:
 
 
 def _used(path: Path, vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
-    """Return the mesh without the vertices that no face uses, if one of these is not a place."""
+    """Return the mesh without unused vertices, if one of them has no valid coordinates."""
     valid: Bools = np.asarray((np.abs(vertices) <= FARTHEST).all(axis=1))
     if valid.all():
         return vertices, faces
@@ -266,7 +266,7 @@ def _check(path: Path, vertices: Floats, faces: NDArray[np.int64]) -> tuple[str,
 
 
 def gltf_elements(path: Path) -> int:
-    """Return the number of vertices and indices that reading a file makes, each instance counted."""
+    """Return the number of vertices and indices in memory after reading; each instance is counted."""
     header = _header(path)
     counts: list[int] = [_count(accessor) for accessor in header.get("accessors", [])]
     # Accessors without a view have no bytes in the file; they are filled with zeros.
@@ -305,7 +305,7 @@ def _count(accessor: dict[str, Any]) -> int:
 
 
 def _check_graph(nodes: list[dict[str, Any]]) -> None:
-    """Check that the nodes are trees: each has at most one parent, and is at most `DEEPEST` below a root."""
+    """Check that the nodes form trees: at most one parent, and at most `DEEPEST` levels below a root."""
     children = [list(node.get("children", [])) for node in nodes]
     named = [child for each in children for child in each]
     if len(set(named)) < len(named) or not set(named) <= set(range(len(nodes))):

@@ -1,7 +1,7 @@
 """Points and an orthophoto from a textured mesh: random samples of its surface, and its view from above.
 
-Neither depends on the orientation of faces or on the number of faces at an edge: the mesh may be inside out
-or not manifold.
+The mesh may be inside out or not manifold: neither result depends on the orientation of faces or on the
+number of faces at an edge.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from flexroad.tasks.types import Bools, Floats, Orthophoto
 from flexroad.tools.prepare.points.binning import Points
 
 CHUNK = 500_000
-"""Points, or rays of the orthophoto, processed at a time, so that memory does not grow with the area."""
+"""Points, or rays of the orthophoto, processed at a time, to limit the memory."""
 MOST_RAYS = 4
 """Largest number of rays across a pixel of the orthophoto."""
 TOLERANCE_M = 1e-6
@@ -40,7 +40,7 @@ class TexturedMesh:
     faces: Faces
     """``(F, 3)``, indices of vertices."""
     texture: NDArray[np.int32]
-    """``(F,)``, index of the face's texture in `textures`; -1 if it has none."""
+    """``(F,)``, index of the face's texture in `textures`; -1 without a texture."""
     textures: tuple[NDArray[np.uint8], ...] = ()
     """Red, green, blue, ``(h, w, 3)`` each."""
     uv: NDArray[np.float32] | None = None
@@ -84,8 +84,8 @@ def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
     """Yield points evenly distributed on the mesh's surface, chunk by chunk.
 
     Stratified sampling: the surface is divided, along the sequence of faces, into parts of equal area with
-    one random point each. The density is that of independent points, with fewer clusters and gaps. Equal
-    input gives equal points.
+    one random point each. So points have fewer clusters and gaps than independent points. Equal input gives
+    equal points.
 
     - `mesh`: in a CRS in metres.
     - result: at most `CHUNK` points, with colours if all faces have a colour.
@@ -106,7 +106,7 @@ def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
 
 
 def orthophoto(mesh: TexturedMesh, grid: Grid) -> Orthophoto:
-    """Draw the mesh from above: each vertical ray has the colour of the highest surface it hits.
+    """Draw the mesh from above: a vertical ray has the colour of the highest surface that it hits.
 
     If the texture is finer than the pixels, several rays per pixel are averaged, at most `MOST_RAYS` across.
 
@@ -158,7 +158,7 @@ def _rays(mesh: TexturedMesh, pixel: float) -> int:
 
 @compiled()
 def _weights(vertices: Floats, corners: Faces, east: Floats, north: Floats, weights: Floats) -> None:
-    """Compute barycentric weights of the corners of faces, ``(n, 3)``, at positions in plan."""
+    """Compute the barycentric weights of faces' corners, ``(n, 3)``, at positions in plan."""
     for n in range(corners.shape[0]):
         a, b, c = vertices[corners[n, 0]], vertices[corners[n, 1]], vertices[corners[n, 2]]
         ax, ay, bx, by = a[0] - east[n], a[1] - north[n], b[0] - east[n], b[1] - north[n]
@@ -234,7 +234,7 @@ def project_down(mesh: TexturedMesh, grid: Grid) -> tuple[Floats, Faces]:
 
 @compiled()
 def _raster(points: Floats, faces: Faces, cell: float, heights: Floats, face_index: Faces) -> None:
-    """Set height and face of the highest surface at each centre; of equal heights the first face counts."""
+    """Set height and face of the highest surface at each centre; at equal heights the first face is used."""
     rows, cols = heights.shape
     for f in range(faces.shape[0]):
         ax, ay, az = points[faces[f, 0]]

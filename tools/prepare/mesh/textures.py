@@ -1,8 +1,7 @@
 """Textures of a mesh file, and the plain colours of materials without a texture.
 
 Mesh libraries ignore a texture that is missing or cannot be decoded; here it is an error that names the file.
-
-Of the files that a mesh names, only those in its own folder or below are read.
+Files that a mesh names are read only if they are in its folder or below.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ PIL = lazy("PIL")
 
 REMEDY = "export it again, or make no orthophoto: --no-dop"
 HELD, DECODING = 3, 9
-"""Bytes per texel that a texture takes, and takes more while it is decoded."""
+"""Bytes per texel of a texture, and additional bytes while it is decoded."""
 FACTOR = 8
-"""Memory that reading a mesh takes, as a multiple of its files: text, numbers and copies of both."""
+"""Memory to read a mesh, as a multiple of the size of its files: text, numbers and copies of both."""
 
 
 class Textures:
@@ -36,7 +35,7 @@ class Textures:
         self._decoded: dict[Any, NDArray[np.uint8]] = {}
 
     def texture(self, visual: Any) -> NDArray[np.uint8] | None:
-        """Return the texture of a material, ``(h, w, 3)``, or None if it has none."""
+        """Return the texture of a material, ``(h, w, 3)``; None without a texture."""
         material = getattr(visual, "material", None)
         file = self.files.get(getattr(material, "name", "") or "") or self.files.get("")
         if file is None and self.path.suffix.lower() in (".glb", ".gltf"):
@@ -50,7 +49,7 @@ class Textures:
         return self._decoded[key]
 
     def plain_colour(self, visual: Any) -> NDArray[np.uint8] | None:
-        """Return the colour of a material without a texture, ``(3,)``, or None if it has none."""
+        """Return the colour of a material without a texture, ``(3,)``; None without a colour."""
         material: Any = getattr(visual, "material", None)
         if "kd" in getattr(material, "kwargs", {}):
             return np.asarray(material.diffuse[:3], np.uint8)
@@ -102,7 +101,7 @@ def _of_mtl(path: Path) -> dict[str, Path]:
 
 
 def _decode(path: Path, source: Any, held: int) -> NDArray[np.uint8]:
-    """Return a texture, ``(h, w, 3)``, from a file or an open image; others take ``held`` bytes."""
+    """Return a texture, ``(h, w, 3)``, from a file or an open image; other textures use ``held`` bytes."""
     name = f"the texture {source} of {path}" if isinstance(source, Path) else f"the texture in {path}"
     if isinstance(source, Path) and not source.is_file():
         raise TaskError(
@@ -125,7 +124,7 @@ def beside(mesh: Path, name: str) -> Path:
         if path.is_relative_to(folder):
             return path
     except (OSError, RuntimeError, ValueError):
-        # A name with a null byte, one that is too long, or a loop of links.
+        # A name with a null byte, a name that is too long, or a loop of links.
         pass
     raise TaskError(
         f"{mesh} needs the file {name[:200]!r}, which is not in its folder; copy it there and name it "
@@ -137,7 +136,7 @@ def beside(mesh: Path, name: str) -> Path:
 class Beside:
     """Resolver for trimesh: gives it the material file or the buffers that a mesh names.
 
-    trimesh goes on without files that it does not get, so that the reason is kept for the caller.
+    trimesh continues without files that it does not get. So the reason is kept for the caller.
     """
 
     def __init__(self, mesh: Path) -> None:

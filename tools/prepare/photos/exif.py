@@ -1,8 +1,7 @@
 """Camera positions from GNSS tags of photographs, and ground control points, in a metric CRS.
 
-Heights are used as written by the camera. Simple receivers have errors of metres in height, and many drones
-add an offset that is not in the file. Heights are therefore not corrected; `PlacedPhotos.heights` is their
-datum.
+Heights are used as written by the camera; `PlacedPhotos.heights` is their datum. They are not corrected:
+simple receivers have errors of metres in height, and many drones add an offset that is not in the file.
 """
 
 from __future__ import annotations
@@ -28,9 +27,9 @@ from flexroad.tasks.types import Floats
 from flexroad.tools.prepare.images import check_pixels, image_errors
 
 GNSS_M = (3.0, 5.0)
-"""Accuracy in plan and height of a receiver without corrections, if the file has none (m)."""
+"""Accuracy in plan and height of a receiver without corrections, if the file gives no accuracy (m)."""
 RTK_M = {50: (0.03, 0.06), 34: (0.5, 1.0)}
-"""The same by DJI's RtkFlag: 50 is a fixed solution, 34 a float solution."""
+"""Accuracy by DJI's RtkFlag (m): 50 is a fixed solution, 34 a float solution."""
 BYTES = 12
 """Memory that a photograph takes per pixel while it is matched: four copies in colour."""
 FAR_M = 1000.0
@@ -38,9 +37,9 @@ FAR_M = 1000.0
 HIGHEST_M = 100_000.0
 """Greatest altitude of a camera, above or below the datum (m)."""
 LONGEST = 100
-"""Greatest focal length, in sides or diagonals of the sensor; a longer one is taken as unknown."""
+"""Largest focal length, in sides or diagonals of the sensor; a longer focal length is taken as unknown."""
 FILM_DIAGONAL_MM = math.hypot(36, 24)
-"""Diagonal of 35 mm film."""
+"""Diagonal of 35 mm film (mm)."""
 WIDEST = 3 / 2
 """Largest aspect ratio of a sensor; a wider photograph is cropped in height."""
 SEA_LEVEL, ELLIPSOID = "above mean sea level", "above the WGS 84 ellipsoid"
@@ -60,7 +59,7 @@ class Shot:
     latitude: float
     """Degrees north."""
     altitude: float
-    """As written by the camera (m)."""
+    """Height as written by the camera (m)."""
     accuracy: tuple[float, float]
     """Standard deviation in plan and height (m)."""
     heights: str
@@ -68,9 +67,9 @@ class Shot:
     camera: str
     """Make and model; photographs of one camera and focal length are calibrated together."""
     focal_px: float | None
-    """Focal length (pixels); None if the file has none."""
+    """Focal length (pixels); None if unknown."""
     taken: datetime | None
-    """Time of exposure; None if the file has none."""
+    """Time of exposure; None if unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ class Control:
     points: Floats
     """Easting, northing, height, ``(n, 3)``, m."""
     marks: tuple[Mapping[Path, tuple[float, float]], ...]
-    """Per point its pixel in each photograph: column and row from the upper left corner."""
+    """Pixels of each point by photograph: column and row from the upper left corner."""
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -105,7 +104,7 @@ class PlacedPhotos:
 def read_shot(path: Path) -> Shot:
     """Read position, camera and date of a photograph from its EXIF and XMP tags.
 
-    DJI's own XMP position is preferred: it has more digits, and accuracies where the drone had corrections.
+    DJI's XMP position is preferred: it has more digits, and accuracies if the drone had corrections.
     """
     remedy = "leave it out, or make it smaller"
     with image_errors(f"{path} cannot be read as a photograph", remedy, path), Image.open(path) as image:
@@ -116,7 +115,7 @@ def read_shot(path: Path) -> Shot:
         text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
         # DJI's tags may be attributes or elements.
         xmp = dict(re.findall(r'drone-dji:(\w+)\s*(?:="|>)\s*([^"<]*)', text))
-        # A truncated file is only detected when its pixels are read.
+        # A truncated file is detected only when its pixels are read.
         image.draft("L", (width // 8, height // 8))
         image.load()
         gps = dict(exif.get_ifd(ExifTags.IFD.GPSInfo))
@@ -170,7 +169,7 @@ def read_control(path: Path, placed: PlacedPhotos, crs: str | None = None) -> Co
     - `path`: the table: one row per point and photograph. Rows with the same name (without names, the same
       coordinates) are one point. Pixels are counted from the upper left corner; heights are in metres.
     - `placed`: the photographs; rows refer to them by file name.
-    - `crs`: CRS of easting and northing; by default that of the photographs.
+    - `crs`: CRS of easting and northing; by default the CRS of the photographs.
     """
     paths = {shot.path.name: shot.path for shot in placed.shots}
     by_name: dict[str, tuple[list[float], dict[Path, tuple[float, float]]]] = {}
@@ -219,7 +218,7 @@ def _from_exif(gps: Mapping[int, Any]) -> tuple[float, float, float, str]:
 def _validated(
     longitude: float, latitude: float, altitude: float, heights: str
 ) -> tuple[float, float, float, str]:
-    # Receivers without a fix write zeros; NaN fails the comparisons below, too.
+    # Receivers without a position write zeros. NaN fails the comparisons below, too.
     has_fix = (longitude, latitude) != (0, 0)
     if not (has_fix and abs(longitude) <= 180 and abs(latitude) <= 90 and abs(altitude) <= HIGHEST_M):
         raise ValueError(f"{longitude}, {latitude}, {altitude} is not a position")
@@ -232,7 +231,7 @@ def _degrees(parts: Sequence[Any]) -> float:
 
 
 def _accuracy(xmp: Mapping[str, str], gps: Mapping[int, Any]) -> tuple[float, float]:
-    """Return standard deviations in plan and height (m): from the file, else by the type of receiver."""
+    """Return standard deviations in plan and height (m): from the file, else for the type of receiver."""
     if all(f"RtkStd{axis}" in xmp for axis in ("Lon", "Lat", "Hgt")):
         east, north, up = (float(xmp[f"RtkStd{axis}"]) for axis in ("Lon", "Lat", "Hgt"))
         # A drone without a solution writes zeros.

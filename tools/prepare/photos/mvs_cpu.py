@@ -1,8 +1,8 @@
 """Dense stereo on the CPU: depth maps of photographs with given poses, merged to an oriented cloud.
 
 For each photograph: rectification with its best partners (Fusiello et al., 2000), semi-global matching
-(Hirschmüller, 2008; OpenCV), and selection of the depths that two pairs agree on. The result is coarser than
-that of PatchMatch stereo on a GPU, but deterministic.
+(Hirschmüller, 2008; OpenCV), and selection of the depths that two pairs agree on. The result is
+deterministic, but coarser than the result of PatchMatch stereo on a GPU.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ cv2 = lazy("cv2")
 FEWEST_SHARED = 20
 """Smallest number of sparse points shared by the photographs of a pair."""
 BEST_ANGLE_DEG, WIDEST_ANGLE_DEG = 12.0, 45.0
-"""A smaller angle between rays gives less accurate depths; at a wider one, surfaces look too different."""
+"""Range of the angle between rays: smaller angles give less accurate depths, larger angles fewer matches."""
 NEARER, FARTHER = 0.25, 0.05
-"""Extension of the range of depths of the sparse points, which are rare on crowns and roofs (shares)."""
+"""The range of depths of the sparse points is extended by these shares: crowns and roofs have few points."""
 SMALLEST_PATCH = 2e-4
-"""Patches of depth smaller than this share of the image are removed as chance matches (crowns, water)."""
+"""Patches of depth below this share of the image are removed: they are chance matches (crowns, water)."""
 
 
 class Options(base.Options):
@@ -95,7 +95,7 @@ class _Pair:
 
 
 def partners(reconstruction: Reconstruction, number: int, options: Options) -> list[int]:
-    """Return the photographs to match one with, best first, by shared points and the angle of their rays."""
+    """Return the photographs to match with a photograph, best first, by shared points and angles of rays."""
     view = reconstruction.views[number]
     scores = {}
     for other, partner in enumerate(reconstruction.views):
@@ -184,7 +184,7 @@ def _pinhole(view: View, size: int) -> _Pinhole:
 def _read(view: View, size: int) -> NDArray[np.uint8]:
     """Return the reduced photograph in sensor orientation, ``(h, w, 3)``: blue, green, red."""
     try:
-        # The poses are those of the sensor, so the orientation tag is ignored.
+        # The poses are poses of the sensor, so the orientation tag is ignored.
         image = cv2.imread(str(view.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         # More pixels than the limit of `images`.
@@ -210,7 +210,7 @@ def _rectify(view: View, other: View, points: Floats, focal: float) -> _Pair:
     a, b = _frame(view, rotation, focal), _frame(other, rotation, focal)
     top, bottom = max(a[1], b[1]), min(a[3], b[3])
     # The columns of the second photograph are shifted by the parallax of the farthest depth; the first
-    # columns leave space for that of the nearest depth.
+    # columns leave space for the parallax of the nearest depth.
     farthest = focal * length / far
     left, right = a[0] - parallaxes, a[2]
     width, height = math.ceil(right - left), max(math.ceil(bottom - top), 1)

@@ -1,14 +1,14 @@
 """Structure from motion: camera poses and sparse points from photographs with GNSS positions.
 
 The paper's stage A leaves this to photogrammetry. Here it is COLMAP (Schönberger & Frahm, 2016) by its Python
-binding: SIFT, matching among GNSS neighbours, and incremental mapping with the positions as priors in the
-bundle adjustment. Coordinates are relative to an origin in whole metres, so that float32 files lose no
-precision. Features are found and matched on the CPU, also where pycolmap has a GPU: with COLMAP's SIFT for
-GPUs, heights from the synthetic photographs of the tests were 0.09 m off (median), instead of 0.004 m.
+binding: SIFT, matching of GNSS neighbours, and incremental mapping. The positions are priors in the bundle
+adjustment. Coordinates are relative to an origin in whole metres, so that float32 files lose no precision.
+Features are found and matched on the CPU, even if pycolmap has a GPU. With COLMAP's SIFT for GPUs, heights
+from the synthetic photographs of the tests were 0.09 m off (median), instead of 0.004 m.
 
-Vertical photographs of flat ground do not determine the focal length: a longer one with the ground farther
-below fits them equally well, and scales all heights by the same factor. The focal length of the files is
-therefore held fixed unless a free one fits clearly better.
+Vertical photographs of flat ground do not determine the focal length: a longer focal length with the ground
+farther below fits them equally well, and scales all heights by the same factor. So the focal length of the
+files is fixed unless a free focal length fits clearly better.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ pycolmap = lazy("pycolmap")
 EXHAUSTIVE = 12
 """Up to this number of photographs, all pairs are matched."""
 CLEARLY_BETTER = 0.95
-"""A free focal length is used if its reprojection error is below this share of that with the fixed one.
+"""A free focal length is used if it reduces the reprojection error below this share.
 A rolling shutter or a simple lens model can cause smaller improvements."""
 INSTALL = "pip install 'flexroad[photogrammetry]'"
 
@@ -48,11 +48,11 @@ class Options(base.Options):
     )
     features: int = Field(8192, ge=500, description="largest number of features per photograph")
     neighbours: int = Field(
-        12, ge=2, description="each photograph is matched with this number of nearest ones"
+        12, ge=2, description="each photograph is matched with this number of nearest photographs"
     )
     calibrate: Literal["auto", "held", "free"] = Field(
         "auto",
-        description="focal length: held at that of the files, free, or auto: free if this fits much better",
+        description="focal length: fixed (from the files), free, or auto: free if this fits much better",
     )
     seed: int = Field(1, ge=0, description="random seed")
     threads: int | None = Field(None, ge=1, description="number of threads; null: one per core")
@@ -107,7 +107,7 @@ class Reconstruction:
     control_m: Floats | None
     """Adjusted minus given ground control points, ``(n, 3)``, m; None if only GNSS was used."""
     focal_held: bool
-    """Whether the focal length was held at that of the files."""
+    """Whether the focal length was fixed to the value of the files."""
     model: Path
     """Folder of the model in COLMAP's format, in the local frame."""
     root: Path
@@ -123,12 +123,12 @@ class Reconstruction:
 def colmap() -> Any:
     """Return pycolmap, an optional dependency, and silence its log."""
     try:
-        # It logs hundreds of lines of progress; its errors are raised here as TaskError.
+        # It logs hundreds of lines of progress. Its errors are raised here as TaskError.
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     except ImportError as error:
         raise TaskError(f"photographs need pycolmap ({error}): {INSTALL}") from error
     except RuntimeError as error:
-        # As pycolmap-cuda12 without CUDA's libraries or libSM.so.6.
+        # For example pycolmap-cuda12 without CUDA's libraries or libSM.so.6.
         reason = error.__cause__ or error
         raise TaskError(
             f"pycolmap cannot be loaded ({reason}); install the library that is missing, "
@@ -143,7 +143,7 @@ def reconstruct(
     """Reconstruct the poses of photographs and sparse points from their features and GNSS positions.
 
     - `work`: empty folder for the database and the model.
-    - `options`: options. The same seed and number of threads give the same result up to rounding.
+    - `options`: the same seed and number of threads give the same result up to rounding.
     - `control`: ground control points. If 3 or more are marked in at least 2 placed photographs each, they
       alone determine the georeference; GNSS is then only used for matching.
     """
@@ -227,7 +227,7 @@ def _match(database: Path, count: int, options: Options) -> None:
 
 
 def _map(database: Path, root: Path, work: Path, options: Options, has_focal: bool) -> tuple[Any, bool]:
-    """Return the model with most photographs, and whether the focal length was held fixed."""
+    """Return the model with most photographs, and whether the focal length was fixed."""
     held = has_focal and options.calibrate != "free"
     models = {}
     for hold in [True] * held + [False] * (not held or options.calibrate == "auto"):
@@ -279,7 +279,7 @@ def _check_placed(model: Any, shots: Mapping[str, Shot], options: Options) -> No
 
 
 def _control(model: Any, shots: Mapping[str, Shot], control: Control, origin: Floats) -> Floats | None:
-    """Transform the model to the control points, adjust it with these fixed; return residuals, ``(n, 3)``, m.
+    """Transform the model to the control points and adjust it to them; return residuals, ``(n, 3)``, m.
 
     Returns None, and leaves the model unchanged, if fewer than 3 points are marked in 2 placed photographs.
     """

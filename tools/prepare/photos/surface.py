@@ -1,8 +1,8 @@
-"""From camera poses to a mesh by pycolmap: a dense cloud on a GPU, and the surface of any dense cloud.
+"""Meshes from camera poses with pycolmap: a dense cloud on a GPU, and the surface of any dense cloud.
 
 The cloud is COLMAP's PatchMatch stereo and fusion (Schönberger et al., 2016). It needs a GPU and a pycolmap
-built with CUDA, as the package pycolmap-cuda12. The surface is Poisson's (Kazhdan & Hoppe, 2013). It is
-closed: parts far from all points are invented, and are removed.
+built with CUDA, such as the package pycolmap-cuda12. The surface is Poisson's (Kazhdan & Hoppe, 2013). It is
+closed, so parts far from all points are wrong and are removed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Points, the cell of each, and what the points of a cell give: means, highest point, top layer, colour.
+"""Points, their cells, and values of a cell from its points: means, highest point, top layer, colour.
 
-The highest of n points with noise is above the surface, the more so the more points a cell has. The mean of
-the points close below it, the top layer, is not, and still belongs to the uppermost surface: a deck, not the
-ground under it. A single point far above all around it is a spike.
+The highest of many points with noise is above the surface; more points make this error larger. The mean of
+the top layer (the points close below the highest point) has no such error. It still belongs to the uppermost
+surface: a deck, not the ground under it. A single point far above all points around it is a spike.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ Cells = NDArray[np.int64]
 """Row-major index of the cell of each point, ``(n,)``; -1 outside the grid."""
 
 NUDGE = 1e-6
-"""Part of a cell that is more than the rounding error of its edge's coordinates."""
+"""Share of a cell that is larger than the rounding error of its edge's coordinates."""
 AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 """The 8 neighbours of a cell."""
 Codes = NDArray[np.int32]
-"""Colours as 24-bit numbers (red, green, blue from the highest byte); -1 if there is none."""
+"""Colours as 24-bit numbers (red, green, blue from the highest byte); -1 without a colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Points:
 
 
 def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
-    """Return the cell of each point, ``(n,)``, row-major; -1 outside the grid.
+    """Return the row-major index of the cell of each point, ``(n,)``; -1 outside the grid.
 
     A point on the border of two cells belongs to the eastern or southern one. Rounding does not change that,
     so all grids of the same lattice give the same result.
@@ -86,7 +86,7 @@ def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats
 
     - `cells`: the cells of the points, ``(n,)``; points outside the grid are left out.
     """
-    # The first number is that of the points outside.
+    # The first number is for the points outside.
     numbers, size = cells + 1, shape[0] * shape[1] + 1
     count = np.bincount(numbers, minlength=size)
     with np.errstate(invalid="ignore"):
@@ -103,9 +103,9 @@ def highest(cells: Cells, height: Floats, shape: tuple[int, int]) -> Floats:
 def spikes(cells: Cells, height: Floats, shape: tuple[int, int], despike_m: float) -> NDArray[np.int64]:
     """Return the indices of single points far above all points around them, ``(k,)``.
 
-    The highest point of a cell is a spike if it is more than ``despike_m`` above the second highest point of
-    its cell and above the highest points of all 8 neighbours. A pole or a crown with two points is not a
-    spike, nor is a point without any points around it. A cell has at most one spike.
+    The highest point of a cell is a spike if it is more than ``despike_m`` above two heights: the second
+    highest point of its cell, and the highest points of all 8 neighbours. A pole or a crown with two points
+    is not a spike. A point without any points around it is not a spike. A cell has at most one spike.
     """
     top, second, index = _two_highest(cells, height, shape[0] * shape[1])
     around = ndimage.maximum_filter(top.reshape(shape), footprint=AROUND, mode="constant", cval=-np.inf)
@@ -116,7 +116,7 @@ def spikes(cells: Cells, height: Floats, shape: tuple[int, int], despike_m: floa
 
 @compiled()
 def _two_highest(cells: Cells, height: Floats, size: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Return the two greatest heights per cell (-inf if there is none) and the index of the greatest."""
+    """Return the two largest heights per cell (-inf if missing) and the index of the largest."""
     top, second = np.full(size, -np.inf), np.full(size, -np.inf)
     index = np.full(size, -1, np.int64)
     for i in range(cells.size):
@@ -135,11 +135,11 @@ def top_layer(
 ) -> Floats:
     """Return the top layer of each cell: mean height (m), number and spread of its points, ``(3, H, W)``.
 
-    The spread is the standard deviation of the heights (m): 0 for one point. Where there are no points, it
-    and the mean are NaN.
+    The spread is the standard deviation of the heights (m): 0 for one point. Spread and mean are NaN in cells
+    without points.
 
-    - `highest`: highest point per cell, ``(H, W)``, m; NaN where there is none.
-    - `depth_m`: points up to this much below the highest one belong to the top layer (m).
+    - `highest`: highest point per cell, ``(H, W)``, m; NaN without points.
+    - `depth_m`: points up to this much below the highest point belong to the top layer (m).
     """
     count, below, squared = _sums(cells, height, highest.ravel(), depth_m)
     with np.errstate(invalid="ignore"):
@@ -150,7 +150,7 @@ def top_layer(
 
 @compiled()
 def _sums(cells: Cells, height: Floats, highest: Floats, depth_m: float) -> tuple[Floats, Floats, Floats]:
-    """Return number, sum and sum of squares of the heights relative to the highest, per cell."""
+    """Return number, sum and sum of squares of the heights relative to the highest point, per cell."""
     count, below, squared = np.zeros_like(highest), np.zeros_like(highest), np.zeros_like(highest)
     for i in range(cells.size):
         c = cells[i]
@@ -165,13 +165,13 @@ def _sums(cells: Cells, height: Floats, highest: Floats, depth_m: float) -> tupl
 
 
 def photo(points: Points, grid: Grid, fill_m: float) -> Orthophoto:
-    """Return the colour of the highest point in each pixel; voids have that of the nearest valid pixel.
+    """Return the colour of the highest point in each pixel; voids have the nearest valid pixel's colour.
 
-    Of points at the same height, the one with the greatest red, then green, then blue is used; of pixels at
-    the same distance, the northernmost, then the westernmost.
+    Among points at the same height, the largest red, then green, then blue is used. Among pixels at the same
+    distance, the northernmost, then the westernmost is used.
 
     - `points`: must have colours, and include a rim of ``fill_m`` around the grid.
-    - `fill_m`: pixels whose centre is farther than this from that of a valid pixel stay without colour (m).
+    - `fill_m`: pixels whose centre is farther than this from all valid centres stay without colour (m).
     """
     assert points.colour is not None
     rim = grid.buffered(fill_m)

@@ -1,8 +1,9 @@
 """Slope-based ground filter: points too far above a lower point near by are not ground.
 
 Vosselman (2000), "Slope based filtering of laser altimetry data", IAPRS 33: a point is ground unless another
-one within the radius is lower by more than the ground can fall over that distance. The result equals that of
-comparing all pairs; sorting points into square buckets and by height avoids most of the comparisons.
+point within the radius is lower by more than the ground can fall over that distance. The result is the same
+as from a comparison of all pairs. Points are sorted into square buckets and by height, to avoid most
+comparisons.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Options(low_outliers.Options):
 
     @property
     def reach_m(self) -> float:
-        """Distance up to which points decide whether one is ground (m)."""
+        """Distance up to which other points decide whether a point is ground (m)."""
         return self.radius_m + self.low_reach_m
 
 
@@ -54,8 +55,7 @@ def ground(
 
     - `easting`, `northing`, `height` ``(n,)``: in metres. Points with NaN or infinite coordinates are not
       ground.
-    - `asked` ``(n,)``: points for which the answer is needed; all others are returned as not ground. None
-      asks for all.
+    - `asked` ``(n,)``: points for which the answer is needed; others are returned as not ground. None: all.
     - result ``(n,)``: independent of the order of the points.
     """
     points = low_outliers.without_low_outliers(easting, northing, height, options.radius_m, options)
@@ -105,7 +105,7 @@ def _ground(
     for b in range(rows * cols):
         if not asked[start[b] : start[b + 1]].any():
             continue
-        # Comparing with one low point near by rejects most points that are not ground.
+        # A comparison with one low point near by rejects most points that are not ground.
         low = start[_lowest(floor, floor_of_row, shape, side, b, radius, slope)]
         top = -np.inf
         for p in range(start[b], start[b + 1]):

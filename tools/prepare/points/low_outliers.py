@@ -1,7 +1,7 @@
-"""Low outliers of a point cloud: points far below all around, as multipath echoes cause them.
+"""Low outliers of a point cloud: points far below all points around them, caused by multipath echoes.
 
-Ground filters leave them out first, because all points around one would be rejected. Sorting points into
-square buckets and by height avoids most of the comparisons.
+Ground filters remove them first: a low outlier would cause the rejection of all points around it. Points are
+sorted into square buckets and by height, to avoid most comparisons.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ POINTS_PER_BUCKET = 16
 BUCKETS_PER_RADIUS = 16
 """Buckets have about `POINTS_PER_BUCKET` points, more in dense clouds: their side is at least radius / 16."""
 FEW_POINTS = 64
-"""Points of a bucket that are sorted by insertion, which is fast for few."""
+"""Buckets with at most this many points are sorted by insertion, which is fast for few points."""
 SLACK_M = 1e-6
 """Margin of distances to buckets (m), for points that rounding moved across the edge of a bucket."""
 OUTNUMBERED = 20
-"""Low outliers have this many times more points above them; with fewer they may be ground."""
+"""A low outlier has this many times more points above it; with fewer points it may be ground."""
 
 
 class Options(base.Options):
@@ -48,17 +48,17 @@ class Options(base.Options):
 
     @property
     def low_reach_m(self) -> float:
-        """Distance up to which points decide whether one is a low outlier (m)."""
+        """Distance up to which other points decide whether a point is a low outlier (m)."""
         return 0.0 if self.low_m is None else self.low_radius_m
 
 
 def without_low_outliers(
     easting: Floats, northing: Floats, height: Floats, radius_m: float, options: Options
 ) -> _Buckets:
-    """Return the points that are finite and no low outliers, sorted into buckets.
+    """Return the finite points without low outliers, sorted into buckets.
 
-    A point is a low outlier if within ``low_radius_m`` at most ``low_companions`` others are lower or at most
-    ``low_m`` higher, and 20 times as many points (counting itself) are above that.
+    A point is a low outlier if within ``low_radius_m`` at most ``low_companions`` other points are lower or
+    at most ``low_m`` higher, and 20 times as many points (with itself) are above that.
 
     - `easting`, `northing`, `height` ``(n,)``: in metres.
     - `radius_m`: radius of searches in the buckets (m), for their size.
@@ -98,8 +98,8 @@ class _Buckets:
 
     @classmethod
     def of(cls, easting: Floats, northing: Floats, height: Floats, radius: float) -> _Buckets:
-        """Sort points into buckets, whose number is at most a small multiple of that of the points."""
-        # Subtracting a whole-metre origin from large coordinates is exact.
+        """Sort points into buckets; there are at most a few times more buckets than points."""
+        # The subtraction of a whole-metre origin from large coordinates is exact.
         x, y = easting - math.floor(easting.min()), northing - math.floor(northing.min())
         width, depth = float(x.max()), float(y.max())
         mean_side = math.sqrt(POINTS_PER_BUCKET * width * depth / x.size)
@@ -155,7 +155,7 @@ def _sorted(x: Floats, y: Floats, z: Floats, shape: tuple[int, int], side: float
 
 @compiled()
 def span(position: float, reach: float, side: float, count: int) -> tuple[int, int]:
-    """Return the first bucket within reach of a coordinate, and the last one plus 1."""
+    """Return the first bucket within reach of a coordinate, and the last bucket plus 1."""
     first = math.floor((position - reach - SLACK_M) / side)
     last = math.floor((position + reach + SLACK_M) / side)
     return max(first, 0), min(last, count - 1) + 1
@@ -177,7 +177,7 @@ def _low_outliers(
     bucket_is_near = math.sqrt(2) * side + SLACK_M <= radius
     for b in range(start.size - 1):
         end = start[b + 1]
-        # Points are sorted by height, so only the first ones of a bucket can have too few companions.
+        # Points are sorted by height, so only the first points of a bucket can have too few companions.
         if bucket_is_near:
             end = min(end, start[b] + companions + 1)
         for p in range(start[b], end):
@@ -203,7 +203,7 @@ def _count(
     step: float,
     enough: int,
 ) -> int:
-    """Count the points near p, itself included, at most ``step`` above it; stop at ``enough``."""
+    """Count the points near p, including p, at most ``step`` above it; stop at ``enough``."""
     # Most points have enough companions in their own bucket.
     count = _count_in(x, y, z, start[own], start[own + 1], radius, p, step, enough)
     first_col, end_col = span(x[p], radius, side, shape[1])
@@ -229,7 +229,7 @@ def _count_in(
     step: float,
     enough: int,
 ) -> int:
-    """Count as `_count` does, among points ``first`` to ``end - 1``, which are sorted by height."""
+    """Count like `_count`, among points ``first`` to ``end - 1``, which are sorted by height."""
     count = 0
     for q in range(first, end):
         if z[q] - z[p] > step:

@@ -1,10 +1,11 @@
 """Morphological ground filter: points above what an opening of the surface leaves are not ground.
 
-An opening with a disk removes all that is narrower than the disk, as houses and trees, but keeps ground on
-one side of a wall or quay, which the slope filter rejects. Disks of all sizes are compared, each with the
-height that sloping ground loses by it, as by Zhang et al. (2003), "A progressive morphological filter for
-removing nonground measurements from airborne LIDAR data", IEEE TGRS 41(4), and Pingel et al. (2013), "An
-improved simple morphological filter for the terrain classification of airborne LIDAR data", ISPRS JPRS 77.
+An opening with a disk removes all objects that are narrower than the disk, such as houses and trees. It keeps
+ground on one side of a wall or quay, which the slope filter rejects. Disks of all sizes are used, each with a
+tolerance for the height that sloping ground loses by it. See Zhang et al. (2003), "A progressive
+morphological filter for removing nonground measurements from airborne LIDAR data", IEEE TGRS 41(4), and
+Pingel et al. (2013), "An improved simple morphological filter for the terrain classification of airborne
+LIDAR data", ISPRS JPRS 77.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class Options(low_outliers.Options):
 
     @property
     def reach_m(self) -> float:
-        """Distance up to which points decide whether one is ground (m)."""
+        """Distance up to which other points decide whether a point is ground (m)."""
         return 2 * self.radius_m + math.sqrt(2) * self.cell_m + self.low_reach_m
 
 
@@ -47,11 +48,11 @@ def ground(easting: Floats, northing: Floats, height: Floats, options: Options) 
     The surface has the height of the lowest point in each cell. A point is ground if it is at most ``slope *
     (r + cell_m) + tolerance_m`` above the opening of the surface by the disk of radius r, for all radii from
     0 to ``radius_m`` in steps of a cell. Cells without points have no effect. Low outliers are not ground,
-    and do not count.
+    and are not used.
 
     - `easting`, `northing`, `height` ``(n,)``: in metres. Points with NaN or infinite coordinates are not
       ground.
-    - result ``(n,)``: independent of the order of the points, and of those farther away than ``reach_m``.
+    - result ``(n,)``: independent of the order of the points, and of points farther away than ``reach_m``.
     """
     points = low_outliers.without_low_outliers(easting, northing, height, options.radius_m, options)
     out = np.zeros(height.shape, bool)
@@ -70,7 +71,7 @@ def ground(easting: Floats, northing: Floats, height: Floats, options: Options) 
 
 
 def _highest_ground(surface: Floats, radius: int, fall: float) -> Floats:
-    """Return the lowest sum of an opening and of the fall over its radius, for all radii, ``(H, W)``, m.
+    """Return the minimum over all radii of the opening plus the fall over its radius, ``(H, W)``, m.
 
     - `surface`: heights (m); inf without points.
     - `radius`: largest radius, in cells.
@@ -81,7 +82,7 @@ def _highest_ground(surface: Floats, radius: int, fall: float) -> Floats:
         down, across = np.mgrid[-size : size + 1, -size : size + 1]
         disk = np.asarray(down**2 + across**2 <= size**2, np.uint8)
         lowest = cv2.erode(surface, disk)
-        # Where no point is within the disk, the lowest one is inf, or OpenCV's value beyond the border.
+        # Where no point is within the disk, the minimum is inf, or OpenCV's value beyond the border.
         there = lowest < np.finfo(np.float64).max
         opened = cv2.dilate(np.where(there, lowest, -np.inf), disk)
         np.minimum(result, opened + fall * size, out=result)

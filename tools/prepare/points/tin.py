@@ -1,9 +1,9 @@
 """Linear interpolation over Delaunay triangles of limited size: the DTM from ground points, and voids.
 
 A triangle is used if the diameter of its circumcircle, which has no other node inside, is at most a given
-width. The height of a cell therefore depends only on nodes within that distance, and does not change if the
-area is divided into blocks. At the border of the survey, the same rule leaves bays open, and lakes keep their
-shore: a void stays where a disc of that diameter fits into it.
+width. So the height of a cell depends only on nodes within that distance, and does not change if the area is
+divided into blocks. A void stays where a disc of that diameter fits into it: so bays at the border of the
+survey stay open, and lakes keep their shore.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from flexroad.tasks.types import Bools, Floats, Mesh
 Window = tuple[slice, slice]
 """Rows and columns of a raster."""
 JITTER = 1e-6
-"""Scale of the displacement of nodes (cells), which makes the triangulation of cocircular nodes unique."""
+"""Largest displacement of nodes (cells); it makes the triangulation of cocircular nodes unique."""
 SNAP_M = 1e-12
 """Nodes closer than this would be merged (m)."""
 LIMIT_FACTOR = 1 + 1e-9
-"""Factor of the limit, so that a circle exactly as wide as the limit is used in spite of rounding."""
+"""Factor of the limit, so that a circle exactly as wide as the limit is used despite rounding errors."""
 COUNT_OFFSET = 0.6180339887
 """Offset (cells) added before rounding down to whole cells, so that rounding errors do not matter."""
 EMPTY_CIRCLE_CELLS = 2 * math.sqrt(2)
-"""Largest diameter (cells) of an empty circle between nodes at any position in cells that all have one."""
+"""Largest diameter (cells) of an empty circle if every cell has a node anywhere in it."""
 CHAIN_CELLS = 4 * math.sqrt(2)
-"""Diameter (cells) of a disc that holds a square of 3 x 3 complete cells wherever it lies."""
+"""Diameter (cells) of a disc that contains a square of 3 x 3 complete cells at every position."""
 REACH_CELLS = math.ceil(CHAIN_CELLS)
 DIAGONAL = math.sqrt(2)
 """Largest distance of the centres of touching cells (cells), added to the width of a void."""
@@ -41,9 +41,9 @@ DIAGONAL = math.sqrt(2)
 def triangulated(ground: Floats, grid: Grid, void_m: float, inner: Window | None = None) -> Floats:
     """Return the ground height at the cell centres, linear between the centroids of cells, ``(H, W)``, m.
 
-    A centroid is the mean of the points of a cell in plan and height: it is exact on planes and not biased,
-    as the lowest point would be. A cell with ground points whose centre is outside all triangles, as at the
-    border of the survey, has the mean height of its points.
+    A centroid is the mean of the points of a cell in plan and height. It is exact on planes and, unlike the
+    lowest point, not biased. A cell with ground points whose centre is outside all triangles, for example at
+    the border of the survey, has the mean height of its points.
 
     - `ground` ``(3, H, W)``: easting and northing of the cells' centroids from the grid's north-west corner,
       and their height (m); NaN without ground points.
@@ -67,8 +67,8 @@ def tin(
     - `east`, `north`: position of a cell's node, from the grid's north-west corner, ``(H, W)``, m.
     - `height`: height of a cell's node, ``(H, W)``, m; NaN if the cell has no node.
     - `widest_m`: largest diameter of a triangle's circumcircle (m).
-    - `inner`: the cells whose heights are needed; others may be wrong. None needs all.
-    - result: NaN where there is no triangle.
+    - `inner`: the cells whose heights are needed; others may be wrong. None: all.
+    - result: NaN outside of all triangles.
     """
     nodes = np.isfinite(height)
     if inner is not None:
@@ -78,12 +78,12 @@ def tin(
 
 
 def _acting(nodes: Bools, inner: Window) -> Bools:
-    """Return the cells whose nodes may be those of triangles at inner cells, ``(H, W)``.
+    """Return the cells whose nodes may belong to triangles at inner cells, ``(H, W)``.
 
-    A node is not, if it is far from them and from each void that is connected to them: no circle without a
-    node inside then touches both. Let a disc of `CHAIN_CELLS` move within such a circle from the inner cell
-    to the node. Everywhere it holds a square of 3 x 3 cells, all of them without a node, so that these
-    squares are a chain from the inner cells to the node.
+    Other nodes are far from the inner cells and from each void that is connected to them. Then no empty
+    circle touches both a node and an inner cell. Proof: move a disc of `CHAIN_CELLS` within such a circle
+    from the inner cell to the node. At every position it contains a square of 3 x 3 cells without nodes.
+    These squares form a void that connects the inner cells to the node.
     """
     near = np.zeros(nodes.shape, bool)
     rows, cols = (slice(max(part.start - REACH_CELLS, 0), part.stop + REACH_CELLS) for part in inner)
@@ -116,8 +116,8 @@ def _interpolated(
 def _noise(grid: Grid, row: NDArray[np.intp], col: NDArray[np.intp]) -> Floats:
     """Return two pseudo-random numbers from -0.5 to 0.5 per cell, ``(n, 2)``: a hash of its position.
 
-    Any four nodes of a lattice square are cocircular; which of its diagonals is used must not depend on the
-    order of insertion, which differs between blocks. The hash is that of SplitMix64 (Steele et al., 2014).
+    The four nodes of a lattice square are cocircular. The choice of the diagonal must not depend on the order
+    of insertion, which differs between blocks. The hash function is from SplitMix64 (Steele et al., 2014).
     """
     east = col + int(np.floor(grid.west / grid.cell + COUNT_OFFSET))
     south = row - int(np.floor(grid.north / grid.cell + COUNT_OFFSET))
@@ -131,10 +131,10 @@ def _noise(grid: Grid, row: NDArray[np.intp], col: NDArray[np.intp]) -> Floats:
 
 
 def _coarse_first(row: NDArray[np.intp], col: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return an order of cells that begins with every 2^k-th one, ``(n,)``.
+    """Return an order of cells that begins with every 2^k-th cell, ``(n,)``.
 
-    Triangles of few nodes that are spread evenly are split where the next ones lie. Row by row, each node
-    would change the long triangles beside the rows that are done, which takes 1.5 times as long.
+    Inserting nodes row by row takes 1.5 times as long: each node changes the long triangles next to the rows
+    that are done. Here nodes are first spread evenly, and each further node changes only small triangles.
     """
     position = row | col
     # The greatest power of two that divides both row and column.
@@ -144,7 +144,7 @@ def _coarse_first(row: NDArray[np.intp], col: NDArray[np.intp]) -> NDArray[np.in
 def _delaunay(plan: Floats, order: NDArray[np.intp]) -> NDArray[np.int32]:
     """Return the faces of the Delaunay triangulation, ``(F, 3)``, counter-clockwise.
 
-    Nodes are inserted in an order, which changes only the time that this takes.
+    Nodes are inserted in the given order; it has an effect only on the time.
     """
     if len(plan) < 3:
         return np.empty((0, 3), np.int32)

@@ -1,7 +1,7 @@
 """Rasters from a point cloud: DSM and its top layer, DTM, bridge decks and orthophoto of a block of ground.
 
 Values depend only on the points near the block (`points_reach_m` + `cells_reach_m`), not on the division into
-blocks or on the order of the points; heights agree to 1e-8 m, the rounding of sums and large coordinates.
+blocks or the order of the points. Heights agree within 1e-8 m, the rounding of sums and large coordinates.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CELL_LAYERS = (
     *("ground: easting from the grid's west (m)", "northing from its north (m)", "height (m)"),
     "bridge decks: mean height (m)",
 )
-"""What the points of each cell give, without the cells around it; NaN where there are none."""
+"""Values of each cell from its own points; NaN without points."""
 GROUND = "ground"
 """Layer of the cells with ground points, for the refinement of a mesh's DTM; it is not published."""
 
@@ -48,14 +48,14 @@ class Options(base.Options):
     despike_m: float | None = Field(
         None,
         gt=0,
-        description="drop single points that are this much above all others around (m); null keeps all",
+        description="drop single points that are this much above all points around them (m); null keeps all",
     )
     fill_m: float = Field(5.0, ge=0, le=100, description="DSM voids up to this width are filled (m)")
     top_layer_m: float = Field(
         0.25,
         gt=0,
         le=10,
-        description="points up to this much below a cell's highest one make the height of roads (m)",
+        description="points up to this much below a cell's highest point make the height of roads (m)",
     )
     ground: Literal["classes", "filter", "morphological"] = Field(
         "classes",
@@ -86,11 +86,10 @@ class Options(base.Options):
 def of_points(
     points: Points, grid: Grid, options: Options, pixels: Grid | None
 ) -> tuple[Floats, Orthophoto | None]:
-    """Return what the points of each cell give, `CELL_LAYERS`, ``(8, H, W)``, and the orthophoto.
+    """Return the values of each cell (`CELL_LAYERS`), ``(8, H, W)``, and the orthophoto.
 
-    - `points`: in the grid's CRS (m), including a rim of `points_reach_m` around the grid; others have no
-      effect.
-    - `pixels`: pixels of the orthophoto; None makes no orthophoto.
+    - `points`: points in the grid's CRS (m), including a rim of `points_reach_m` around the grid.
+    - `pixels`: pixels of the orthophoto; None: no orthophoto.
     - result: no orthophoto if the points have no colours.
     """
     if options.despike_m is not None:
@@ -117,7 +116,7 @@ def of_points(
 
 
 def of_cells(cells: Floats, rim: Grid, grid: Grid, options: Options) -> dict[str, Floats | Bools]:
-    """Return the rasters of a block of ground by layer: heights (m), NaN where there is none, and `GROUND`.
+    """Return the rasters of a block of ground by layer: heights (m; NaN where unknown), and `GROUND`.
 
     ``road_height`` has three bands, ``(3, H, W)``: where a void is filled, the number of points is 0. Without
     decks there is no layer ``bridges``.
@@ -140,18 +139,18 @@ def of_cells(cells: Floats, rim: Grid, grid: Grid, options: Options) -> dict[str
 
 
 def points_reach_m(options: Options, cell: float) -> float:
-    """Return the largest distance at which points can change what `of_points` returns (m)."""
+    """Return the largest distance at which points can change the result of `of_points` (m)."""
     farthest = options.dop_fill_m
     if options.ground == "filter":
         farthest = max(farthest, options.filter.reach_m)
     if options.ground == "morphological":
         farthest = max(farthest, options.morphological.reach_m)
-    # Whether a point is a spike depends on its own and the neighbouring cells.
+    # Whether a point is a spike depends on its cell and the neighbouring cells.
     return farthest if options.despike_m is None else farthest + 2 * cell
 
 
 def cells_reach_m(options: Options, cell: float) -> float:
-    """Return the largest distance at which cells can change what `of_cells` returns (m)."""
+    """Return the largest distance at which cells can change the result of `of_cells` (m)."""
     reach = tin.tin_reach_m if options.dtm == "tin" else tin.voids_reach_m
     return max(reach(options.void_m, cell), tin.voids_reach_m(options.fill_m, cell))
 
@@ -192,7 +191,7 @@ def _classes(classes: tuple[int, ...]) -> str:
 
 
 def _is_ground(points: Points, asked: Bools, options: Options) -> Bools:
-    """Return which of the points that are asked for are ground, ``(n,)``."""
+    """Return which of the requested points are ground, ``(n,)``."""
     if options.ground == "classes":
         return _has_class(points, options.ground_classes)
     if options.ground == "morphological":

@@ -1,1 +1,1 @@
-"""The report as one HTML page: a map first, then what to look at, with the tables folded away."""
+"""The report as one HTML page: a map, then the tiles to look at, with closed tables."""

@@ -1,4 +1,4 @@
-"""How good the tiles are: histograms of the main figures as SVG, and a comparison with another run."""
+"""Quality of the tiles: histograms of the main figures as SVG, and a comparison with another run."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from flexroad.catalog.text import count
 from flexroad.tools.report.browser.tiles import LABELS, TileTable, short
 
 FIGURES = ("error_estimate_m", "l2_road_m", "l2_terrain_m", "mad_road_deg", "triangles", "seconds")
-"""Figures that are compared; smaller is better for all of them."""
+"""Figures that are compared; for all of them smaller is better."""
 NONE = "–"
 NOISE = ("seconds",)
-"""Figures that differ each time: neither better nor worse."""
+"""Figures that differ each time, so that they are neither better nor worse."""
 SAME = 1e-6
-"""Relative difference up to which a figure counts as the same: other processors round otherwise."""
+"""Relative difference up to which figures are taken as equal: processors differ in rounding."""
 SHOWN = ("error_estimate_m", "l2_road_m", "mad_road_deg", "measured_road", "seconds")
-"""Columns with a histogram, as far as they have values; at most `MOST` are shown."""
+"""Columns with a histogram, if they have values; at most `MOST` are shown."""
 MOST = 4
 BARS = 24
 WIDTH, HEIGHT, BELOW, ABOVE = 300, 96, 22, 12
 """Size of a chart without its labels, and the space for labels below and above (px)."""
 BAR = Markup('<rect class="{}" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}"><title>{}</title></rect>')
 FEW = 3
-"""Fewer values than this make no histogram."""
+"""Least number of values of a histogram."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,13 @@ class Comparison:
 
     @property
     def columns(self) -> dict[str, tuple[str, str, pd.Series]]:
-        """The change as a column of the map: label, unit and values by name; empty if no tile has it."""
+        """The change as a column of the map: label, unit and values by name; empty without values."""
         label = ("change of the error estimate", "m", self.change)
         return {"change_m": label} if np.isfinite(self.change).any() else {}
 
 
 def compare(table: TileTable, before: pd.DataFrame, variant: str, name: str) -> Comparison:
-    """Compare the tiles of a run with the rows of another one, called ``name``.
+    """Compare the tiles of a run with the rows of another run.
 
     - `before`: the other run's metrics.parquet.
     - `name`: name of the other run in the text.
@@ -183,7 +183,7 @@ def _mark(limit: float | None, low: float, high: float) -> Markup:
 
 
 def _range(values: np.ndarray, limit: float | None) -> tuple[float, float]:
-    """Return a range that single high values do not stretch, with round ends."""
+    """Return a range with round ends that single high values do not extend."""
     high = float(np.percentile(values, 98))
     if limit is not None and values.max() > limit:
         high = max(high, 1.5 * limit)

@@ -1,4 +1,4 @@
-"""What the page says in words: did the run work, why tiles are flagged, and what to do."""
+"""Texts of the page: whether the run worked, why tiles are flagged, and what to do."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ from flexroad.tools.report.browser.tiles import STATES, TileTable, short
 from flexroad.tools.report.content import MESHES, STEPS, Content
 
 OF_HEIGHTS = ("dropped", NO_ROAD)
-"""Flags that a DSM far from the DTM gives."""
+"""Flags caused by a DSM far from the DTM."""
 MOST = 3
-"""Kinds of errors that are told; the table of failures has all."""
+"""Largest number of kinds of errors in a statement; the table of failures has all."""
 
 
 @dataclass(frozen=True)
 class _Meaning:
-    """What a flag says."""
+    """The meaning of a flag."""
 
     words: str
-    """What is wrong, with ``{value}`` and ``{limit}``."""
+    """Description of the fault, with ``{value}`` and ``{limit}``."""
     remedy: str
-    """What to do, with ``{there}`` where the flag's place belongs."""
+    """Advice, with ``{there}`` for the flag's place."""
     percent: bool = False
     """Whether value and limit are shares, which are shown in percent."""
 
 
 MEANINGS = {
     "error-estimate": _Meaning(
-        "the surface is {value} m off on average, by what it leaves of DSM and DTM (limit {limit} m)",
+        "the surface is {value} m from DSM and DTM on average (limit {limit} m)",
         "compare DSM and DTM{there}: one of them is wrong or older",
     ),
     "worst-error": _Meaning(
@@ -56,7 +56,7 @@ MEANINGS = {
     ),
     "patch": _Meaning(
         "{value} m² of road in one piece are far from both DSM and DTM (limit {limit} m²)",
-        "look for a bridge (`flexroad catalog check` maps unnamed ones), a tree or a gap in the data{there}",
+        "look for a bridge (`flexroad catalog check` maps bridges), a tree or a gap in the data{there}",
     ),
     "spike": _Meaning(
         "the surface bends more than a road can ({value} 1/m, limit {limit} 1/m)",
@@ -72,7 +72,7 @@ MEANINGS = {
     ),
     "off-dtm": _Meaning(
         "{value} of the road lie off the DTM (limit {limit})",
-        "a bridge is right (`flexroad catalog check` maps unnamed ones); otherwise the DTM is wrong or "
+        "a bridge is right (`flexroad catalog check` maps bridges); otherwise the DTM is wrong or "
         "older{there}",
         percent=True,
     ),
@@ -100,7 +100,7 @@ MEANINGS = {
         "a culvert is right; otherwise check the level and the outline of this road",
     ),
     NO_ABUTMENT: _Meaning(
-        "at a deck no road of level 0 goes on",
+        "no road of level 0 continues a deck",
         "check the level of the roads at its ends, and gaps there; level 0 ends by itself",
     ),
     NO_ROAD: _Meaning(
@@ -114,12 +114,12 @@ MEANINGS = {
 def reasons(
     row: Mapping[str, Any], places: Mapping[str, Place], notes: Sequence[str] = ()
 ) -> list[tuple[str, str]]:
-    """Return a tile's flags, each with what is wrong, where, and what to do.
+    """Return a tile's flags, each with a description, a place and advice.
 
     - `row`: the tile's row of metrics.parquet.
     - `places`: place of each flag, as far as known (`flexroad.tasks.quality.flagged.places`).
-    - `notes`: notes on the sources of the tile: a DSM that lies off the DTM as a whole is why roads are
-      dropped.
+    - `notes`: notes on the sources of the tile. A note on a DSM that lies off the whole DTM explains dropped
+      roads.
     """
     given = row.get("flags")
     names = given.split(", ") if isinstance(given, str) and given else []
@@ -133,7 +133,7 @@ def reasons(
 def _reason(name: str, row: Mapping[str, Any], place: Place | None, remedy: str) -> str:
     meaning = MEANINGS.get(name)
     if meaning is None:
-        # A run of another version may have flags of its own.
+        # A run of another version may have other flags.
         return "docs/quality.md explains this flag; look at the tile"
     column = FLAGS.get(name)
     value = row.get(column) if column else None
@@ -159,7 +159,7 @@ def described() -> dict[str, dict[str, Any]]:
 
 def coordinates(east: float, north: float) -> str:
     """Return a place as easting and northing in whole metres: ``588,612 / 4,519,130``."""
-    # Half a metre is rounded up, as by the page's script.
+    # Half a metre is rounded up, like in the page's script.
     return " / ".join(f"{math.floor(value + 0.5):,}" for value in (east, north))
 
 
@@ -171,17 +171,17 @@ def _number(value: Any, percent: bool) -> str:
 
 @dataclass(frozen=True)
 class _Statement:
-    """One line on the run, with what to do."""
+    """One line on the run, with advice."""
 
     kind: str
     """``good``, ``flagged``, ``no-road``, ``failed`` or ``pending``."""
     text: str
     command: str = ""
-    """The next command, ready to be pasted; empty if nothing has to be done."""
+    """The next command, ready to be pasted; empty if no command is needed."""
 
 
 def headline(table: TileTable, skipped: int = 0) -> str:
-    """Return the answer in one sentence; ``skipped`` is the number of files that the catalog lacks."""
+    """Return the outcome in one sentence; ``skipped`` is the number of files that the catalog lacks."""
     n, total = table.counts, len(table.tiles)
     done = n["fine"] + n["flagged"] + n["no-road"]
     if done == total and skipped:
@@ -198,7 +198,7 @@ def headline(table: TileTable, skipped: int = 0) -> str:
 def cards(table: TileTable) -> list[tuple[str, int, str]]:
     """Return the numbers at the top of the page: key of `STATES` or ``all``, number of tiles, and name.
 
-    States without tiles are left out but ``done``.
+    States without tiles are left out, except ``done``.
     """
     shown = [
         (state, table.counts[state], name)
@@ -209,7 +209,7 @@ def cards(table: TileTable) -> list[tuple[str, int, str]]:
 
 
 def statements(content: Content, table: TileTable, failed: Mapping[str, str], run: str) -> list[_Statement]:
-    """Return what is to be known of a run, the most urgent first.
+    """Return the statements on a run, the most urgent first.
 
     - `failed`: the error of each failed tile by id.
     """
@@ -228,14 +228,14 @@ def statements(content: Content, table: TileTable, failed: Mapping[str, str], ru
 
 def _last_run(content: Content, run: str) -> Iterator[_Statement]:
     if content.counts.refused:
-        yield _Statement("failed", f"The last run could not go on: {printable(content.counts.refused)}")
+        yield _Statement("failed", f"The last run could not continue: {printable(content.counts.refused)}")
     if content.counts.interrupted:
         text = "The last run was interrupted; its tiles are kept."
         yield _Statement("pending", text, f"flexroad rerun {run}")
 
 
 def _skipped(content: Content) -> Iterator[_Statement]:
-    """Say which files the catalog lacks: no tile tells."""
+    """Return a statement on files that the catalog lacks: no tile shows them."""
     counts = content.counts
     if not counts.skipped:
         return
@@ -263,7 +263,7 @@ def _failures(number: int, failed: Mapping[str, str], run: str) -> Iterator[_Sta
 
 
 def _kind(error: str) -> str:
-    """Return an error without numbers and names of files, in which errors of one kind differ."""
+    """Return an error without numbers and file names: so errors of one kind are equal."""
     return re.sub(r"\S*[\d/\\]\S*", "", error)
 
 
@@ -300,7 +300,7 @@ def _without_roads(number: int) -> Iterator[_Statement]:
 
 
 def _surfaces(content: Content) -> Iterator[_Statement]:
-    """Say whether neighbouring tiles meet and meshes have no fault."""
+    """Return statements on steps between tiles and faults of meshes."""
     steps, _ = content.tables[STEPS]
     own = steps[steps.variant == content.variant] if len(steps) else steps
     if len(own):

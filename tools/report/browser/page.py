@@ -1,4 +1,4 @@
-"""The page: outcome, map, figures and the tiles to look at, put together from their parts."""
+"""The page, from its parts: outcome, map, figures and the tiles to look at."""
 
 from __future__ import annotations
 
@@ -93,14 +93,14 @@ def html_page(
 
 
 def ranking(table: TileTable) -> tuple[str, list[str]]:
-    """Return by what tiles are ranked, in words, and the ids of the worst tiles, the worst first."""
+    """Return the name of the ranking, and the ids of the worst tiles, the worst first."""
     for column, words in (
         (ESTIMATE, "with the highest error estimate, highest first"),
         (TRUE_ERROR, "with the highest road error (L2), highest first"),
     ):
         values = pd.to_numeric(table.frame[column], errors="coerce").dropna()
         if len(values):
-            # Of equal values the first in the catalog.
+            # Among equal values, the first in the catalog.
             return words, [
                 str(name) for name in values.sort_values(ascending=False, kind="stable").index[:WORST]
             ]
@@ -140,7 +140,7 @@ def _look(
     found: TilePictures | None,
     viewer: str,
 ) -> dict[str, Any]:
-    """Return what the page shows of a tile to look at."""
+    """Return the content of the page on a tile to look at."""
     row: dict[str, Any] = dict(table.frame.loc[name])
     estimate, true = row[ESTIMATE], row[TRUE_ERROR]
     parts = [f"Error estimate {estimate:.2g} m"] if np.isfinite(estimate) else []
@@ -151,7 +151,7 @@ def _look(
         "number": number,
         "figure": f"{'; '.join(parts)}.",
         "reasons": reasons(row, found.places if found else {}, found.notes if found else ()),
-        # The first picture and the last are the most telling.
+        # The first and the last picture show most.
         "pair": tuple(dict.fromkeys((*pictures[:1], *pictures[-1:]))),
         "more": pictures[1:-1],
         "notes": found.notes if found else (),

@@ -93,7 +93,7 @@ class TileTable:
     frame: pd.DataFrame
     """Figures of the first exported variant by tile id, NaN where a tile is not done."""
     states: tuple[str, ...]
-    """A key of `STATES` per tile."""
+    """The state of each tile, a key of `STATES`."""
 
     @property
     def finished(self) -> list[Tile]:
@@ -130,7 +130,7 @@ def _state(state: str, flags: Any) -> str:
 
 
 def _bounds(tiles: Sequence[Tile], crs: str) -> NDArray[np.float64]:
-    # To make a transformer takes as long as to use it a thousand times.
+    # Making a transformer takes as long as a thousand uses.
     transformer = cache(lambda other: pyproj.Transformer.from_crs(other, crs, always_xy=True))
     bounds = np.full((len(tiles), 4), np.nan)
     for i, tile in enumerate(tiles):
@@ -159,10 +159,10 @@ def numeric_columns(table: TileTable) -> dict[str, tuple[str, str, pd.Series]]:
 def map_data(
     table: TileTable, failed: Mapping[str, str], more: Mapping[str, tuple[str, str, pd.Series]]
 ) -> dict[str, Any]:
-    """Return the tiles for the page's script: for `as_script`, which writes the arrays of figures.
+    """Return the tiles for the page's script, to be written by `as_script`.
 
     - `failed`: the error of each failed tile by id.
-    - `more`: further columns, as those of `numeric_columns`: differences.
+    - `more`: further columns in the form of `numeric_columns`: differences.
     """
     finite = table.bounds[np.isfinite(table.bounds[:, 0])]
     west, south, east, north = (*finite[:, :2].min(0), *finite[:, 2:].max(0)) if len(finite) else (0.0,) * 4
@@ -174,7 +174,7 @@ def map_data(
             "label": label,
             "unit": unit,
             "values": values.to_numpy(),
-            # A difference has a neutral colour for zero, whatever its values are.
+            # A difference of zero always has the neutral colour.
             "signed": key in more,
         }
         for key, (label, unit, values) in (numeric_columns(table) | dict(more)).items()
@@ -211,9 +211,9 @@ def errors(content: Content) -> dict[str, str]:
 
 
 def as_script(data: Any) -> str:
-    """Return data as JSON that is safe inside of ``<script>``: no character of it can begin a tag.
+    """Return data as JSON that is safe inside of ``<script>``: no character can begin a tag.
 
-    Arrays of figures, ``(n,)``, have `DIGITS` digits, those of boxes, ``(n, 4)``, centimetres.
+    Arrays of figures, ``(n,)``, have `DIGITS` digits; arrays of boxes, ``(n, 4)``, are in centimetres.
     """
     # One array at a time: as objects, the numbers of all tiles take gigabytes.
     text = json.dumps(data, ensure_ascii=True, allow_nan=False, separators=(",", ":"), default=_listed)
@@ -221,7 +221,7 @@ def as_script(data: Any) -> str:
 
 
 def short(value: float) -> str:
-    """Return a number with three digits, or as a whole one."""
+    """Return a number with three digits, or as a whole number."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 

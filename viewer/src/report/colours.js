@@ -121,7 +121,7 @@ function numberScale(column) {
 
 // --- legend -----------------------------------------------------------------------------------------
 
-// Taken from the page, so that the file has no web address at all.
+// Taken from the page, so that the file has no web address.
 const SVG = document.getElementById("svg").namespaceURI;
 
 export function element(tag, attributes = {}, ...children) {

@@ -1,3 +1,3 @@
-// What the report says of the run, from its page.
+// The data of the report, from its page.
 
 export const DATA = JSON.parse(document.getElementById("data").textContent);

@@ -80,7 +80,7 @@ export class TileMap extends FlatMap {
     for (const [i, rect] of visible) this.paintMarks(i, rect, theme);
     this.paintPlaces(theme);
     for (const [tile, rect] of this.inSight()) if (tile === this.selected) this.twice(theme, [6, 3], () => c.strokeRect(...wholePixels(rect)));
-    // On paper the map has another size than in the window, and its scale bar is a part of it.
+    // On paper the map, with its scale bar, has another size than in the window.
     if (printing) this.paintScale(SCALE_PX, [14, this.box.height - 14], theme.mark, "14px sans-serif");
     // While all of the run is visible, a finger scrolls the page.
     this.canvas.style.touchAction = this.isFitted() ? "pan-y" : "none";

@@ -10,7 +10,7 @@ function sortKey(text) {
   return text.trim() !== "" && Number.isFinite(number) ? number : text;
 }
 
-// Numbers before texts, empty ones last in both directions.
+// Numbers before texts, empty cells last in both directions.
 function compareKeys(a, b, direction) {
   const empty = (v) => v === "–" || v === "" || v === null || v === undefined;
   if (empty(a) || empty(b)) return empty(a) - empty(b);

@@ -243,7 +243,7 @@ def test_pipes_are_not_opened(tmp_path):
 
 @pytest.mark.parametrize("offset", [(float("nan"), 0, 0), (1e300, 0, 0)])
 def test_offset_that_is_no_place_raises(tmp_path, offset):
-    fails(write(tmp_path, "m.obj"), "which is no place; give --offset", offset=offset)
+    fails(write(tmp_path, "m.obj"), "which is not a place; give --offset", offset=offset)
 
 
 @pytest.mark.slow
