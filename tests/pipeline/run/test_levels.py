@@ -283,7 +283,7 @@ def test_mosaic_of_a_level_has_its_heights_alone(run, cells, level, tmp_path):
 
 def test_smooth_formats_say_that_they_have_level_0(run, tmp_path):
     call("export", run.path, "--format", "step", "-o", tmp_path).expected(0)
-    assert "the surface is that of level 0" in (tmp_path / "export.json").read_text()
+    assert "the surface is the ground (level 0)" in (tmp_path / "export.json").read_text()
 
 
 @pytest.fixture(scope="module")
