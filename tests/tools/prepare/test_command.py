@@ -17,7 +17,6 @@ from tests.make_clouds import write_cloud
 from tests.permissions import permissions_enforced
 
 WEST, SOUTH = 356_000.0, 5_699_000.0
-AHN = ("--bridge-class", "26")
 
 
 def flexroad(*words, expect=0) -> str:
@@ -69,11 +68,12 @@ def test_prepare_points_options_are_applied(cloud, tmp_path):
 
     flexroad(
         "prepare", "points", cloud, "-o", tmp_path, "--cell", 2, "--dop-cell", 1, "--ground-class", 2, 6,
-        "--workers", 1,
+        "--bridge-class", 6, "--workers", 1,
     )  # fmt: skip
     with rasterio.open(tmp_path / "dtm.tif") as raster:
         assert raster.res == (2, 2)
         assert "2, 6" in raster.tags()["DTM"]
+    assert (tmp_path / "bridges.tif").is_file()
 
 
 @pytest.mark.parametrize(
@@ -81,9 +81,6 @@ def test_prepare_points_options_are_applied(cloud, tmp_path):
     [
         (["points", "nowhere.laz"], "nowhere.laz"),
         (["points", "CLOUD", "--crs", "EPSG:4"], "EPSG:4"),
-        (["points", "CLOUD", "--to-crs", "EPSG:4326"], "EPSG:4326"),
-        (["points", "CLOUD", "--roads", "nowhere.gpkg"], "nowhere.gpkg"),
-        (["points", "CLOUD", "--dop-cell", "0.3"], "--dop-cell"),
         (["points", "CLOUD", "--ground", "classes", "--ground-class", "9"], "class 9"),
         (["mesh", "nowhere.obj"], "nowhere.obj"),
         (["odm", "nowhere"], "nowhere"),
@@ -115,12 +112,6 @@ def test_prepare_into_folder_with_raster_of_others_changes_nothing(cloud, tmp_pa
     assert contents(tmp_path) == {"dtm.tif": b"mine"}
 
 
-def test_prepare_again_replaces_own_outputs(cloud, tmp_path):
-    for _ in range(2):
-        flexroad("prepare", "points", cloud, "-o", tmp_path, "--workers", 1)
-    assert not (tmp_path / "lock.json").exists()
-
-
 def test_prepare_into_folder_in_use_is_refused(cloud, tmp_path):
     with run_lock(tmp_path):
         error = refusal("points", cloud, "-o", tmp_path)
@@ -129,11 +120,12 @@ def test_prepare_into_folder_in_use_is_refused(cloud, tmp_path):
         assert contents(tmp_path).keys() == {"lock.json"}
 
 
-def test_prepare_into_folder_of_killed_process_takes_over_its_lock(cloud, tmp_path):
-    (tmp_path / "lock.json").write_bytes(replace(Owner.me(), pid=2**22 + 1).data)
-    said = flexroad("prepare", "points", cloud, "-o", tmp_path, "--workers", 1)
-    assert "note: took over the lock of pid" in said
-    assert not (tmp_path / "lock.json").exists()
+def test_prepare_again_takes_over_the_lock_of_a_killed_process_and_replaces_own_outputs(cloud, tmp_path):
+    for took_over in (False, True):
+        said = flexroad("prepare", "points", cloud, "-o", tmp_path, "--workers", 1)
+        assert ("note: took over the lock of pid" in said) == took_over
+        assert not (tmp_path / "lock.json").exists()
+        (tmp_path / "lock.json").write_bytes(replace(Owner.me(), pid=2**22 + 1).data)
 
 
 def test_prepare_into_folder_that_cannot_be_written_names_the_remedy(cloud, tmp_path):
@@ -169,22 +161,3 @@ def test_prepare_interrupted_leaves_no_folder(cloud, tmp_path, number):
     assert process.returncode == 130, output
     assert "nothing was written" in output[1]
     assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "is_bridge"),
-    [
-        ((), False),
-        (("--bridge-class", "26"), True),
-        (("--bridge-class", "17"), False),
-    ],
-)
-def test_prepare_points_bridge_class_selects_bridges(tmp_path, words, is_bridge):
-    east, north = np.meshgrid(np.arange(0, 40, 0.5), np.arange(0, 40, 0.5))
-    kind = np.where(abs(north - 20) < 4, 26, 2)
-    # A place in the Netherlands: elsewhere a metre of their CRS is none.
-    xyz = np.stack([east + 155_000, north + 463_000, np.where(kind == 26, 6.0, 0.0)], -1).reshape(-1, 3)
-    path = write_cloud(tmp_path / "ahn.las", xyz, kind.ravel(), "EPSG:28992")
-    said = flexroad("prepare", "points", path, "-o", tmp_path / "out", "--workers", 1, *words)
-    assert (tmp_path / "out" / "bridges.tif").is_file() == is_bridge
-    assert ("--bridge-class 26 takes them" in said) == (not is_bridge)
