@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -69,7 +70,8 @@ def test_encode_read_by_pyopencrg_has_the_line_and_the_heights_of_the_surface(
     np.testing.assert_allclose([road.x, road.y], [truth.line.x, truth.line.y], atol=1e-4)
     np.testing.assert_allclose(road.v, truth.v, atol=1e-9)
     np.testing.assert_allclose(road.surface_z(), truth.heights, atol=1e-4)
-    assert (road.phi_start, road.phi_end) == pytest.approx((road.phi[0], road.phi[-1]), abs=1e-6)
+    ends = re.findall(rb"REFERENCE_LINE_(?:START|END)_PHI\s*=\s*(\S+)", path.read_bytes())
+    assert [float(end) for end in ends] == pytest.approx(truth.line.chord_headings[[0, -1]], abs=1e-6)
     rng = np.random.default_rng(0)
     u, v = rng.uniform(0, road.u_end, 2000), rng.uniform(truth.v[0], truth.v[-1], 2000)
     x, y = road.uv_to_xy(u, v)

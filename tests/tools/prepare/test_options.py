@@ -38,21 +38,22 @@ def grid(bounds, out, photo=True, per_cell=0, **common):
 
 
 @pytest.mark.parametrize(
-    ("clouds", "message"),
+    ("clouds", "chunk", "message"),
     [
-        (([], [(2e6, 7)]), "b.las has a point at easting 2356000.00 and northing 5699007.00"),
-        (([(9, 2e6)],), "a.las has a point at easting 356009.00 and northing 7699000.00"),
+        (([], [(2e6, 7)]), 5000, "b.las has a point at easting 2356000.00 and northing 5699007.00"),
+        (([(9, 2e6)],), 5000, "a.las has a point at easting 356009.00 and northing 7699000.00"),
         # A part of a file, far from the parts before: its farthest point.
-        (([(0, 2e6), (5, 2.1e6)],), "a.las has a point at easting 356005.00 and northing 7799000.00"),
+        (([(0, 2e6), (5, 2.1e6)],), 1000, "a.las has a point at easting 356005.00 and northing 7799000.00"),
         # Few points behind a gap.
         (
             ([], [(70_000, 60_000), (70_001, 60_000)]),
+            5000,
             r"b.las has points at easting 42600[01].00 and northing 5759000.00 \(m\), \d\d km from the",
         ),
     ],
 )
-def test_distant_points_are_named_with_their_file(tmp_path, monkeypatch, clouds, message):
-    monkeypatch.setattr(point_reading, "CHUNK", 1000)
+def test_distant_points_are_named_with_their_file(tmp_path, monkeypatch, clouds, chunk, message):
+    monkeypatch.setattr(point_reading, "CHUNK", chunk)
     files = [cloud(tmp_path / f"{name}.las", *far) for name, far in zip("ab", clouds, strict=False)]
     with pytest.raises(CatalogError, match=message):
         prepare(files, tmp_path / "out")
