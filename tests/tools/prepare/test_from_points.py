@@ -290,7 +290,9 @@ def test_prepare_points_dense_noisy_cloud_gives_unbiased_ground(tmp_path):
     assert abs(np.nanmedian(dtm) - 50) < 0.01
 
 
-def bad_inputs(folder: Path):
+@pytest.fixture(scope="module")
+def bad_inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bad")
     xyz, kind, _ = world()
     crs = "EPSG:25832"
     good = write_cloud(folder / "good.laz", xyz, kind, crs)
@@ -327,8 +329,8 @@ BAD = "missing empty cut_laz cut_las no_crs mixed contradicted noise far mercato
 
 
 @pytest.mark.parametrize("name", BAD.split())
-def test_prepare_points_invalid_input_is_one_line_and_leaves_no_folder(tmp_path, name):
-    files, options, message = bad_inputs(tmp_path / "clouds")[name]
+def test_prepare_points_invalid_input_is_one_line_and_leaves_no_folder(bad_inputs, tmp_path, name):
+    files, options, message = bad_inputs[name]
     with pytest.raises((CatalogError, ConfigError), match=message) as error:
         prepare(files, tmp_path / "out", **options)
     assert "\n" not in str(error.value)

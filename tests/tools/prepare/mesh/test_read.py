@@ -207,69 +207,45 @@ def cut_short(path):
     path.write_bytes(path.read_bytes()[:300])
 
 
+GONE = Path.unlink
+BARE_FACES = "f 1 2 3\nf 1 3 4\n"
 NO_COLOURS = [
-    (write_obj, {"m.png": Path.unlink}, "m.obj needs the texture .*m.png, which does not exist.*--no-dop"),
-    (write_ply, {"m.png": Path.unlink}, "m.ply needs the texture .*m.png, which does not exist.*--no-dop"),
+    (write_obj, {"m.png": GONE}, "m.obj needs the texture .*m.png, which does not exist.*--no-dop"),
+    (write_ply, {"m.png": GONE}, "m.ply needs the texture .*m.png, which does not exist.*--no-dop"),
     (write_obj, {"m.png": cut_short}, "the texture .*m.png of .*m.obj cannot be read"),
-    (
-        write_obj,
-        {"m.mtl": Path.unlink},
-        "m.obj needs the material file m.mtl, which is not beside it.*--no-dop",
-    ),
-    (
-        obj(faces="usemtl m\nf 1 2 3\nf 1 3 4\n"),
-        {},
-        "m.obj has a texture but no texture coordinates.*--no-dop",
-    ),
-    (obj(head="", faces="f 1 2 3\nf 1 3 4\n"), {}, "m.obj has no colours.*--no-dop"),
+    (write_obj, {"m.mtl": GONE}, "m.obj needs the material file m.mtl, which is not beside it.*--no-dop"),
+    (obj(faces="usemtl m\n" + BARE_FACES), {}, "m.obj has a texture but no texture coordinates.*--no-dop"),
+    (obj(head="", faces=BARE_FACES), {}, "m.obj has no colours.*--no-dop"),
 ]
 """Meshes that can be read without colours: how they are written, what is done to a file, and the error."""
+SIDECAR_FAULTS = [
+    ("data_meta.json", '{"reference_utm": {"offset": [1, 2, 3]}}', " has no reference_utm"),
+    ("coords.txt", "WGS84 UTM 17N\n", " has no CRS in its first line and an offset"),
+    (
+        "metadata.xml",
+        MODEL_METADATA.format("ENU:37.2,-80.4", "0,0,0"),
+        " has no SRS like .*ENU:37.2,-80.4.*--crs and --offset",
+    ),
+    (
+        "metadata.xml",
+        MODEL_METADATA.format("EPSG:32617", "552208,4114742"),
+        " has no SRS like .* with an SRSOrigin of three numbers",
+    ),
+]
+NO_NUMBER = obj(head="mtllib m.mtl\nv nan 0 0\n", faces="usemtl m\nf 1/1 2/2 3/3\n")
 BAD = [
     *((write, changes, PLACED, message) for write, changes, message in NO_COLOURS),
+    *((write_obj, {name: text}, {}, name + message) for name, text, message in SIDECAR_FAULTS),
     (bare_glb, {}, PLACED, "m.glb has no colours"),
     (write_obj, {}, {}, "m.obj has no georeference.*--crs EPSG:.*--offset"),
     (write_obj, {}, {"crs": CRS}, "m.obj has no georeference"),
     (write_obj, {}, {"crs": "EPSG:nothing", "offset": ZERO}, "m.obj: unknown CRS 'EPSG:nothing'"),
-    (
-        write_obj,
-        {"data_meta.json": '{"reference_utm": {"offset": [1, 2, 3]}}'},
-        {},
-        "data_meta.json has no reference_utm",
-    ),
-    (
-        write_obj,
-        {"coords.txt": "WGS84 UTM 17N\n"},
-        {},
-        "coords.txt has no CRS in its first line and an offset",
-    ),
-    (
-        write_obj,
-        {"metadata.xml": MODEL_METADATA.format("ENU:37.2,-80.4", "0,0,0")},
-        {},
-        "metadata.xml has no SRS like .*ENU:37.2,-80.4.*--crs and --offset",
-    ),
-    (
-        write_obj,
-        {"metadata.xml": MODEL_METADATA.format("EPSG:32617", "552208,4114742")},
-        {},
-        "metadata.xml has no SRS like .* with an SRSOrigin of three numbers",
-    ),
     (obj(faces=""), {}, PLACED, "m.obj has no faces"),
     (obj(faces="usemtl m\nf 1/1 2/2 2/2\n"), {}, PLACED, "m.obj has faces but no area"),
-    (
-        obj(head="mtllib m.mtl\nv nan 0 0\n", faces="usemtl m\nf 1/1 2/2 3/3\n"),
-        {},
-        PLACED,
-        "m.obj has faces with missing or non-finite corners",
-    ),
+    (NO_NUMBER, {}, PLACED, "m.obj has faces with missing or non-finite corners"),
     (write_glb, {"m.glb": cut_short}, PLACED, "m.glb cannot be read as a mesh"),
-    (lambda folder, texture: folder / "gone.obj", {}, PLACED, "gone.obj does not exist"),
-    (
-        lambda folder, texture: folder / "m.fbx",
-        {"m.fbx": "Kaydara"},
-        PLACED,
-        "m.fbx is not a mesh of a supported format",
-    ),
+    (lambda folder, _: folder / "gone.obj", {}, PLACED, "gone.obj does not exist"),
+    (lambda folder, _: folder / "m.fbx", {"m.fbx": "x"}, PLACED, "m.fbx is not a mesh of a supported format"),
 ]
 
 
