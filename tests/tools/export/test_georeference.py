@@ -14,9 +14,8 @@ from flexroad.tools.export.georeference import Datum, Georeference, LocalFrame, 
 PLACE = Georeference("EPSG:25832", (295500.0, 5629250.0, 150.0), "EPSG:7837")
 
 
-def test_sidecar_has_place_axes_and_other_entries():
-    content = json.loads(PLACE.sidecar("x east", step_m=0.5))
-    assert content == {
+def test_sidecar_lines_and_prj_have_the_place():
+    assert json.loads(PLACE.sidecar("x east", step_m=0.5)) == {
         "crs": "EPSG:25832",
         "crs_name": "ETRS89 / UTM zone 32N",
         "vertical_crs": "EPSG:7837",
@@ -24,22 +23,14 @@ def test_sidecar_has_place_axes_and_other_entries():
         "axes": "x east",
         "step_m": 0.5,
     }
-
-
-def test_lines_are_single_ascii_lines():
     wkt = 'PROJCRS["Réunion",\n BASEGEOGCRS["b"]]'
-    lines = Georeference(wkt, PLACE.origin).lines()
-    assert lines == [
+    assert Georeference(wkt, PLACE.origin).lines() == [
         "origin 295500 5629250 150 (easting northing height, m)",
         'crs PROJCRS["R\\xe9union", BASEGEOGCRS["b"]]',
         "vertical crs unknown",
     ]
-
-
-def test_prj_is_read_as_the_same_crs():
-    text = PLACE.prj().decode()
-    assert len(text.splitlines()) == 1
-    assert CRS.from_user_input(text).to_epsg(20) == 25832
+    (line,) = PLACE.prj().decode().splitlines()
+    assert CRS.from_user_input(line).to_epsg(20) == 25832
 
 
 PLACES = {
@@ -94,28 +85,15 @@ def geoid(tmp_path):
     return path
 
 
-def test_offset_is_added_and_the_place_is_that_of_pyproj():
-    longitude, latitude, height = Datum("offset", "47.5").geographic("EPSG:25832", *POINT)
-    expected = Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True).transform(*POINT[:2])
-    np.testing.assert_allclose((longitude, latitude), expected, atol=1e-12)
-    assert height == 147.5
-
-
-def test_geoid_is_added_at_each_place(geoid):
+def test_offset_or_geoid_is_added_at_each_place(geoid):
     east = np.array([460_000.0, 500_000.0, 540_000.0])
     north, level = np.full(3, 5_600_000.0), np.array([0.0, 100.0, 200.0])
+    place = Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True).transform(east, north)
+    *found, height = Datum("offset", "47.5").geographic("EPSG:25832", east, north, level)
+    np.testing.assert_allclose(found, place, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(height, level + 47.5)
     longitude, _, height = Datum("geoid", str(geoid)).geographic("EPSG:25832", east, north, level)
     np.testing.assert_allclose(height - level, 47 + (longitude - 9), atol=1e-4)
-
-
-def test_geoid_that_does_not_cover_the_area_raises(geoid):
-    with pytest.raises(CatalogError, match=r"no exact conversion from EPSG:25833 .*--geoid FILE"):
-        Datum("geoid", str(geoid)).geographic("EPSG:25833", *POINT)
-
-
-def test_vertical_crs_without_its_grid_raises_and_is_not_ignored():
-    with pytest.raises(CatalogError, match=r"heights of EPSG:7837 .*; give the geoid's grid with --geoid"):
-        Datum("crs", "EPSG:7837").geographic("EPSG:25832", *POINT)
 
 
 def test_geocentric_agrees_with_the_equations_of_the_ellipsoid():
@@ -132,7 +110,17 @@ def test_geocentric_agrees_with_the_equations_of_the_ellipsoid():
     np.testing.assert_allclose(geocentric(longitude, latitude, height)[0], np.ravel(expected), atol=1e-6)
 
 
-@pytest.mark.parametrize(("kind", "value"), [("geoid", "none.gtx"), ("offset", "nan")])
-def test_datum_that_cannot_be_used_raises(kind, value):
-    with pytest.raises(CatalogError, match=value):
-        Datum(kind, value)
+@pytest.mark.parametrize(
+    ("kind", "value", "crs", "message"),
+    [
+        ("geoid", "none.gtx", "EPSG:25832", "none.gtx"),
+        ("offset", "nan", "EPSG:25832", "nan"),
+        # The geoid does not cover the area.
+        ("geoid", "GEOID", "EPSG:25833", r"no exact conversion from EPSG:25833 .*--geoid FILE"),
+        # PROJ has no grid of this datum.
+        ("crs", "EPSG:7837", "EPSG:25832", r"heights of EPSG:7837 .*; give the geoid's grid with --geoid"),
+    ],
+)
+def test_datum_that_cannot_be_used_raises(geoid, kind, value, crs, message):
+    with pytest.raises(CatalogError, match=message):
+        Datum(kind, value.replace("GEOID", str(geoid))).geographic(crs, *POINT)

@@ -115,17 +115,13 @@ def test_write_head_has_units_crs_and_time():
     assert root.find(f"{SPACE}Project").get("name") == "Aachen"
 
 
-def test_write_unknown_heights_have_no_datum():
-    project = Project('<a> & "b"\n', PROJECT.written)
-    root = ElementTree.fromstring(written([tile()], project))
-    assert root.find(f"{SPACE}CoordinateSystem").get("verticalDatum") is None
-    assert root.find(f"{SPACE}Project").get("name") == '<a> & "b"\\n'
-
-
-def test_write_crs_without_code_is_wkt():
+def test_write_unknown_heights_have_no_datum_and_a_crs_without_code_is_wkt():
     wkt = CRS.from_proj4("+proj=tmerc +lat_0=50 +lon_0=6 +k=1 +units=m").to_wkt(pretty=True)
-    system = ElementTree.fromstring(written([replace(tile(), crs=wkt)])).find(f"{SPACE}CoordinateSystem")
-    assert system.get("epsgCode") is None
+    project = Project('<a> & "b"\n', PROJECT.written)
+    root = ElementTree.fromstring(written([replace(tile(), crs=wkt)], project))
+    assert root.find(f"{SPACE}Project").get("name") == '<a> & "b"\\n'
+    system = root.find(f"{SPACE}CoordinateSystem")
+    assert (system.get("verticalDatum"), system.get("epsgCode")) == (None, None)
     assert CRS(system.get("ogcWktCode")).equals(CRS(wkt))
 
 

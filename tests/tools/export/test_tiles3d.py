@@ -59,10 +59,12 @@ def test_regions_contain_all_vertices():
     made, placed_sheet, _ = sheet_of(4000.0, east, north, 64.0)
     for region, inside in ((at(east, north, 250)["region"], points), (placed_sheet["region"], made.points)):
         longitude, latitude, height = DATUM.geographic(PLACE.crs, *inside.T)
-        own = [*np.radians([longitude, latitude]), height]
-        assert (np.min(own, axis=1) >= [region[0], region[1], region[4]]).all()
-        assert (np.max(own, axis=1) <= [region[2], region[3], region[5]]).all()
-        assert region[2] - region[0] < np.ptp(own[0]) + 1e-5
+        plan, (west, south, east_, north_, low, high) = np.radians([longitude, latitude]), region
+        assert (plan.min(axis=1) > [west, south]).all()
+        assert (plan.max(axis=1) < [east_, north_]).all()
+        assert low <= height.min() < height.max() <= high
+    west, _, east_, *_ = placed_sheet["region"]
+    assert east_ - west < np.ptp(plan[0]) + 1e-7
 
 
 @given(st.lists(st.tuples(*[st.floats(-1, 1)] * 6), min_size=1, max_size=9))
