@@ -6,7 +6,7 @@ import shapely
 from shapely import LineString, Point, Polygon
 
 from flexroad.pipeline.run.sampler import Heights
-from flexroad.tools.lift import features
+from flexroad.tools.lift import features, types
 from flexroad.tools.lift.features import Feature, grades, level_columns, lifted, wanted_levels
 from flexroad.tools.lift.network import ANY
 from flexroad.tools.lift.shapes import of_wkb, to_wkb
@@ -148,3 +148,24 @@ def test_levels_are_read_from_columns_that_say_them():
     assert level_columns(["Bridge", "layer", "b"]) == ["Bridge", "layer"]
     assert wanted_levels({"Bridge": ["yes", None], "layer": ["2", "1"]}, 2) == [2, 0]
     assert wanted_levels({}, 2) == [ANY, ANY]
+
+
+def test_each_part_has_its_heights_in_order_whatever_the_batch(monkeypatch):
+    asked = []
+
+    def heights(x, y):
+        asked.append(len(x))
+        return Heights((0,), (x + y)[None])
+
+    parts = [*"ab", 3, 0, *"c", 5]
+    for size in (1, 4, 100):
+        monkeypatch.setattr(types, "POINTS", size)
+        found = types.with_heights(
+            parts,
+            lambda part: types.NO_POINTS if isinstance(part, str) else (np.arange(part), np.ones(part)),
+            heights,
+        )
+        result = [(part, own.ground.tolist()) for part, own in found]
+        assert [part for part, _ in result] == parts
+        assert [own for _, own in result] == [[], [], [1, 2, 3], [], [], [1, 2, 3, 4, 5]]
+    assert asked[-1] == 8

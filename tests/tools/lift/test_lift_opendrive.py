@@ -56,40 +56,6 @@ def test_roads_get_the_heights_of_the_run(run, flexroad, tmp_path, header, words
     assert float(row["grade_max_percent"]) == pytest.approx(2 if turned else 5, abs=0.01)
 
 
-def test_roads_that_stay_are_named_with_the_reason(run, flexroad, tmp_path):
-    bad = road(length=0.0, name="9")
-    source, out = write(tmp_path, ROAD, bad, header=UTM + HERE), tmp_path / "out.xodr"
-    said = flexroad("lift", source, run, "-o", out).expected(0)
-    assert said.err == "note: 1 road: has a length of 0 m; it stays as it was (9)\n"
-    assert bad in out.read_text()
-
-
-@pytest.mark.parametrize(
-    ("text", "words", "message"),
-    [
-        (None, [], "carries no CRS; give it with --crs"),
-        (None, ["--crs", "EPSG:25832"], "does not lie on the finished tiles"),
-        ("<OpenDRIVE><road>", ["--crs", "EPSG:25832"], "is not whole XML"),
-        ("<OpenDRIVE/>", ["--crs", "EPSG:25832"], "has no road or feature with coordinates"),
-        ("<OpenDRIVE><header><geoReference>+proj=what</geoReference></header></OpenDRIVE>", [], "not read"),
-        ('<!DOCTYPE a [<!ENTITY b "c">]><OpenDRIVE>&b;</OpenDRIVE>', [], "declares the entity 'b'"),
-        ("<OpenDRIVE><header><offset x='b'/></header></OpenDRIVE>", [], "offset with x 'b'"),
-    ],
-)
-def test_a_file_that_cannot_be_lifted_is_one_line_and_leaves_nothing(
-    run, flexroad, tmp_path, text, words, message
-):
-    source, out = write(tmp_path, ROAD), tmp_path / "out.xodr"
-    if text is not None:
-        source.write_text(text)
-    said = flexroad("lift", source, run, "-o", out, *words)
-    assert said.code == 2
-    assert message in said.err
-    assert str(source) in said.err
-    assert len(said.err.strip().splitlines()) == 1
-    assert [path.name for path in tmp_path.iterdir()] == [source.name]
-
-
 @pytest.mark.parametrize(
     "shape",
     [
