@@ -2,32 +2,19 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from flexroad.tools.synthetic import make_scene
 from flexroad.tools.synthetic.gerod import APART_M, PRESET, STRATA, survey
 
 
-def test_survey_default_has_strata_of_paper():
-    places = survey(seed=1)
-    assert (
-        Counter(stratum for _, _, stratum, _ in places)
-        == STRATA
-        == {"urban": 168, "suburban": 23, "rural": 49}
-    )
-    assert len({tile_id for tile_id, *_ in places}) == 240
-
-
-def test_survey_24_tiles_is_stratified():
-    assert Counter(stratum for _, _, stratum, _ in survey(24)) == {"urban": 17, "suburban": 2, "rural": 5}
-
-
 @settings(max_examples=30)
 @given(st.integers(1, 300), st.integers(0, 5))
+@example(240, 1)
 def test_survey_any_size_has_shares_of_paper(tiles, seed):
     places = survey(tiles, seed)
-    assert len(places) == tiles
+    assert len({name for name, *_ in places}) == tiles
     counts = Counter(stratum for _, _, stratum, _ in places)
     for stratum, share in STRATA.items():
         assert abs(counts[stratum] - tiles * share / 240) < 1
@@ -59,7 +46,7 @@ def test_survey_options_vary_around_those_of_stratum():
 
 @pytest.mark.parametrize("stratum", STRATA)
 def test_survey_scenes_have_plausible_road_share_and_height(stratum):
-    tiles = [place for place in survey(60) if place[2] == stratum][:5]
+    tiles = [place for place in survey(60) if place[2] == stratum][:3]
     scenes = [make_scene(grid, 0, name, options) for _, grid, name, options in tiles]
     least, most = {"urban": (0.12, 0.35), "suburban": (0.08, 0.3), "rural": (0.03, 0.2)}[stratum]
     for scene in scenes:

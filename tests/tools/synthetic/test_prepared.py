@@ -61,12 +61,6 @@ def test_write_tile_returns_the_tile_of_its_files(tmp_path):
             assert file.nodata is None
 
 
-def test_write_tile_heights_are_exact_to_a_tenth_of_a_millimetre(tmp_path):
-    write_tile(tmp_path, "a", GRID, {"dtm": heights()})
-    with rasterio.open(tmp_path / "dtm" / "a.tif") as file:
-        assert np.nanmax(np.abs(file.read(1) - heights())) < 1e-4
-
-
 def test_write_tile_layers_follow_catalog_order(tmp_path):
     names = ("reference_road", "reference", "dtm", "road_mask", "dsm")
     layers = {name: road() if "road" in name else heights() for name in names}
@@ -101,13 +95,6 @@ def test_write_tile_odd_lattice_is_exact(tmp_path, cell, west, north):
     assert tile.grid == grid
     with rasterio.open(tmp_path / "dsm" / "a.tif") as file:
         assert (file.transform, file.shape) == (grid.transform, grid.shape)
-
-
-def test_write_tile_again_replaces_files(tmp_path):
-    write_tile(tmp_path, "a", GRID, {"dsm": heights()})
-    write_tile(tmp_path, "a", GRID, {"dsm": heights() + 1})
-    with rasterio.open(tmp_path / "dsm" / "a.tif") as file:
-        assert file.read(1)[1, 1] == np.float32(heights()[1, 1] + 1)
 
 
 def test_write_tile_failed_keeps_old_file(tmp_path):
