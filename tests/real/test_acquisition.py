@@ -7,6 +7,7 @@ import csv
 import re
 import shlex
 import shutil
+import zipfile
 from pathlib import Path
 
 import laspy
@@ -22,7 +23,7 @@ from tests.real.opendrive import reference_lines
 from tests.real.shown import flexroad, measured, table_after
 
 PAGE = (Path(__file__).parents[2] / "docs" / "results" / "real_data.md").read_text()
-SETS = ("autzen", "ign", "stbarth", "brighton", "deepscenario")
+SETS = ("barbican", "gothenburg", "autzen", "ign", "stbarth", "brighton", "deepscenario")
 ROADS = Path(__file__).parent / "roads"
 FOOT = 0.3048
 ORIGIN = (552_208.0, 4_114_742.0)
@@ -37,6 +38,8 @@ def folder(real_data, tmp_path_factory) -> Path:
     for name in ("autzen", "ign_crops", "brighton_beach", "deepscenario"):
         (path / name).symlink_to(real_data / name)
     (path / "roads").symlink_to(ROADS)
+    for archive in ("London_BNG", "Goteborg_SWEREF99_1200"):
+        zipfile.ZipFile(real_data / "umep" / f"{archive}.zip").extractall(path / "umep")
     for name in SETS:
         for line in commands(name):
             flexroad(shlex.split(line)[1:], path)
@@ -44,7 +47,7 @@ def folder(real_data, tmp_path_factory) -> Path:
 
 
 def commands(name: str) -> list[str]:
-    lines = re.findall(rf"^flexroad .*(?:data|runs)/{name}$", PAGE, flags=re.MULTILINE)
+    lines = re.findall(rf"^flexroad .*[ /]{name}(?:\.parquet)?$", PAGE, flags=re.MULTILINE)
     assert len(lines) == 2
     return lines
 
