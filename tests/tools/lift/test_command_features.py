@@ -272,14 +272,16 @@ def test_a_line_with_heights_beyond_the_survey_keeps_them_or_goes_on_level(run, 
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_columns_and_report_have_grade_crossfall_and_error(run, flexroad, tmp_path, suffix):
+def test_columns_and_report_have_grades_errors_and_decks_of_unknown_height(run, flexroad, tmp_path, suffix):
     east = LineString(place((2, 5), (30, 5)))
     north = LineString(place((5, 2), (5, 30)))
-    source = write(tmp_path / f"in.{suffix}", [east, north], index=suffix != "fgb", id=[1, 2])
+    columns = {"id": [1, 2], "bridge": [None, "yes"]}
+    source = write(tmp_path / f"in.{suffix}", [east, north], index=suffix != "fgb", **columns)
     out, report = tmp_path / f"out.{suffix}", tmp_path / "rows.csv"
     limits = ["--grade-limit", 4, "--crossfall-limit", 4]
     words = ["--columns", "--report", report, *limits, "--crs", UTM]
-    flexroad("lift", source, run, "-o", out, *words).expected(0)
+    said = flexroad("lift", source, run, "-o", out, *words).expected(0)
+    assert "28.0 m of 1 feature are on a deck of unknown height" in said.err
     table, rows = geopandas.read_file(out), list(csv.DictReader(report.open()))
     names = ["grade_max_percent", "crossfall_max_percent", "error_estimate_m"]
     columns = ["grade_pct", "crossf_pct", "error_m"] if suffix == "shp" else names
@@ -289,6 +291,7 @@ def test_columns_and_report_have_grade_crossfall_and_error(run, flexroad, tmp_pa
     assert list(table.id) == [1, 2]
     np.testing.assert_allclose([float(row["grade_max_percent"]) for row in rows], [5, 2], atol=1e-3)
     np.testing.assert_allclose([float(row["length_m"]) for row in rows], 28, atol=1e-3)
+    assert [float(row["unknown_deck_m"]) for row in rows] == [0, 28]
     places = geopandas.read_file(report.with_suffix(".gpkg"))
     assert list(places.kind) == ["grade", "crossfall"]
     assert_on_ground(places.geometry)
@@ -379,16 +382,3 @@ def test_lift_replaces_an_older_copy(run, flexroad, tmp_path):
     flexroad("lift", out, run, "-o", tmp_path / "again.gpkg").expected(0)
     first, again = geopandas.read_file(out), geopandas.read_file(tmp_path / "again.gpkg")
     assert list(first.geometry.to_wkb()) == list(again.geometry.to_wkb())
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_a_bridge_of_which_the_run_has_no_level_is_reported(run, flexroad, tmp_path, suffix):
-    lines = [LineString(place((2, 5), (30, 5))), LineString(place((5, 2), (5, 30)))]
-    columns = {"id": [1, 2], "bridge": [None, "yes"]}
-    source = write(tmp_path / f"in.{suffix}", lines, index=suffix != "fgb", **columns)
-    report = tmp_path / "rows.csv"
-    words = ["-o", tmp_path / f"out.{suffix}", "--report", report, "--crs", UTM]
-    said = flexroad("lift", source, run, *words).expected(0)
-    assert "28.0 m of 1 feature are on a deck of unknown height" in said.err
-    rows = list(csv.DictReader(report.open()))
-    assert [float(row["unknown_deck_m"]) for row in rows] == [0, 28]

@@ -80,7 +80,7 @@ def test_fewer_vertices_with_a_larger_tolerance_and_none_if_not_wanted():
     assert len(one(line, run, add_vertices=False)[0].coords) == 2
 
 
-def test_line_over_a_deck_takes_it_by_its_level_or_by_continuity():
+def test_line_or_point_over_a_deck_takes_it_by_its_level_or_by_continuity():
     run, line = Waves(deck=True), LineString([(10, 0), (90, 0)])
     below, row = one(line, run)
     assert row.levels == (0,)
@@ -92,10 +92,7 @@ def test_line_over_a_deck_takes_it_by_its_level_or_by_continuity():
     assert row.levels == (0,)
     _, row = one(line, run, wanted=1)
     assert row.unknown_deck_m == pytest.approx(60, abs=1)
-
-
-def test_point_without_a_level_takes_the_highest():
-    run = Waves(deck=True)
+    # A point takes the highest level if nothing names another.
     assert one(Point(50, 0), run)[0].z == pytest.approx(run.height(50, 0) + 6)
     assert one(Point(50, 0), run, wanted=0)[0].z == pytest.approx(run.height(50, 0))
 
@@ -121,13 +118,6 @@ def test_a_line_far_longer_than_the_run_is_not_sampled_off_it():
     assert row.without_ground_m == pytest.approx(1e8)
     _, row = one(LineString([(-5e7, 0), (5e7, 0)]), run)
     assert run.largest <= features.MOST_PIECES + 2
-
-
-def test_places_above_limits_are_the_steepest_of_each_stretch():
-    _, row = one(LineString([(0, 0), (100, 0)]), Waves(), grade_limit=0.2)
-    # The wave is steepest at its zeros, every 28.3 m.
-    assert [place.x for place in row.steep] == pytest.approx(9 * np.pi * np.arange(4), abs=0.6)
-    assert row.grade == pytest.approx(2 / 9, rel=0.01)
 
 
 def test_columns_have_the_crossfall_of_lines_and_the_largest_error():

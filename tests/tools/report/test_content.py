@@ -123,10 +123,7 @@ def made(variant, triangles=None, error=""):
             [made("a", 10), made("a", 20), made("b", 5)],
             [("a", 2, 30, 0, "no fault"), ("b", 1, 5, 0, "no fault")],
         ),
-        (
-            [made("a", 10), made("a", error=FAULT)],
-            [("a", 2, 10, 1, "error: 1 of 2 meshes have faults")],
-        ),
+        ([made("a", 10), made("a", error=FAULT)], [("a", 2, 10, 1, "error: 1 of 2 meshes have faults")]),
         ([made("a", error=FAULT)], [("a", 1, 0, 1, "error: 1 of 1 meshes have faults")]),
         ([made("a", error="load: TaskError: no MeshFault: x")], []),
     ],

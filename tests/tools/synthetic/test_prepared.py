@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog import Catalog, CatalogError, Grid
-from flexroad.tasks.load import Options, load
 from flexroad.tools.synthetic.prepared import with_neighbours, write_tile
 
 GRID = Grid("EPSG:25832", 500_000.0, 5_600_250.0, 1.0, 25, 20)
@@ -65,13 +64,7 @@ def test_write_tile_layers_follow_catalog_order(tmp_path):
     names = ("reference_road", "reference", "dtm", "road_mask", "dsm")
     layers = {name: road() if "road" in name else heights() for name in names}
     tile = write_tile(tmp_path, "a", GRID, layers, "rural", TAKEN)
-    assert [layer.name for layer in tile.layers] == [
-        "dsm",
-        "dtm",
-        "road_mask",
-        "reference",
-        "reference_road",
-    ]
+    assert [layer.name for layer in tile.layers] == ["dsm", "dtm", "road_mask", "reference", "reference_road"]
     Catalog((tile,)).write(tmp_path / "catalog.parquet")
     assert Catalog.read(tmp_path / "catalog.parquet").tiles == (tile,)
 
@@ -192,31 +185,6 @@ def test_layer_of_a_neighbour_alone_is_nearby(tmp_path):
     strip = Grid("EPSG:25832", 500_050.0, 5_600_000.0, 1.0, 20, 60)
     assert first.around(strip, strip.bounds).layers == second.around(strip, strip.bounds).layers
     assert len(first.around(strip, strip.bounds).layers) == 3
-
-
-def test_halo_has_the_heights_of_the_neighbours(tmp_path):
-    tiles = block(tmp_path, "abcdefghi")
-    own = {name: load(tile, Options()) for name, tile in tiles.items()}
-    data = load(tiles["e"], Options(halo_m=50))
-    assert data.grid.shape == (160, 160)
-    assert not np.isnan(data.dsm).any()
-    assert not np.isnan(data.dtm).any()
-    assert data.notes == ()
-    for row, names in enumerate(("abc", "def", "ghi")):
-        for column, name in enumerate(names):
-            part = (
-                slice(max(0, 60 * row - 10), 60 * row + 50),
-                slice(max(0, 60 * column - 10), 60 * column + 50),
-            )
-            seen = data.dsm[part]
-            size = slice(-seen.shape[0], None) if row == 0 else slice(seen.shape[0])
-            width = slice(-seen.shape[1], None) if column == 0 else slice(seen.shape[1])
-            assert np.array_equal(seen, own[name].dsm[size, width]), name
-    # The corner tile has no neighbours in the north and west.
-    corner = load(tiles["a"], Options(halo_m=50)).dsm
-    assert np.isnan(corner[:50]).all()
-    assert np.isnan(corner[:, :50]).all()
-    assert not np.isnan(corner[50:, 50:]).any()
 
 
 def test_write_tile_on_full_disk_names_the_file_and_leaves_none(tmp_path, monkeypatch):
