@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flexroad.pipeline.run.sampler import Heights
+from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift import opendrive, plan_view
 from flexroad.tools.lift.plan_view import extent
 from flexroad.tools.lift.road_profiles import cross_sections
@@ -76,6 +77,10 @@ def lifted(source: Path, height, **options) -> tuple[ET.Element, list[Lifted]]:
     out = source.with_name("out.xodr")
     rows = list(opendrive.lift(source, out, heights, Options(**options)))
     return ET.parse(out).getroot(), rows
+
+
+def elevation(element: ET.Element, s: float) -> float:
+    return polynomial(element, "elevationProfile/elevation", s)
 
 
 def places(element: ET.Element, right: float = -3.5, left: float = 3.5) -> np.ndarray:
@@ -149,9 +154,9 @@ def test_roads_that_meet_have_one_height_and_one_grade(tmp_path):
     for element, at_end in zip(root.findall("road"), (True, True, False, False), strict=True):
         length = float(element.get("length"))
         s = length if at_end else 0.0
-        z = polynomial(element, "elevationProfile/elevation", s)
+        z = elevation(element, s)
         step = 1e-4 * (-1 if at_end else 1)
-        grade = (polynomial(element, "elevationProfile/elevation", s + step) - z) / step
+        grade = (elevation(element, s + step) - z) / step
         ends.append((z, -grade if element.get("id") == "1" else grade))
     np.testing.assert_allclose(ends, [ends[0]] * 4, atol=1e-5)
     assert ends[0][0] == pytest.approx(float(crowned(70.0, 20.0)), abs=1e-9)
@@ -216,10 +221,10 @@ def test_without_ground_a_road_keeps_its_profile(tmp_path, profiles):
     root, (row,) = lifted(write(tmp_path, road(profiles=profiles)), until)
     first = root.find("road")
     for s in (0.0, 12.0, 29.9):
-        assert polynomial(first, "elevationProfile/elevation", s) == pytest.approx(plane(10 + s, 20))
+        assert elevation(first, s) == pytest.approx(plane(10 + s, 20))
     old = {30.1: 1.3, 59.0: 1.3} if profiles else {30.1: 0.0, 59.0: 0.0}
     for s, z in old.items():
-        assert polynomial(first, "elevationProfile/elevation", s) == pytest.approx(z)
+        assert elevation(first, s) == pytest.approx(z)
     assert row.without_ground_m == pytest.approx(30.0)
     assert row.superelevation_m < 1e-6
 
@@ -231,7 +236,7 @@ def test_without_ground_a_road_goes_on_level_if_asked(tmp_path):
     root, (row,) = lifted(write(tmp_path, road()), inner, beyond="flat")
     first = root.find("road")
     for s, z in ((0.0, plane(21, 20)), (11.0, plane(21, 20)), (25, plane(35, 20)), (60, plane(50, 20))):
-        assert polynomial(first, "elevationProfile/elevation", s) == pytest.approx(z)
+        assert elevation(first, s) == pytest.approx(z)
     assert row.without_ground_m == pytest.approx(31.0)
 
 
@@ -324,9 +329,7 @@ def test_a_road_with_several_levels_goes_on_where_its_links_do(tmp_path, order):
     levels = {row.id: row.levels for row in rows}
     assert levels == {"1": (0,), "2": (0,), "3": (0,), "4": (1,)}
     assert [row.id for row in rows if "nothing that it meets says which" in row.note] == ["4"]
-    heights = {
-        each.get("id"): polynomial(each, "elevationProfile/elevation", 6) for each in root.iter("road")
-    }
+    heights = {each.get("id"): elevation(each, 6) for each in root.iter("road")}
     assert heights["3"] == pytest.approx(plane(38, 20))
     assert heights["4"] == pytest.approx(plane(66, 20) + 6)
 
@@ -346,10 +349,7 @@ def test_roads_beyond_the_surface_go_on_level_as_those_that_they_are_linked_with
         linked("5", 56, 0, before="4"),
     ]
     root, rows = lifted(write(tmp_path, *roads[::order]), ends, beyond="flat")
-    z = {
-        each.get("id"): [polynomial(each, "elevationProfile/elevation", s) for s in (0, 6, 12)]
-        for each in root.iter("road")
-    }
+    z = {each.get("id"): [elevation(each, s) for s in (0, 6, 12)] for each in root.iter("road")}
     # The surface ends at x = 13, and begins again at x = 63.
     assert z["1"] == pytest.approx([100.4, 100.65, 100.65])
     assert z["5"][:2] == pytest.approx([103.15, 103.15])
@@ -369,9 +369,7 @@ def test_a_tunnel_in_two_roads_does_not_climb_the_hill(tmp_path):
         for each, end in zip(roads, ends, strict=True)
     ]
     root, _ = lifted(write(tmp_path, *tunnels), hill, beyond="flat")
-    first, second = (
-        [polynomial(each, "elevationProfile/elevation", s) for s in (0, 12)] for each in root.iter("road")
-    )
+    first, second = ([elevation(each, s) for s in (0, 12)] for each in root.iter("road"))
     assert first[1] == pytest.approx(second[0])
     assert max(*first, *second) < 101.6
 
@@ -445,6 +443,11 @@ def test_a_road_that_cannot_be_read_stays_and_is_named(tmp_path, text, words):
 )
 def test_the_frame_is_that_of_the_header(tmp_path, header, expected):
     assert opendrive.frame(write(tmp_path, road(), header=header)) == expected
+
+
+def test_an_offset_that_is_no_number_is_refused(tmp_path):
+    with pytest.raises(TaskError, match="offset with x 'b'"):
+        opendrive.frame(write(tmp_path, header="<offset x='b'/>"))
 
 
 def test_places_above_limits_are_the_steepest_of_their_stretch(tmp_path):

@@ -62,9 +62,6 @@ def row_of(rows, tile, variant):
     return rows[(rows.tile_id == tile.tile_id) & (rows.variant == variant)].iloc[0]
 
 
-# --- roles ---------------------------------------------------------------------------------------
-
-
 def test_roles_of_renamed_variants_follow_from_options(run):
     assert tile_view.roles_of(run.config) == ROLES
 
@@ -82,9 +79,6 @@ def test_typical_tile_is_median_of_tiles_with_road():
     assert tile_view.typical_tile(table, "v") == "d"
     with pytest.raises(ConfigError, match="--tile"):
         tile_view.typical_tile(table[table.tile_id == "c"], "v")
-
-
-# --- maps -------------------------------------------------------------------------------------------------
 
 
 def test_maps_show_values_of_metrics_table(run, rows, tile, made_survey):
@@ -106,9 +100,6 @@ def test_maps_show_values_of_metrics_table(run, rows, tile, made_survey):
             np.testing.assert_allclose(angles[~on_road].mean(), row.mad_terrain_deg, rtol=1e-6, atol=1e-8)
         assert upper.get_title() == f"{label}\nroad {row.l2_road_m:.3f} m, terrain {row.l2_terrain_m:.3f} m"
         assert lower.get_title() == f"road {row.mad_road_deg:.2f}°, terrain {row.mad_terrain_deg:.2f}°"
-
-
-# --- profile ----------------------------------------------------------------------------------------------
 
 
 def test_along_is_bilinear_and_nan_next_to_nan():
@@ -183,9 +174,6 @@ def test_trajectory_on_tiny_road_is_empty_or_short(cells):
     assert row.size == col.size <= 4
 
 
-# --- renders ----------------------------------------------------------------------------------------------
-
-
 def test_vertex_colours_match_error_below(tile):
     colours = tile_figures.vertex_colours(tile, "rgt")
     mesh = tile.results["rgt"].mesh
@@ -211,9 +199,6 @@ def test_busiest_is_square_with_most_dropped_cells():
     assert tile_figures.busiest(np.zeros(small.shape, bool), small) == (1000.0, 2010.0, 1050.0, 2060.0)
 
 
-# --- trade-off --------------------------------------------------------------------------------------------
-
-
 def test_trade_off_shows_means_of_metrics_table(run, rows):
     figure = figures.trade_off(run.config, "flexroad", rows)[1]
     expected = {
@@ -236,9 +221,6 @@ def test_sweep_of_an_option_that_the_method_lacks_is_empty():
     (full,) = chains
     assert figures.sweep(chains, full, ("fit.control_points",)) == {}
     assert figures.sweep(chains, full, ("sample.road_m", "sample.terrain_m")).keys() == {full}
-
-
-# --- dataset ---------------------------------------------------------------------------------------------
 
 
 def test_statistics_match_rasters_and_metrics_table(run, rows, made_survey):
@@ -270,9 +252,6 @@ def test_dataset_figure_counts_every_tile():
     assert sum(bar.get_height() for bar in heights.patches) == 5
     assert roads.lines[0].get_xdata()[0] == pytest.approx(83 / 6)
     assert heights.lines[0].get_xdata()[0] == pytest.approx(45)
-
-
-# --- write_figures ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

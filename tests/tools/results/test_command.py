@@ -255,31 +255,32 @@ def test_query_of_unusable_points_gives_one_error(run, flexroad, tmp_path, text,
     assert said.out == ""
 
 
+ORIGIN = Point(0, 0)
+
+
+def line(*places) -> LineString:
+    return LineString(places)
+
+
 @pytest.mark.parametrize(
-    ("option", "shapes", "crs", "words", "message"),
+    ("option", "shape", "crs", "words", "message"),
     [
-        (
-            "--points",
-            [LineString([(0, 0), (1, 1)])],
-            UTM,
-            "",
-            "type LineString, not points; lines go to --line",
-        ),
-        ("--line", [Point(0, 0)], UTM, "", "type Point, not lines; points go to --points"),
-        ("--points", [Point(0, 0)], None, "", "carries no CRS; give it with --crs"),
-        ("--points", [Point(0, 0)], UTM, "--crs EPSG:4326", "is in EPSG:25832, not EPSG:4326"),
-        ("--points", [Point(0, 0)], UTM, "--layer b", "no layer 'b'; it has points"),
-        ("--line", [LineString([(0, 0), (0, 0)])], UTM, "", "has no length"),
-        ("--line", [LineString([(200, 95), (201, 96)])], "EPSG:4326", "", "cannot be transformed"),
-        ("--line", [LineString([(0, 0), (9e9, 1)])], UTM, "", "at most 10000000"),
+        ("--points", line((0, 0), (1, 1)), UTM, "", "type LineString, not points; lines go to --line"),
+        ("--line", ORIGIN, UTM, "", "type Point, not lines; points go to --points"),
+        ("--points", ORIGIN, None, "", "carries no CRS; give it with --crs"),
+        ("--points", ORIGIN, UTM, "--crs EPSG:4326", "is in EPSG:25832, not EPSG:4326"),
+        ("--points", ORIGIN, UTM, "--layer b", "no layer 'b'; it has points"),
+        ("--line", line((0, 0), (0, 0)), UTM, "", "has no length"),
+        ("--line", line((200, 95), (201, 96)), "EPSG:4326", "", "cannot be transformed"),
+        ("--line", line((0, 0), (9e9, 1)), UTM, "", "at most 10000000"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:'crs' was not provided")
 def test_query_of_unusable_features_gives_one_error(
-    run, flexroad, tmp_path, option, shapes, crs, words, message
+    run, flexroad, tmp_path, option, shape, crs, words, message
 ):
     path = tmp_path / "points.gpkg"
-    geopandas.GeoDataFrame(geometry=shapes, crs=crs).to_file(path)
+    geopandas.GeoDataFrame(geometry=[shape], crs=crs).to_file(path)
     said = flexroad("query", run, option, path, *words.split()).expected(2)
     assert message in said.err
     assert said.err.count("\n") == 1

@@ -7,7 +7,7 @@ from scipy import ndimage
 from flexroad.catalog.grid import Grid
 from flexroad.tools.prepare.mesh.sample import orthophoto as mesh_orthophoto
 from flexroad.tools.prepare.mesh.sample import project_down
-from flexroad.tools.synthetic import Kind
+from flexroad.tools.synthetic import Kind, make_scene
 from flexroad.tools.synthetic.dsc3d import (
     BUMPS_M,
     FRAGMENTS,
@@ -39,16 +39,13 @@ def height(scene):
     return project_down(scene.mesh, scene.surface.grid)[0]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_survey_scenes_have_rise_of_site(seed):
-    from flexroad.tools.synthetic import make_scene
-
-    places = survey(seed=seed)
+def test_survey_scenes_have_rise_of_site():
+    places = survey(seed=1)
     for place in places:
-        truth = make_scene(place.grid, seed, place.site.stratum, place.options)
+        truth = make_scene(place.grid, 1, place.site.stratum, place.options)
         assert np.ptp(truth.reference) == pytest.approx(place.site.rise_m, rel=0.05)
         assert 0.1 < truth.reference_road.mean() < 0.4
-    assert survey(2, seed) == places[:2]
+    assert survey(2, 1) == places[:2]
 
 
 @pytest.mark.slow

@@ -30,12 +30,16 @@ def road(grid: Grid = GRID) -> np.ndarray:
 def test_write_tile_returns_the_tile_of_its_files(tmp_path):
     layers = {"dsm": heights(), "road_mask": road()}
     second = write_tile(tmp_path, "b", GRID, layers, "urban", TAKEN, "made")
+    before = datetime.now(UTC) - timedelta(seconds=5)
     first = write_tile(tmp_path, "a", GRID, {"reference_road": road().astype(np.uint8)})
     # Tiles of the same ground.
     assert with_neighbours([second, first]) == [first, second]
     assert (first.id, second.id) == ("a", "b")
     assert (second.grid, second.stratum, second.dataset) == (GRID, "urban", "made")
     assert first.dataset == ""
+    # Without a date, it is that of the file.
+    assert first.datetime_assumed
+    assert before < first.datetime < datetime.now(UTC) + timedelta(seconds=5)
     assert second.datetime == TAKEN
     assert not second.datetime_assumed
     assert second.root == str(tmp_path)
@@ -69,13 +73,6 @@ def test_write_tile_layers_follow_catalog_order(tmp_path):
     assert Catalog.read(tmp_path / "catalog.parquet").tiles == (tile,)
 
 
-def test_write_tile_without_date_uses_file_time(tmp_path):
-    before = datetime.now(UTC) - timedelta(seconds=5)
-    tile = write_tile(tmp_path, "a", GRID, {"dsm": heights()})
-    assert tile.datetime_assumed
-    assert before < tile.datetime < datetime.now(UTC) + timedelta(seconds=5)
-
-
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     cell=st.sampled_from([0.1, 0.2, 0.3, 1 / 3, 0.7, 2.5, 10.0]),
@@ -100,26 +97,17 @@ def test_write_tile_failed_keeps_old_file(tmp_path):
     assert (tmp_path / "dsm" / "a.tif").read_bytes() == before
 
 
-def photo(rows: int = 40, columns: int = 50) -> np.ndarray:
-    return np.random.default_rng(2).integers(0, 256, (3, rows, columns), dtype=np.uint8)
-
-
-def test_write_tile_photo_keeps_its_pixels(tmp_path):
-    tile = write_tile(tmp_path, "a", GRID, {"dop": photo(), "road_mask": road()}, "urban", TAKEN)
+@pytest.mark.parametrize("shape", [(40, 50), (28, 35)])
+def test_write_tile_photo_keeps_its_pixels(tmp_path, shape):
+    photo = np.random.default_rng(2).integers(0, 256, (3, *shape), dtype=np.uint8)
+    tile = write_tile(tmp_path, "a", GRID, {"dop": photo, "road_mask": road()}, "urban", TAKEN)
     assert tile.grid == GRID
     dop, mask = tile.layers
     assert (dop.name, dop.files, mask.name) == ("dop", ("dop/a.tif",), "road_mask")
     with rasterio.open(tile.paths(dop)[0]) as file:
-        assert np.array_equal(file.read(), photo())
-        assert file.res == (0.5, 0.5)
-        assert tuple(file.bounds) == GRID.bounds
-        assert [band.name for band in file.colorinterp] == ["red", "green", "blue"]
-
-
-def test_write_tile_photo_with_odd_pixel_size_fits(tmp_path):
-    tile = write_tile(tmp_path, "a", GRID, {"dsm": heights(), "dop": photo(28, 35)})
-    with rasterio.open(tile.paths(tile.layer("dop"))[0]) as file:
+        assert np.array_equal(file.read(), photo)
         assert file.bounds == pytest.approx(GRID.bounds)
+        assert [band.name for band in file.colorinterp] == ["red", "green", "blue"]
 
 
 def block(folder, names, size=60, gap=0.0, **options):
