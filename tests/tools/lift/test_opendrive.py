@@ -302,15 +302,16 @@ def test_level_lanes_are_not_superelevated_and_named(tmp_path):
     assert 'level="true"' in row.note
 
 
-def linked(name: str, x: float, heading: float, before: str = "", after: str = "") -> str:
-    """A road of 12 m with links to the start of the one after it and to the end of the one before."""
-    plan = f'<geometry s="0" x="{x}" y="20" hdg="{heading}" length="{{length}}"><line/></geometry>'
-    links = "".join(
-        f'<{kind} elementType="road" elementId="{other}" contactPoint="{end}"/>'
-        for kind, other, end in (("predecessor", before, "end"), ("successor", after, "start"))
-        if other
-    )
-    return road(plan, 12.0, name, profiles="").replace("<link/>", f"<link>{links}</link>")
+def in_line(number: int) -> list[str]:
+    """Roads of 12 m from x = 8 on, each linked with the one before it and the one after it."""
+    roads = []
+    for k in range(1, number + 1):
+        plan = f'<geometry s="0" x="{12 * k - 4}" y="20" hdg="0" length="{{length}}"><line/></geometry>'
+        before = f'<predecessor elementType="road" elementId="{k - 1}" contactPoint="end"/>' if k > 1 else ""
+        after = f'<successor elementType="road" elementId="{k + 1}" contactPoint="start"/>'
+        links = f"<link>{before}{after if k < number else ''}</link>"
+        roads.append(road(plan, 12.0, str(k), profiles="").replace("<link/>", links))
+    return roads
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -319,12 +320,8 @@ def test_a_road_with_several_levels_goes_on_where_its_links_do(tmp_path, order):
     def covered(x, y):
         return Heights((0, 1), np.stack([plane(x, y), np.where(x > 15, plane(x, y) + 6, np.nan)]))
 
-    roads = [
-        linked("1", 8, 0, after="2"),
-        linked("2", 20, 0, before="1", after="3"),
-        linked("3", 32, 0, before="2"),
-        linked("4", 60, 0),
-    ]
+    alone = road(LINE.replace('x="10"', 'x="60"'), 12.0, "4", profiles="")
+    roads = [*in_line(3), alone]
     root, rows = lifted(write(tmp_path, *roads[::order]), covered)
     levels = {row.id: row.levels for row in rows}
     assert levels == {"1": (0,), "2": (0,), "3": (0,), "4": (1,)}
@@ -341,14 +338,7 @@ def test_roads_beyond_the_surface_go_on_level_as_those_that_they_are_linked_with
     def ends(x, y):
         return np.where(np.abs(x - 38) > 24.5, 100 + 0.05 * x, np.nan)
 
-    roads = [
-        linked("1", 8, 0, after="2"),
-        linked("2", 20, 0, before="1", after="3"),
-        linked("3", 32, 0, before="2", after="4"),
-        linked("4", 44, 0, before="3", after="5"),
-        linked("5", 56, 0, before="4"),
-    ]
-    root, rows = lifted(write(tmp_path, *roads[::order]), ends, beyond="flat")
+    root, rows = lifted(write(tmp_path, *in_line(5)[::order]), ends, beyond="flat")
     z = {each.get("id"): [elevation(each, s) for s in (0, 6, 12)] for each in root.iter("road")}
     # The surface ends at x = 13, and begins again at x = 63.
     assert z["1"] == pytest.approx([100.4, 100.65, 100.65])
@@ -363,10 +353,9 @@ def test_a_tunnel_in_two_roads_does_not_climb_the_hill(tmp_path):
         return plane(x, y) + np.where((x > 14.5) & (x < 25.5), 9.0, 0.0)
 
     ends = ((6.0, 6.0), (0.0, 6.0))
-    roads = (linked("1", 8, 0, after="2"), linked("2", 20, 0, before="1"))
     tunnels = [
         each.replace("</lanes>", f"</lanes>{structure('tunnel', *end)}")
-        for each, end in zip(roads, ends, strict=True)
+        for each, end in zip(in_line(2), ends, strict=True)
     ]
     root, _ = lifted(write(tmp_path, *tunnels), hill, beyond="flat")
     first, second = ([elevation(each, s) for s in (0, 12)] for each in root.iter("road"))

@@ -143,12 +143,22 @@ RISE = Claim("rises", "x", "l2_road_m", ("flexroad", "wo_ecsrc"), 111)
 
 @pytest.mark.parametrize(
     ("ours", "verdict"),
-    [(2.1, HELD), (1.5, HELD), (4.4, HELD), (1.4, WEAKER), (4.5, STRONGER), (1.0, NOT_HELD), (0.9, NOT_HELD)],
+    [
+        ([2.1] * 4, HELD),
+        ([1.5] * 4, HELD),
+        ([4.4] * 4, HELD),
+        ([1.4] * 4, WEAKER),
+        ([4.5] * 4, STRONGER),
+        ([1.0] * 4, NOT_HELD),
+        ([0.9] * 4, NOT_HELD),
+        # The mean is 2.1, too, but by one tile in four: it is so in few resamples.
+        ([0.9, 0.9, 0.9, 5.7], NOT_DECIDED),
+    ],
 )
 def test_check_change_holds_between_half_and_twice_the_papers(ours, verdict):
     # The paper's ratio is 2.114: the square root is 1.454, the square 4.469.
-    result = check(RISE, bootstrap(figures({"flexroad": [1.0] * 4, "wo_ecsrc": [ours] * 4})))
-    assert (result.verdict, result.paper, result.ours) == (verdict, "+111%", percent(ours))
+    result = check(RISE, bootstrap(figures({"flexroad": [1.0] * 4, "wo_ecsrc": ours})))
+    assert (result.verdict, result.paper, result.ours) == (verdict, "+111%", percent(np.mean(ours)))
 
 
 @pytest.mark.parametrize(
@@ -166,14 +176,6 @@ def test_check_order_holds_if_means_are_ordered(values, slack, verdict, text):
     result = check(claim, means)
     assert (result.verdict, result.paper, result.ours) == (verdict, "0.483 < 1.021", text)
     assert result.certainty == ("100% of resamples" if verdict == HELD else "0% of resamples")
-
-
-@pytest.mark.parametrize("certain", [True, False])
-def test_check_verdict_of_few_resamples_is_not_decided(certain):
-    # The mean ratio is 2.1 in both cases; with one tile in four it is so in few resamples.
-    ours = [2.1] * 4 if certain else [0.9, 0.9, 0.9, 5.7]
-    result = check(RISE, bootstrap(figures({"flexroad": [1.0] * 4, "wo_ecsrc": ours})))
-    assert (result.verdict, result.ours) == (HELD if certain else NOT_DECIDED, "+110%")
 
 
 def test_check_order_of_most_but_not_enough_resamples_is_not_decided():
