@@ -12,12 +12,18 @@ from flexroad.catalog import Grid
 from flexroad.catalog.sources import nrw
 from flexroad.catalog.sources.rasters import index
 from flexroad.tasks import TaskError
+from flexroad.tasks.filter import planar
+from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.load import Options, load
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.segment import mask, vector
 from flexroad.tasks.types import Source, TileData
+from tests import exact_fit
 
 pytestmark = pytest.mark.real
+
+
+BARBICAN = {"dsm": "dsm_barb*.tif", "dtm": "dem_barb*.tif", "road_mask": "landcover*.tif"}
 
 
 @pytest.fixture
@@ -33,8 +39,7 @@ def unpack(real_data, tmp_path):
 def test_barbican_corner_off_by_rounding_is_copied(unpack):
     """651 x 601 m, corner 0.1 mm off the metre: copied, not resampled; nine tiles, three slivers left out."""
     folder = unpack("London_BNG")
-    layers = {"dsm": "dsm_barb*.tif", "dtm": "dem_barb*.tif", "road_mask": "landcover*.tif"}
-    result = index(folder, layers, road_values=(1,))
+    result = index(folder, BARBICAN, road_values=(1,))
     assert len(result.tiles) == 9
     assert result.tiles[4].id == "532250_181500"
     assert {t.grid.crs for t in result.tiles} == {"EPSG:27700"}
@@ -54,6 +59,23 @@ def test_barbican_corner_off_by_rounding_is_copied(unpack):
     assert roads[5].outside.sum() == np.isnan(data[5].dsm).sum() == 40 * 250
     unmatched = sum(np.count_nonzero(r.mask & np.isnan(d.dsm)) for r, d in zip(roads, data, strict=True))
     assert unmatched == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(9))
+def test_fit_of_barbican_equals_literal_fit(unpack, monkeypatch, number):
+    """The fit of production is within 1 mm of a literal computation with a direct solver."""
+    data = load(index(unpack("London_BNG"), BARBICAN, road_values=(1,)).tiles[number], Options())
+    clusters = planar.ecsrc(data, mask.segment(data, mask.Options()), planar.Options(shoulder_m=5))
+    surfaces = []
+    for literal in (False, True):
+        if literal:
+            monkeypatch.setattr(smoothing_spline, "_minimum", exact_fit.minimum)
+        surface = smoothing_spline.fit(data, clusters, smoothing_spline.Options())
+        surfaces.append(surface.lattice(data.core.eastings, data.core.northings))
+    # Beyond the survey there is nothing to hold the surface.
+    near = np.isfinite(data.dsm)[data.grid.window(data.core)]
+    assert np.abs(surfaces[0] - surfaces[1])[near].max() < 1e-3
 
 
 def test_gothenburg_local_crs_and_partial_tile_loads(unpack):
