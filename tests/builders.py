@@ -22,7 +22,7 @@ from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
-from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
 CRS = "EPSG:25832"
 WEST, NORTH = 295500.0, 5629500.0
@@ -173,3 +173,16 @@ def make_special(path: Path, kind: str) -> None:
         os.close(folder)
     else:
         os.mkfifo(path)
+
+
+def make_mesh(column: int = 0, row: int = 0, n: int = 5, size: float = 10.0, road_from: float = 4.0) -> Mesh:
+    """Return a square tile of hills. Faces east of ``road_from`` (m, over all tiles) are road."""
+    x, y = np.meshgrid(np.linspace(0, size, n), np.linspace(0, size, n))
+    origin = (WEST + column * size, 5629250.0 + row * size, 150.0 + column)
+    z = 163.2 + np.sin((x + column * size) / 3) + 0.1 * (y + row * size) - origin[2]
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
+    faces = np.concatenate([np.c_[a, b, c], np.c_[a, c, d]]).astype(np.int32)
+    vertices = np.c_[x.ravel(), y.ravel(), z.ravel()]
+    road = vertices[faces].mean(axis=1)[:, 0] + column * size > road_from
+    return Mesh(CRS, origin, vertices, faces, road)

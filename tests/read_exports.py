@@ -90,22 +90,39 @@ def obj(folder):
     return np.concatenate(points)
 
 
+def entries(folder, file="tileset.json", transform=None, above=None):
+    """Yield each tile's entry, its GLB file, the product of the transforms, and the entry above it."""
+    path = folder / file
+    todo = [(json.loads(path.read_text())["root"], np.eye(4) if transform is None else transform, above)]
+    while todo:
+        entry, outer, parent = todo.pop()
+        matrix = outer @ np.reshape(entry.get("transform", np.eye(4)), (4, 4)).T
+        uri = entry.get("content", {}).get("uri", "")
+        if uri.endswith(".json"):
+            yield from entries(folder, (path.parent / uri).relative_to(folder), matrix, entry)
+        else:
+            yield entry, (path.parent / uri).resolve() if uri else None, matrix, parent
+        todo += [(child, matrix, entry) for child in entry.get("children", ())]
+
+
+def mesh_of(file, matrix):
+    """The mesh of a GLB file in coordinates from the Earth's centre, as viewers place it."""
+    mesh = trimesh.load_scene(file, process=False).to_geometry()
+    east, up, south = mesh.vertices.T
+    return np.column_stack([east, -south, up]) @ matrix[:3, :3].T + matrix[:3, 3], mesh.faces
+
+
+def from_earth(points, crs="EPSG:25832"):
+    """From the Earth's centre to easting, northing and height of the run."""
+    plan = Transformer.from_crs("EPSG:4978", crs, always_xy=True).transform(*points.T)[:2]
+    height = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*points.T)[2]
+    return np.column_stack([*plan, height - OFFSET_M])
+
+
 def tiles3d(folder, crs):
     """The vertices of all tiles by the tilesets, back in the CRS of the run."""
-    back = Transformer.from_crs("EPSG:4978", crs, always_xy=True)
-    geographic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
-    points = []
-    for block in json.loads((folder / "tileset.json").read_text())["root"]["children"]:
-        file = folder / block["content"]["uri"]
-        root = json.loads(file.read_text())["root"]
-        for leaf in root["children"]:
-            matrix = np.reshape(root["transform"], (4, 4)).T @ np.reshape(leaf["transform"], (4, 4)).T
-            scene = trimesh.load(file.parent / leaf["content"]["uri"])
-            east, up, south = scene.to_geometry().vertices.T
-            placed = np.column_stack([east, -south, up]) @ matrix[:3, :3].T + matrix[:3, 3]
-            x, y, _ = back.transform(*placed.T)
-            points.append(np.column_stack([x, y, geographic.transform(*placed.T)[2] - OFFSET_M]))
-    return np.concatenate(points)
+    tiles = [item for item in entries(folder) if item[1] and item[1].parent.name == "tiles"]
+    return np.concatenate([from_earth(mesh_of(file, matrix)[0], crs) for _, file, matrix, _ in tiles])
 
 
 def vertices(out, crs="EPSG:25832"):

@@ -1,4 +1,5 @@
 import json
+import shutil
 from datetime import UTC, datetime
 
 import geopandas
@@ -19,18 +20,19 @@ LEVELS = ["bridge", "tunnel", "layer", "level"]
 LINE = "1 place looks like decks; no road there has a level"
 
 
-@pytest.fixture
-def town(tmp_path):
-    """Write tiles with one deck across their borders; return their catalog."""
-    return write_scenes(tmp_path / "town", 4, SEED, size_m=60, decks=True)
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """The catalog of tiles with one deck across their borders; their roads have no levels."""
+    catalog = write_scenes(tmp_path_factory.mktemp("scenes"), 4, SEED, size_m=60, decks=True)
+    roads = geopandas.read_file(catalog.with_name("roads.gpkg"))
+    roads.drop(columns=LEVELS).to_file(catalog.with_name("roads.gpkg"), layer="roads")
+    return catalog
 
 
 @pytest.fixture
-def unnamed(town):
-    """Take the levels out of the roads; return the catalog."""
-    roads = geopandas.read_file(town.with_name("roads.gpkg"))
-    roads.drop(columns=LEVELS).to_file(town.with_name("roads.gpkg"), layer="roads")
-    return town
+def unnamed(scenes, tmp_path):
+    """The catalog of a copy, to change."""
+    return shutil.copytree(scenes.parent, tmp_path / "town") / scenes.name
 
 
 @pytest.fixture

@@ -43,23 +43,27 @@ def test_end_has_the_height_of_the_deck(step):
     assert deck.ends == (2 if step < 0.5 else 1)
 
 
-def test_street_on_an_embankment_is_no_deck():
-    assert decks() == []
-    assert decks(GROUND + RISE_M - 0.1) == []
+ROUGH = GROUND + np.random.default_rng(0).normal(0, 1, GROUND.shape)
+HOLE = np.where(SPAN, np.nan, GROUND)
+VALLEY = np.where(SPAN, GROUND - 6, GROUND)
+SMALL = np.where((COL >= 50) & (COL < 50 + AREA_M2 // 8), GROUND - 6, GROUND)
 
 
-def test_small_places_and_other_ground_are_no_deck():
-    small = (COL >= 50) & (COL < 50 + AREA_M2 // 8)
-    assert decks(dtm=np.where(small, GROUND - 6, GROUND)) == []
-    assert decks(dtm=np.where(SPAN, GROUND - 6, GROUND), road=np.zeros(ROAD.shape, bool)) == []
-    rough = GROUND + np.random.default_rng(0).normal(0, 1, GROUND.shape)
-    assert decks(np.where(SPAN, rough, GROUND), np.where(SPAN, GROUND - 6, GROUND)) == []
-
-
-def test_unknown_heights_are_no_deck():
-    hole = np.where(SPAN, np.nan, GROUND)
-    assert decks(hole, np.where(SPAN, GROUND - 6, GROUND)) == []
-    assert decks(GROUND, hole) == []
+@pytest.mark.parametrize(
+    ("dsm", "dtm", "road"),
+    [
+        (GROUND, GROUND, ROAD),
+        (GROUND + RISE_M - 0.1, GROUND, ROAD),
+        (GROUND, SMALL, ROAD),
+        (GROUND, VALLEY, ROAD & (COL < 0)),
+        (np.where(SPAN, ROUGH, GROUND), VALLEY, ROAD),
+        (HOLE, VALLEY, ROAD),
+        (GROUND, HOLE, ROAD),
+    ],
+    ids=["level", "embankment", "small", "no road", "rough", "no DSM", "no DTM"],
+)
+def test_other_places_are_no_deck(dsm, dtm, road):
+    assert decks(dsm, dtm, road) == []
 
 
 def test_decks_at_the_edges_of_the_grid_are_found():

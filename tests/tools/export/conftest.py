@@ -11,8 +11,10 @@ from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tools.export.driver import export
+from flexroad.tools.export.formats import FORMATS
 from flexroad.tools.export.georeference import Datum
-from flexroad.tools.export.source import Options
+from flexroad.tools.export.source import Options, select
 from flexroad.tools.synthetic.scenes import write_scenes
 
 CONFIG = {
@@ -46,6 +48,15 @@ def made_city(tmp_path_factory) -> SmallCity:
     broken = folder / "survey" / "dsm" / f"{catalog.tiles[2].id}.tif"
     broken.write_bytes(broken.read_bytes()[:100])
     return run_city(folder)
+
+
+@pytest.fixture(scope="session")
+def whole(made_city, tmp_path_factory) -> Path:
+    """An export in all formats, one after the other: OpenDRIVE refers to OpenCRG files of the same export."""
+    out, source = tmp_path_factory.mktemp("whole"), select(made_city.path)
+    for name in FORMATS:
+        export(source, out, [name], OPTIONS, SerialExecutor())
+    return out
 
 
 @pytest.fixture

@@ -4,31 +4,22 @@ import json
 import shutil
 from pathlib import Path
 
+import geopandas
 import pytest
+import shapely
 
-from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.tools.export.driver import BEGUN, export
+from flexroad.tools.export.driver import BEGUN
 from flexroad.tools.export.formats import FORMATS
-from flexroad.tools.export.source import select
 from tests.permissions import permissions_enforced
 
-from .conftest import OPTIONS, contents
+from .conftest import contents
 
 DATUM = ("--vertical", "47.5", "--allow-steps")
 """Options of each format; the tiles of the run do not meet."""
 WRITTEN_WHOLE = ("mosaic",)
 """Formats that have no markers: each export writes them again."""
 each_format = pytest.mark.parametrize("name", FORMATS)
-
-
-@pytest.fixture(scope="module")
-def whole(made_city, tmp_path_factory):
-    """An export in all formats, one after the other: OpenDRIVE refers to OpenCRG files of the same export."""
-    out, source = tmp_path_factory.mktemp("whole"), select(made_city.path)
-    for name in FORMATS:
-        export(source, out, [name], OPTIONS, SerialExecutor())
-    return out
 
 
 @pytest.fixture
@@ -47,51 +38,77 @@ def refused(flexroad):
 
 @each_format
 def test_tiles_that_failed_or_are_missing_are_left_out(made_city, whole, flexroad, tmp_path, name):
-    said = flexroad("export", made_city.path, "--format", name, *DATUM, "-o", tmp_path / "out").expected(0)
+    """The folder has spaces and other letters."""
+    out = tmp_path / "für die Stadt (neu)" / "道路"
+    said = flexroad("export", made_city.path, "--format", name, *DATUM, "-o", out).expected(0)
     assert "note: left out 2 unfinished tiles" in said.err.splitlines()
-    assert contents(tmp_path / "out" / name) == contents(whole / name)
-    manifest = json.loads((tmp_path / "out" / "export.json").read_text())
-    assert manifest["tiles"] == 2
+    assert contents(out / name) == contents(whole / name)
+    manifest = json.loads((out / "export.json").read_text())
     assert manifest["left_out"] == [made_city.failed, made_city.pending]
     assert list(manifest["formats"]) == [name]
 
 
-@each_format
-def test_no_finished_tile_is_refused_and_nothing_is_written(made_city, refused, tmp_path, name):
-    words = [made_city.path, "--format", name, *DATUM, "-o", tmp_path / "out"]
-    line = refused(*words, "--tile", made_city.failed, made_city.pending)
-    assert line.endswith(f"has no finished tile to export; see `flexroad status {made_city.path}`")
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
-    ("words", "message"), [(["--bbox", 0, 0, 1, 1], "no tile"), (["--tile", "4711"], "4711")]
-)
-def test_selection_without_tiles_is_refused(made_city, refused, tmp_path, words, message):
-    line = refused(made_city.path, "--format", "obj", "-o", tmp_path / "out", *words)
-    assert message in line
-    assert not (tmp_path / "out").exists()
-
-
-def test_folder_that_is_no_run_is_refused(refused, tmp_path):
-    line = refused(tmp_path, "--format", "obj", "-o", tmp_path / "out")
-    assert "is no run: run.json is missing or damaged" in line
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
+    ("words", "message"),
     [
-        ("lanxml", "--format lanxml is unknown; did you mean landxml?; known are "),
-        ("OBJ", "--format OBJ is unknown; did you mean obj?; known are "),
-        ("usd", "--format usd is unknown; known are "),
-        ("", "--format names no format; known are "),
-        ("3dtiles", "3dtiles needs heights above the ellipsoid of WGS 84"),
+        (["--format", "lanxml"], "--format lanxml is unknown; did you mean landxml?; known are "),
+        (["--format", "OBJ"], "--format OBJ is unknown; did you mean obj?; known are "),
+        (["--format", "usd"], "--format usd is unknown; known are "),
+        (["--format", ""], "--format names no format; known are "),
+        (["--format", "3dtiles"], "3dtiles needs heights above the ellipsoid of WGS 84"),
+        (["--format", "obj", "--bbox", 0, 0, 1, 1], "no tile touches --bbox"),
+        (["--format", "obj", "--tile", "4711"], "no tile '4711'"),
+        (["--format", "obj", "--tile", "FAILED"], "has no finished tile to export; see `flexroad status"),
+        (["--format", "obj", "--area", "absent.gpkg"], "cannot be read"),
+        (["--format", "obj", "--area", "AREA"], "no tile touches --area"),
+        (["--format", "obj", "--area", "POINTS"], "no polygons"),
     ],
 )
-def test_unknown_format_or_missing_datum_is_refused(made_city, refused, tmp_path, given, message):
-    line = refused(made_city.path, "--format", given, "-o", tmp_path / "out")
-    assert line.startswith(f"error: {message}")
-    assert not (tmp_path / "out").exists()
+def test_formats_and_selections_that_cannot_be_exported_are_refused(
+    made_city, refused, tmp_path, words, message
+):
+    points = tmp_path / "points.geojson"
+    points.write_text('{"type": "Point", "coordinates": [9, 50]}')
+    named = {"FAILED": made_city.failed, "AREA": area(tmp_path, 0, 0, 10, 10), "POINTS": points}
+    out = tmp_path / "out"
+    assert message in refused(made_city.path, "-o", out, *(named.get(word, word) for word in words))
+    assert not out.exists()
+
+
+def area(folder, *bounds):
+    """Write an area over bounds in longitude and latitude."""
+    shape = geopandas.GeoSeries([shapely.box(*bounds)], crs="EPSG:25832")
+    shape.to_crs("EPSG:4326").to_file(folder / "area.geojson")
+    return folder / "area.geojson"
+
+
+def test_area_selects_the_tiles_of_an_export_and_of_a_run(town, flexroad, tmp_path):
+    west, south, _, _ = town.tiles[0].grid.bounds
+    path = area(tmp_path, west + 5, south + 5, west + 20, south + 20)
+    said = flexroad(
+        "export", town.path, "--format", "mosaic", "--area", path, "-o", tmp_path / "out"
+    ).expected(0)
+    assert "mosaic: 7 files" in said.out
+    assert json.loads((tmp_path / "out" / "export.json").read_text())["tiles"] == 1
+    words = "run", "--catalog", town.path / "catalog.parquet", "--out", tmp_path / "run", "--dry-run"
+    said = flexroad("--allow", town.path.parent / "survey", *words, "--area", path).expected(0)
+    assert [line for line in said.out.splitlines() if line.endswith(": new")] == [f"{town.tiles[0].id}: new"]
+
+
+def test_folders_that_cannot_be_used_are_refused_and_stay(made_city, refused, tmp_path):
+    """No run; a file; a folder in place of the manifest; a folder that cannot be written."""
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "taken" / "export.json").mkdir(parents=True)
+    (tmp_path / "closed").mkdir(mode=0o555)
+    before = sorted(tmp_path.rglob("*"))
+    words = "--format", "obj", "-o"
+    assert "is no run: run.json is missing or damaged" in refused(tmp_path, *words, tmp_path / "out")
+    assert str(tmp_path / "file") in refused(made_city.path, *words, tmp_path / "file")
+    assert "export.json" in refused(made_city.path, *words, tmp_path / "taken")
+    with permissions_enforced():
+        assert "Permission denied" in refused(made_city.path, *words, tmp_path / "closed")
+    assert sorted(tmp_path.rglob("*")) == before
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 @pytest.mark.parametrize("part", ["", "tiles", "store/x", "delivery"])
@@ -101,28 +118,6 @@ def test_output_in_the_run_is_refused(made_city, refused, part):
     assert f"lies in the run ({made_city.path}" in line
     assert line.endswith("choose a folder outside")
     assert sorted(made_city.path.rglob("*")) == before
-
-
-def test_output_that_is_a_file_is_refused_and_stays(made_city, refused, tmp_path):
-    (tmp_path / "out").write_text("mine")
-    line = refused(made_city.path, "--format", "obj", "-o", tmp_path / "out")
-    assert str(tmp_path / "out") in line
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-def test_output_that_cannot_be_written_is_refused(made_city, refused, tmp_path):
-    (tmp_path / "out").mkdir(mode=0o555)
-    with permissions_enforced():
-        line = refused(made_city.path, "--format", "obj", "-o", tmp_path / "out")
-    assert "Permission denied" in line
-    assert not list((tmp_path / "out").iterdir())
-
-
-def test_manifest_that_is_a_folder_is_refused_before_any_work(made_city, refused, tmp_path):
-    (tmp_path / "out" / "export.json").mkdir(parents=True)
-    line = refused(made_city.path, "--format", "obj", "-o", tmp_path / "out")
-    assert "export.json" in line
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["export.json"]
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"formats": 3}', "\x00"])
@@ -169,13 +164,6 @@ def test_folder_that_another_export_writes_is_refused(made_city, refused, flexro
 
 
 @each_format
-def test_folder_with_spaces_and_other_letters(made_city, whole, flexroad, tmp_path, name):
-    out = tmp_path / "für die Stadt (neu)" / "道路"
-    flexroad("export", made_city.path, "--format", name, *DATUM, "-o", out).expected(0)
-    assert contents(out / name) == contents(whole / name)
-
-
-@each_format
 def test_files_of_tiles_no_longer_selected_are_removed(made_city, flexroad, tmp_path, name):
     # Along the roads of the other tile alone there is none of the least length.
     second, first = made_city.done
@@ -208,28 +196,25 @@ def test_formats_of_other_results_are_named_and_leave_the_manifest(made_city, fl
         assert f"note: {tmp_path / name} is of an earlier export with other results; write" in said.err
 
 
-def test_files_that_the_user_changed_are_not_removed(made_city, flexroad, tmp_path):
-    words = ["export", made_city.path, "--format", "obj", "-o", tmp_path]
-    flexroad(*words).expected(0)
-    changed = tmp_path / "obj" / f"{made_city.done[1]}.obj"
-    changed.write_text("# painted by hand")
-    flexroad(*words, "--tile", made_city.done[0]).expected(0)
-    assert changed.read_text() == "# painted by hand"
-    assert not changed.with_suffix(".json").exists()
-
-
-@pytest.mark.parametrize("name", ["../outside", "/outside", "a/../../outside"])
-def test_marker_that_names_files_elsewhere_removes_nothing(made_city, flexroad, tmp_path, name):
+@pytest.mark.parametrize("name", ["", "../outside", "/outside", "a/../../outside"])
+def test_changed_files_and_files_elsewhere_that_a_marker_names_are_not_removed(
+    made_city, flexroad, tmp_path, name
+):
     words = ["export", made_city.path, "--format", "obj", "-o", tmp_path / "out"]
     flexroad(*words).expected(0)
-    outside = tmp_path / "outside"
+    outside, changed = tmp_path / "outside", tmp_path / "out" / "obj" / f"{made_city.done[1]}.obj"
     outside.write_text("kept")
-    name = str(outside) if name.startswith("/") else name.replace("outside", "../outside", 1)
-    marker = tmp_path / "out" / "obj" / ".pieces" / f"{made_city.done[1]}.json"
-    content = json.loads(marker.read_text())
-    marker.write_text(json.dumps(content | {"sizes": {name: 4, "../../outside": 4}}))
+    changed.write_text("# painted by hand")
+    if name:
+        place = str(outside) if name.startswith("/") else name.replace("outside", "../outside", 1)
+        marker = tmp_path / "out" / "obj" / ".pieces" / f"{made_city.done[1]}.json"
+        content = json.loads(marker.read_text())
+        marker.write_text(json.dumps(content | {"sizes": {place: 4, "../../outside": 4}}))
     flexroad(*words, "--tile", made_city.done[0]).expected(0)
     assert outside.read_text() == "kept"
+    assert changed.read_text() == "# painted by hand"
+    # A marker that names files elsewhere is as none.
+    assert changed.with_suffix(".json").exists() == bool(name)
 
 
 @each_format

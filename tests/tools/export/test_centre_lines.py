@@ -11,7 +11,7 @@ import shapely
 from flexroad.tasks.roads.rasterise import Options
 from flexroad.tasks.types import Source
 from flexroad.tools.export.network import from_table, read_centre_lines
-from tests.make_roads import GRID, in_cp1252, on_grid, write
+from tests.make_roads import GRID, on_grid, write
 
 ALONG = shapely.LineString([(0, 0), (10, 0), (20, 5)])
 
@@ -25,15 +25,20 @@ def only(**values):
     return line
 
 
-def test_from_table_osm_attributes_are_known():
-    line = only(highway="residential", lanes="2", oneway="yes", name="Hauptstraße")
-    assert (line.width_m, line.lanes, line.oneway, line.name) == (7.0, 2, True, "Hauptstraße")
+@pytest.mark.parametrize(
+    ("values", "known"),
+    [
+        (
+            {"highway": "residential", "lanes": "2", "oneway": "yes", "name": "Hauptstraße"},
+            (7.0, 2, True, "Hauptstraße"),
+        ),
+        ({"id": 1}, (6.0, None, False, "")),
+    ],
+)
+def test_from_table_has_the_attributes_or_the_default_width(values, known):
+    line = only(**values)
+    assert (line.width_m, line.lanes, line.oneway, line.name) == known
     assert line.points.tolist() == [[0, 0], [10, 0], [20, 5]]
-
-
-def test_from_table_without_attributes_has_the_default_width_alone():
-    line = only(id=1)
-    assert (line.width_m, line.lanes, line.oneway, line.name) == (6.0, None, False, "")
 
 
 @pytest.mark.parametrize(
@@ -97,17 +102,6 @@ def with_name(path, data):
             file.execute("UPDATE a SET name = CAST(? AS TEXT)", (data,))
             file.commit()
     return path
-
-
-@pytest.mark.parametrize("suffix", ["shp", "gpkg", "fgb", "geojson"])
-def test_names_of_columns_in_another_encoding_than_declared_are_read_with_a_note(suffix, tmp_path):
-    line = shapely.LineString(on_grid((0, 20), (90, 20)))
-    path = write(tmp_path / f"a.{suffix}", [line], name=["Lane"], width_m=[6.0], xxxxxxx=["stone"])
-    in_cp1252(path, "xxxxxxx", "Straßen")
-    found = read_centre_lines({Source("roads", (path,)): GRID.bounds}, GRID.crs, Options())
-    assert [(line.name, line.width_m) for line in found.lines] == [("Lane", 6.0)]
-    (note,) = [note for note in found.notes if "encoding" in note]
-    assert "was read as cp1252;" in note
 
 
 @pytest.mark.parametrize("suffix", ["shp", "gpkg"])

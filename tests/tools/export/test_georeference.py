@@ -14,9 +14,8 @@ from flexroad.tools.export.georeference import Datum, Georeference, LocalFrame, 
 PLACE = Georeference("EPSG:25832", (295500.0, 5629250.0, 150.0), "EPSG:7837")
 
 
-def test_sidecar_has_place_axes_and_other_entries():
-    content = json.loads(PLACE.sidecar("x east", step_m=0.5))
-    assert content == {
+def test_sidecar_lines_and_prj_have_the_place():
+    assert json.loads(PLACE.sidecar("x east", step_m=0.5)) == {
         "crs": "EPSG:25832",
         "crs_name": "ETRS89 / UTM zone 32N",
         "vertical_crs": "EPSG:7837",
@@ -24,39 +23,22 @@ def test_sidecar_has_place_axes_and_other_entries():
         "axes": "x east",
         "step_m": 0.5,
     }
-
-
-def test_lines_are_single_ascii_lines():
     wkt = 'PROJCRS["Réunion",\n BASEGEOGCRS["b"]]'
-    lines = Georeference(wkt, PLACE.origin).lines()
-    assert lines == [
+    assert Georeference(wkt, PLACE.origin).lines() == [
         "origin 295500 5629250 150 (easting northing height, m)",
         'crs PROJCRS["R\\xe9union", BASEGEOGCRS["b"]]',
         "vertical crs unknown",
     ]
-
-
-def test_prj_is_read_as_the_same_crs():
-    text = PLACE.prj().decode()
-    assert len(text.splitlines()) == 1
-    assert CRS.from_user_input(text).to_epsg(20) == 25832
+    (line,) = PLACE.prj().decode().splitlines()
+    assert CRS.from_user_input(line).to_epsg(20) == 25832
 
 
 PLACES = {
-    "EPSG:25832": (366_000.0, 5_621_000.0),
-    "EPSG:27700": (532_400.0, 181_800.0),
-    "EPSG:26910": (5e5, 4.2e6),
+    "EPSG:25832": (366_000.0, 5_621_000.0, "GRS80"),
+    # Another ellipsoid than those of GNSS.
+    "EPSG:27700": (532_400.0, 181_800.0, "WGS84"),
+    "EPSG:26910": (5e5, 4.2e6, "GRS80"),
 }
-
-
-@pytest.mark.parametrize("crs", PLACES)
-def test_local_frame_there_and_back_is_the_same_point(crs):
-    easting, northing = (at + np.array([0.0, 3000.0, -700.0]) for at in PLACES[crs])
-    frame = LocalFrame.around(crs, easting[0], northing[0])
-    x, y = frame.to_local(easting, northing)
-    assert np.hypot(x[0], y[0]) < 1.5
-    back = frame.to_run(x, y)
-    np.testing.assert_allclose(back, (easting, northing), atol=1e-5)
 
 
 def test_local_frame_lengths_are_those_on_the_ellipsoid():
@@ -70,25 +52,21 @@ def test_local_frame_lengths_are_those_on_the_ellipsoid():
 
 
 @pytest.mark.parametrize("crs", PLACES)
-def test_local_frame_proj_string_describes_its_coordinates(crs):
-    easting, northing = PLACES[crs]
+def test_local_frame_is_described_by_its_proj_string_and_leads_back_to_the_run(crs):
+    easting, northing, ellipsoid = PLACES[crs]
     frame = LocalFrame.around(crs, easting, northing)
-    x, y = frame.to_local(np.array([easting + 900]), np.array([northing - 400]))
+    places = easting + np.array([0.0, 900.0, 3000.0]), northing + np.array([0.0, -400.0, -700.0])
+    x, y = frame.to_local(*places)
+    assert np.hypot(x[0], y[0]) < 1.5
+    np.testing.assert_allclose(frame.to_run(x, y), places, atol=1e-5)
     words = dict(word.lstrip("+").split("=") for word in frame.proj.split())
-    assert words["k"] == "1"
+    assert (words["k"], words["ellps"]) == ("1", ellipsoid)
     assert "+no_defs" not in frame.proj
     # The same ellipsoid, without a datum that could shift the result.
-    degrees = pyproj.Proj(frame.proj)(x[0], y[0], inverse=True)
-    geodetic = "EPSG:4326" if words["ellps"] == "WGS84" else pyproj.CRS(crs).geodetic_crs
-    truth = pyproj.Transformer.from_crs(crs, geodetic, always_xy=True).transform(
-        easting + 900, northing - 400
-    )
+    degrees = pyproj.Proj(frame.proj)(x, y, inverse=True)
+    geodetic = "EPSG:4326" if ellipsoid == "WGS84" else pyproj.CRS(crs).geodetic_crs
+    truth = pyproj.Transformer.from_crs(crs, geodetic, always_xy=True).transform(*places)
     np.testing.assert_allclose(degrees, truth, atol=1e-9)
-
-
-def test_local_frame_other_ellipsoid_than_that_of_gnss_uses_wgs_84():
-    assert "+ellps=WGS84" in LocalFrame.around("EPSG:27700", 532_400.0, 181_800.0).proj
-    assert "+ellps=GRS80" in LocalFrame.around("EPSG:25832", 366_000.0, 5_621_000.0).proj
 
 
 POINT = np.array([500_000.0]), np.array([5_600_000.0]), np.array([100.0])
@@ -107,28 +85,15 @@ def geoid(tmp_path):
     return path
 
 
-def test_offset_is_added_and_the_place_is_that_of_pyproj():
-    longitude, latitude, height = Datum("offset", "47.5").geographic("EPSG:25832", *POINT)
-    expected = Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True).transform(*POINT[:2])
-    np.testing.assert_allclose((longitude, latitude), expected, atol=1e-12)
-    assert height == 147.5
-
-
-def test_geoid_is_added_at_each_place(geoid):
+def test_offset_or_geoid_is_added_at_each_place(geoid):
     east = np.array([460_000.0, 500_000.0, 540_000.0])
     north, level = np.full(3, 5_600_000.0), np.array([0.0, 100.0, 200.0])
+    place = Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True).transform(east, north)
+    *found, height = Datum("offset", "47.5").geographic("EPSG:25832", east, north, level)
+    np.testing.assert_allclose(found, place, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(height, level + 47.5)
     longitude, _, height = Datum("geoid", str(geoid)).geographic("EPSG:25832", east, north, level)
     np.testing.assert_allclose(height - level, 47 + (longitude - 9), atol=1e-4)
-
-
-def test_geoid_that_does_not_cover_the_area_raises(geoid):
-    with pytest.raises(CatalogError, match=r"no exact conversion from EPSG:25833 .*--vertical FILE"):
-        Datum("geoid", str(geoid)).geographic("EPSG:25833", *POINT)
-
-
-def test_vertical_crs_without_its_grid_raises_and_is_not_ignored():
-    with pytest.raises(CatalogError, match=r"heights of EPSG:7837 .*; give the geoid's grid with --vertical"):
-        Datum("crs", "EPSG:7837").geographic("EPSG:25832", *POINT)
 
 
 def test_geocentric_agrees_with_the_equations_of_the_ellipsoid():
@@ -145,13 +110,23 @@ def test_geocentric_agrees_with_the_equations_of_the_ellipsoid():
     np.testing.assert_allclose(geocentric(longitude, latitude, height)[0], np.ravel(expected), atol=1e-6)
 
 
-@pytest.mark.parametrize("value", ["none.gtx", "nan"])
-def test_datum_that_cannot_be_used_raises(value):
-    with pytest.raises(CatalogError, match=f"--vertical {value}"):
-        Datum.of(value)
-
-
 def test_datum_is_a_number_a_geoid_or_a_crs(geoid):
     assert Datum.of("-47.50") == Datum("offset", "-47.5")
     assert Datum.of(str(geoid)) == Datum("geoid", str(geoid))
     assert Datum.of("EPSG:7837") == Datum("crs", "EPSG:7837")
+
+
+@pytest.mark.parametrize(
+    ("value", "crs", "message"),
+    [
+        ("none.gtx", "EPSG:25832", "--vertical none.gtx"),
+        ("nan", "EPSG:25832", "--vertical nan"),
+        # The geoid does not cover the area.
+        ("GEOID", "EPSG:25833", r"no exact conversion from EPSG:25833 .*--vertical FILE"),
+        # PROJ has no grid of this datum.
+        ("EPSG:7837", "EPSG:25832", r"heights of EPSG:7837 .*; give the geoid's grid with --vertical"),
+    ],
+)
+def test_datum_that_cannot_be_used_raises(geoid, value, crs, message):
+    with pytest.raises(CatalogError, match=message):
+        Datum.of(value.replace("GEOID", str(geoid))).geographic(crs, *POINT)

@@ -56,9 +56,8 @@ def exported(run, width_m, out):
     y = south + SIZE_M / 2
     line = shapely.LineString([(west + 5.0, y), (east - 5.0, y)])
     roads = make_roads.write(out / "roads.gpkg", [line], "EPSG:25832", width_m=[width_m])
-    entries = export(select(run), out / "out", FORMATS, Options(roads=str(roads)), SerialExecutor())[
-        "formats"
-    ]
+    options = Options(roads=str(roads))
+    entries = export(select(run), out / "out", FORMATS, options, SerialExecutor())["formats"]
     with (out / "out" / "crg" / "roads.csv").open() as file:
         (row,) = csv.DictReader(file)
     return entries, row
@@ -95,18 +94,13 @@ def test_wide_road_has_its_largest_step_in_report_manifest_and_summary(street, t
     assert float(row["crg_max_mm"]) < 1
 
 
-def test_road_within_the_mask_has_no_step(street, tmp_path):
-    run, _ = street
+def test_road_within_the_mask_has_no_step_and_step_says_what_it_leaves_out(street, tmp_path):
+    run, kerb = street
     entries, row = exported(run, 6.0, tmp_path)
     assert float(row["crg_steps_max_mm"]) == float(row["carriageway_steps_max_mm"]) == 0
     for name in ("crg", "xodr", "lines"):
         assert "kerbs" not in entries[name]["summary"]
     assert "misses the surface by at most" in entries["crg"]["summary"]
-
-
-def test_step_says_what_it_leaves_out_and_queries_have_it(street, tmp_path):
-    run, kerb = street
-    entries, _ = exported(run, 6.0, tmp_path)
     (tile,) = Catalog.read(run / "catalog.parquet").tiles
     (west, south, _, _), out = tile.grid.bounds, tmp_path / "out"
     about = json.loads((out / "step" / f"{tile.id}_stp.json").read_text())

@@ -6,23 +6,12 @@ from PIL import Image
 from flexroad.tasks.types import Mesh
 from flexroad.tools.export import obj
 from flexroad.tools.export.georeference import Georeference
+from tests.builders import make_mesh
 from tests.crossing import Crossing
 
-ORIGIN = (295500.0, 5629250.0, 150.0)
 PLACE = Georeference("EPSG:25832", (295400.0, 5629200.0, 0.0), "EPSG:7837")
 """What all tiles of a run are relative to."""
 PHOTO = (295500.0, 5629248.0, 295512.0, 5629260.0)
-
-
-def hills(n: int = 9, road_east: float = 4.0) -> Mesh:
-    """Return a 10 m square of hills whose west is road."""
-    x, y = np.meshgrid(np.linspace(0, 10, n), np.linspace(0, 10, n))
-    z = 3.2 + np.sin(x / 3) + 0.1 * y
-    i = np.arange(n * n).reshape(n, n)
-    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
-    faces = np.concatenate([np.c_[a, b, c], np.c_[a, c, d]]).astype(np.int32)
-    vertices = np.c_[x.ravel(), y.ravel(), z.ravel()]
-    return Mesh("EPSG:25832", ORIGIN, vertices, faces, vertices[faces].mean(axis=1)[:, 0] < road_east)
 
 
 def loaded(folder, mesh: Mesh, textured: bool = False) -> dict[str, trimesh.Trimesh]:
@@ -37,7 +26,7 @@ def loaded(folder, mesh: Mesh, textured: bool = False) -> dict[str, trimesh.Trim
 
 @pytest.mark.parametrize("textured", [False, True])
 def test_encode_is_read_by_trimesh(tmp_path, textured):
-    mesh = hills()
+    mesh = make_mesh()
     parts = loaded(tmp_path, mesh, textured)
     assert set(parts) == {"road", "terrain"}
     for name, faces in (("road", mesh.road), ("terrain", ~mesh.road)):
@@ -47,7 +36,7 @@ def test_encode_is_read_by_trimesh(tmp_path, textured):
 
 
 def test_encode_texture_coordinates_are_places_in_the_photo(tmp_path):
-    for part in loaded(tmp_path, hills(), textured=True).values():
+    for part in loaded(tmp_path, make_mesh(), textured=True).values():
         x, y, _ = part.vertices.T
         np.testing.assert_allclose(part.visual.uv, np.c_[(x - 100) / 12, (y - 48) / 12], atol=1e-5)
         assert part.visual.material.image.size == (24, 24)
@@ -61,7 +50,7 @@ def test_materials_have_colours_or_the_texture():
 
 
 def test_encode_comments_have_the_place():
-    lines = obj.encode(hills(), "tile.mtl", PLACE).decode("ascii").splitlines()
+    lines = obj.encode(make_mesh(), "tile.mtl", PLACE).decode("ascii").splitlines()
     assert lines[:5] == [
         "# origin 295400 5629200 0 (easting northing height, m)",
         "# crs EPSG:25832",
@@ -71,9 +60,9 @@ def test_encode_comments_have_the_place():
     ]
 
 
-@pytest.mark.parametrize(("road_east", "group"), [(-1, "terrain"), (99, "road")])
-def test_encode_class_without_faces_has_no_group(road_east, group):
-    lines = obj.encode(hills(road_east=road_east), "tile.mtl", PLACE).decode().splitlines()
+@pytest.mark.parametrize(("road_from", "group"), [(-1, "road"), (99, "terrain")])
+def test_encode_class_without_faces_has_no_group(road_from, group):
+    lines = obj.encode(make_mesh(road_from=road_from), "tile.mtl", PLACE).decode().splitlines()
     assert [line for line in lines if line.startswith("g ")] == [f"g {group}"]
 
 
@@ -86,7 +75,3 @@ def test_encode_deck_is_a_group_with_the_material_of_roads():
     faces = [[int(k) - 1 for k in line.split()[1:]] for line in groups["level_1"][2:]]
     np.testing.assert_array_equal(faces, mesh.faces[mesh.level == 1])
     assert sum(len(lines) - 2 for lines in groups.values()) == len(mesh.faces)
-
-
-def test_encode_equal_meshes_give_equal_bytes():
-    assert obj.encode(hills(), "a.mtl", PLACE) == obj.encode(hills(), "a.mtl", PLACE)

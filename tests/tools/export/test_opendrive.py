@@ -113,24 +113,30 @@ def test_elevation_error_is_that_of_a_level_cross_section():
         ({"lanes": 2, "oneway": True}, False, 0, 2),
         ({"lanes": 2, "oneway": True}, True, 2, 0),
         ({"lanes": 1}, False, 0, 1),
+        ({"lanes": 1, "oneway": True}, False, 0, 1),
         ({"oneway": True}, False, 0, 1),
     ],
 )
 def test_write_lanes_fill_the_carriageway_around_the_line(known, left_hand, left, right):
     element = only(road(reference(**known)), left_hand=left_hand)
     assert element.attrib["rule"] == ("LHT" if left_hand else "RHT")
+    lanes = {side: element.findall(f"lanes/laneSection/{side}/lane") for side in ("left", "right")}
+    assert [int(lane.attrib["id"]) for lane in lanes["left"]] == list(range(left, 0, -1))
+    assert [int(lane.attrib["id"]) for lane in lanes["right"]] == list(range(-1, -right - 1, -1))
     for s in (0.0, 100.0):
         shifted = element.find("lanes/laneOffset") is not None
         offset = polynomial(element, "lanes/laneOffset", s) if shifted else 0.0
-        reach = {}
-        for side, count in (("left", left), ("right", right)):
-            lanes = element.findall(f"lanes/laneSection/{side}/lane")
-            assert [int(lane.attrib["id"]) for lane in lanes] == (
-                list(range(count, 0, -1)) if side == "left" else list(range(-1, -count - 1, -1))
-            )
-            reach[side] = sum(polynomial(lane, "width", s, "sOffset") for lane in lanes)
-        assert offset + reach["left"] == pytest.approx(3.0)
-        assert offset - reach["right"] == pytest.approx(-3.0)
+        widths = {
+            side: sum(polynomial(lane, "width", s, "sOffset") for lane in lanes[side]) for side in lanes
+        }
+        assert offset + widths["left"] == pytest.approx(3.0)
+        assert offset - widths["right"] == pytest.approx(-3.0)
+    for lane in lanes["left"] + lanes["right"]:
+        assert lane.get("direction") == ("both" if known == {"lanes": 1} else None)
+    # CARLA's parser raises an error for a lane without a mark after its width.
+    for lane in element.findall("lanes/laneSection/*/lane"):
+        assert [mark.attrib["type"] for mark in lane.findall("roadMark")] == ["none"]
+        assert lane[-1].tag == "roadMark"
 
 
 @pytest.mark.parametrize(
@@ -152,25 +158,6 @@ def test_write_lanes_of_unknown_number_have_a_usual_width(width, oneway, left, r
     for lane in lanes["left"] + lanes["right"]:
         assert polynomial(lane, "width", 50.0, "sOffset") == pytest.approx(lane_m)
         assert lane.get("direction") == ("both" if (width, oneway) == (3.5, False) else None)
-
-
-@pytest.mark.parametrize("lanes", [1, 2, 3])
-def test_write_each_lane_has_a_mark_of_no_type_after_its_width(lanes):
-    """CARLA's parser raises an error for a lane without one."""
-    found = only(road(reference(lanes=lanes))).findall("lanes/laneSection/*/lane")
-    assert len(found) == lanes + 1
-    for lane in found:
-        assert [mark.attrib["type"] for mark in lane.findall("roadMark")] == ["none"]
-        assert lane[-1].tag == "roadMark"
-
-
-def test_write_one_lane_for_both_directions_says_so():
-    lane = only(road(reference(lanes=1))).find("lanes/laneSection/right/lane")
-    assert lane is not None
-    assert lane.attrib["direction"] == "both"
-    oneway = only(road(reference(lanes=1, oneway=True))).find("lanes/laneSection/right/lane")
-    assert oneway is not None
-    assert "direction" not in oneway.attrib
 
 
 def test_write_width_follows_the_road():

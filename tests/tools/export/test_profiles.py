@@ -45,11 +45,6 @@ def test_profiles_cubic_road_is_found(length):
     assert worst < 1e-6
 
 
-def test_profiles_left_side_higher_is_positive():
-    result, _ = fitted(grid(lambda x, y: 0.1 * y))
-    assert value_at(result.superelevation, 50.0) == pytest.approx(np.arctan(0.1))
-
-
 def test_profiles_verge_does_not_count():
     # A kerb of 0.3 m from 3 m on, where the carriageway ends; the grid reaches 4 m.
     result, worst = fitted(grid(lambda x, y: hill(x, y) + 0.3 * (np.abs(y) > 3.01)))
@@ -90,12 +85,6 @@ def test_profiles_of_a_crowned_road_do_not_bend_where_its_surface_ends(step):
     complete, cut = (profiles(grid(heights, 60.0)) for heights in (crowned, ending))
     np.testing.assert_allclose(value_at(cut.elevation, s), value_at(complete.elevation, s), rtol=0, atol=1e-9)
     np.testing.assert_allclose(value_at(cut.superelevation, s), np.arctan(0.01), rtol=0, atol=1e-9)
-
-
-def test_profile_error_without_heights_is_nan():
-    whole = grid(hill)
-    nothing = HeightGrid(whole.line, whole.v, whole.heights * np.nan)
-    assert np.isnan(profile_error(nothing, profiles(nothing))[1])
 
 
 def test_profiles_go_on_from_piece_to_piece():
@@ -147,15 +136,6 @@ def tilted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 100 + 0.02 * x + 0.05 * y
 
 
-def test_height_grid_left_of_the_line_has_positive_v():
-    # Northwards: the left is in the west.
-    grid = height_grid(road(np.array([[10.0, 0.0], [10.0, 40.0]])), tilted)
-    np.testing.assert_allclose(grid.v, np.arange(-4, 4.1, 0.25))
-    y = np.arange(41.0)[:, None]
-    np.testing.assert_allclose(grid.heights, tilted(10 - grid.v, y), atol=1e-9)
-    assert grid_error(grid, tilted)[1] < 1e-9
-
-
 def test_height_grid_narrow_bend_has_no_margin_on_its_inside(monkeypatch):
     monkeypatch.setattr(heights_along, "MARGIN_M", 5.0)
     turn = np.radians(np.arange(0.0, 181.0, 5.0))
@@ -189,10 +169,17 @@ def test_grid_error_is_that_of_the_middle_of_cells():
     assert max_m == pytest.approx(median_m)
 
 
-def test_height_grid_beyond_the_surface_is_nan_and_has_no_error():
-    line = road(np.array([[0.0, 0.0], [40.0, 0.0]]))
-    half = lambda x, y: np.where(y > 0, np.nan, x)  # noqa: E731
-    grid = height_grid(line, half)
-    assert np.isnan(grid.heights[:, grid.v > 1e-6]).all()
-    assert grid_error(grid, half)[1] < 1e-9
-    assert np.isnan(grid_error(grid, lambda x, y: x + np.nan)[0])
+def test_height_grid_has_its_left_at_positive_v_and_no_heights_or_error_beyond_the_surface():
+    # Northwards: the left is in the west.
+    line = road(np.array([[10.0, 0.0], [10.0, 40.0]]))
+    complete = height_grid(line, tilted)
+    np.testing.assert_allclose(complete.v, np.arange(-4, 4.1, 0.25))
+    np.testing.assert_allclose(complete.heights, tilted(10 - complete.v, np.arange(41.0)[:, None]), atol=1e-9)
+    assert grid_error(complete, tilted)[1] < 1e-9
+    half = lambda x, y: np.where(x < 9.99, np.nan, tilted(x, y))  # noqa: E731
+    cut = height_grid(line, half)
+    assert np.isnan(cut.heights[:, cut.v > 1e-6]).all()
+    assert grid_error(cut, half)[1] < 1e-9
+    nothing = HeightGrid(line, complete.v, complete.heights * np.nan)
+    assert np.isnan(profile_error(nothing, profiles(nothing))[1])
+    assert np.isnan(grid_error(complete, lambda x, y: x + np.nan)[0])

@@ -100,19 +100,14 @@ def test_joined_error_is_no_less_than_the_distance_from_the_first_meshes():
         assert 0.5 * relief.error_m < worst <= relief.error_m + 1e-6
 
 
-def test_joined_leaves_out_what_no_part_has():
-    parts = [of_mesh(*hills(n, east=100.0 * n, north=100.0 * n), 4.0) for n in range(2)]
-    relief = joined(parts, 12.5)
+def test_joined_step_between_parts_is_part_of_the_error_and_what_no_part_has_is_left_out():
+    lower, upper = hills(0), hills(0, east=100.0)
+    upper[0][:, 2] = lower[0][:, 2] + 30
+    assert joined([of_mesh(*lower, 4.0), of_mesh(*upper, 4.0)], 20.0).error_m > 25
+    relief = joined([of_mesh(*hills(n, east=100.0 * n, north=100.0 * n), 4.0) for n in range(2)], 12.5)
     expected = np.zeros((16, 16), bool)
     expected[8:, :8] = expected[:8, 8:] = True
     np.testing.assert_array_equal(relief.cells, expected)
-
-
-def test_joined_step_between_parts_is_part_of_the_error():
-    lower, upper = hills(0), hills(0, east=100.0)
-    upper[0][:, 2] = lower[0][:, 2] + 30
-    relief = joined([of_mesh(*lower, 4.0), of_mesh(*upper, 4.0)], 20.0)
-    assert relief.error_m > 25
 
 
 def test_joined_part_between_nodes_is_covered():

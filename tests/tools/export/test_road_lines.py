@@ -49,24 +49,17 @@ def test_write_lines_and_segments_have_heights_and_columns(tmp_path, monkeypatch
     )
 
 
-def test_write_unknown_numbers_are_null(tmp_path):
+def test_write_unknown_numbers_are_null_and_equal_roads_give_equal_bytes(tmp_path):
+    for name in ("roads.gpkg", "again.gpkg"):
+        road_lines.write(tmp_path / name, [road(1, 4)], "EPSG:25832", DATE)
     path = tmp_path / "roads.gpkg"
-    road_lines.write(path, [road(1, 4)], "EPSG:25832", DATE)
+    assert path.read_bytes() == (tmp_path / "again.gpkg").read_bytes()
     segments = geopandas.read_file(path, layer="segments")
     assert segments.error_m.isna().tolist() == [True, False, True, False]
     assert geopandas.read_file(path, layer="roads").lanes.isna().all()
     assert len(geopandas.read_file(path, layer="segments", where="error_m IS NULL")) == 2
-
-
-def test_write_to_a_missing_folder_is_an_error(tmp_path):
     with pytest.raises(TaskError, match=r"roads.gpkg cannot be written: .*; check the disk"):
         road_lines.write(tmp_path / "none" / "roads.gpkg", [road(1, 4)], "EPSG:25832", DATE)
-
-
-def test_write_equal_roads_give_equal_bytes(tmp_path):
-    for name in ("one.gpkg", "two.gpkg"):
-        road_lines.write(tmp_path / name, [road(1, 4)], "EPSG:25832", DATE)
-    assert (tmp_path / "one.gpkg").read_bytes() == (tmp_path / "two.gpkg").read_bytes()
 
 
 def line(*points: tuple[float, float], width: float = 6.0) -> ReferenceLine:

@@ -1,16 +1,23 @@
-"""The file against the surface: read by a parser of the standard's syntax, evaluated by geomdl."""
+"""The file against the surface, by a parser of the standard's syntax and geomdl; its part against SciPy."""
 
 import json
 import re
+from dataclasses import replace
 from datetime import datetime
 
 import numpy as np
 import pytest
 from geomdl import NURBS, BSpline
+from scipy.interpolate import BSpline as SciPySpline
 
-from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import RoadMask
 from flexroad.tools.export import step
 from flexroad.tools.export.georeference import Georeference
+from flexroad.tools.export.step import covered, cut, patch
+from tests.builders import make_surface
 from tests.validators.opencascade import read_step
 
 BOUNDS = (295450.0, 5629200.0, 295800.0, 5629550.0)
@@ -20,18 +27,9 @@ PLACE = Georeference("EPSG:25832", (295000.0, 5629100.0, 0.0), "EPSG:7837")
 WRITTEN = datetime(2026, 5, 4, 3, 2, 1)
 
 
-def surface(weights: bool, crs: str = "EPSG:25832") -> NurbsSurface:
-    rng = np.random.default_rng(7)
-    n, m = 14, 12
-    w = np.exp(rng.uniform(-1, 1, (m, n))) if weights else np.ones((m, n))
-    knots = (
-        (clamped_knots(n, 3), clamped_knots(m, 3))
-        if weights
-        else (uniform_knots(0, n - 3, 3), uniform_knots(0, m - 3, 3))
-    )
-    return NurbsSurface(
-        crs, BOUNDS, (3, 3), *knots, w * rng.normal(0, 2, (m, n)), w, 150.25, (295500.0, 5629250.0)
-    )
+def surface(weights: bool) -> NurbsSurface:
+    knots = "clamped" if weights else "uniform"
+    return make_surface((12, 14), (3, 3), knots, weights, 7, BOUNDS)
 
 
 def encoded(weights: bool) -> str:
@@ -181,13 +179,93 @@ def test_encode_head_has_schema_time_and_place():
 
 def test_encode_long_and_foreign_text_is_divided_and_escaped():
     wkt = "PROJCRS['Réunion'," + "x" * 600 + "]"
-    text = step.encode(
-        surface(False, wkt), CORE, "tîle 'a'\\b", WRITTEN, Georeference(wkt, (0.0, 0.0, 0.0))
-    ).decode("ascii")
+    long = replace(surface(False), crs=wkt)
+    place = Georeference(wkt, (0.0, 0.0, 0.0))
+    text = step.encode(long, CORE, "tîle 'a'\\b", WRITTEN, place).decode("ascii")
     (description,) = re.findall(r"FILE_DESCRIPTION\((.*),'2;1'\);", text)
     assert max(map(len, re.findall(r"'((?:[^']|'')*)'", description))) <= 256
     assert r"PRODUCT('t\X4\000000EE\X0\le ''a''\\b'," in text
 
 
-def test_encode_equal_surfaces_give_equal_bytes():
-    assert encoded(True) == encoded(True)
+AREA = (295500.0, 5629250.0, 295750.0, 5629450.0)
+WITHIN = (295512.3, 5629250.0, 295730.0, 5629444.4)
+
+
+def whole(degree=(3, 2), knots="uniform", weights=False) -> NurbsSurface:
+    return make_surface((17, 20), degree, knots, weights, 5, AREA)
+
+
+def evaluated(nurbs, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return points of a NURBS by SciPy, ``(len(v), len(u), 3)``."""
+    nu = SciPySpline(nurbs.knots_u, np.eye(nurbs.points.shape[1]), nurbs.degree[0])(u)
+    nv = SciPySpline(nurbs.knots_v, np.eye(nurbs.points.shape[0]), nurbs.degree[1])(v)
+    w = nurbs.points[..., 3:]
+    homogeneous = np.einsum("ai,bj,ijc->abc", nv, nu, np.concatenate([nurbs.points[..., :3] * w, w], -1))
+    return homogeneous[..., :3] / homogeneous[..., 3:]
+
+
+@pytest.mark.parametrize("degree", [(3, 3), (1, 2), (5, 4)])
+@pytest.mark.parametrize("knots", ["uniform", "clamped"])
+@pytest.mark.parametrize("weights", [False, True])
+@pytest.mark.parametrize("bounds", [WITHIN, AREA, (295400.0, 5629300.0, 295600.0, 5629999.0)])
+def test_patch_equals_surface_within_a_nanometre(degree, knots, weights, bounds):
+    truth = whole(degree, knots, weights)
+    nurbs, rational = patch(truth, bounds, truth.origin)
+    assert rational == weights
+    assert nurbs.degree == tuple(p + weights for p in degree)
+    (west, south), (east, north) = np.maximum(bounds[:2], AREA[:2]), np.minimum(bounds[2:], AREA[2:])
+    t = np.linspace(0, 1, 41)
+    x, y = west + (east - west) * t, south + (north - south) * t
+    found = np.moveaxis(evaluated(nurbs, t, t), -1, 0)
+    np.testing.assert_allclose(found[:2], np.meshgrid(x - 295500, y - 5629250), rtol=0, atol=1e-9)
+    # The surface's own heights have the rounding error of a northing, 1e-9 m, times the slope.
+    steepest = max(np.abs(slope).max() for slope in truth.slope(*np.meshgrid(x, y)))
+    np.testing.assert_allclose(found[2], truth.lattice(x, y), rtol=0, atol=1e-9 * (1 + steepest))
+
+
+def test_patch_of_equal_weights_other_than_1_is_not_rational():
+    ones = whole()
+    nurbs, rational = patch(replace(ones, A=2.5 * ones.A, W=2.5 * ones.W), WITHIN, ones.origin)
+    assert not rational
+    np.testing.assert_allclose(nurbs.points, patch(ones, WITHIN, ones.origin)[0].points, atol=5e-9)
+    np.testing.assert_array_equal(nurbs.points[..., 3], 1)
+
+
+def test_cut_is_clamped_and_has_the_knots_of_the_part():
+    part = cut(whole(), WITHIN)
+    assert part.bounds == WITHIN
+    for knots, degree in ((part.knots_u, 3), (part.knots_v, 2)):
+        np.testing.assert_array_equal(knots[: degree + 1], 0)
+        np.testing.assert_array_equal(knots[-degree - 1 :], 1)
+        assert ((knots > 0) & (knots < 1)).sum() == len(knots) - 2 * degree - 2
+    # Knots are 250 / 17 m apart along easting; the part is from 12.3 m to 230 m.
+    inner = 295500 + np.arange(1, 16) * 250 / 17
+    np.testing.assert_allclose(295512.3 + part.knots_u[4:-4] * 217.7, inner, atol=1e-9)
+
+
+def test_cut_has_no_narrow_span_and_as_few_points_as_possible():
+    part = cut(whole(), (295500 + 5 * 250 / 17 + 1e-10, *AREA[1:]))
+    assert np.diff(part.knots_u)[np.diff(part.knots_u) > 0].min() > 0.05
+    assert cut(whole(), (295501.0, 5629251.0, 295502.0, 5629252.0)).A.shape == (3, 4)
+    with pytest.raises(TaskError, match=r"bounds 0 0 1 1 lie beyond the surface's domain 295500 5629250"):
+        cut(whole(), (0, 0, 1, 1))
+
+
+TILE = Grid("EPSG:25832", 295500.0, 5629500.0, 2.0, 5, 4)
+
+
+@pytest.mark.parametrize(
+    ("survey", "halo", "bounds", "beyond_m2"),
+    [
+        ("##### ##### ##### #####", 0, TILE.bounds, 0.0),
+        ("..... ...#. ..##. .....", 0, (295504.0, 5629494.0, 295508.0, 5629498.0), 4.0),
+        ("..... ..... ..... .....", 0, TILE.bounds, 80.0),
+        # A halo of one cell is beyond the survey.
+        ("....... .#####. .#####. .#####. .#####. .......", 1, TILE.bounds, 0.0),
+    ],
+    ids=["complete", "part", "nothing", "halo"],
+)
+def test_covered_is_the_rectangle_around_the_cells_of_the_core_with_data(survey, halo, bounds, beyond_m2):
+    outside = np.array([list(row) for row in survey.split()]) == "."
+    grid = Grid(TILE.crs, TILE.west - 2 * halo, TILE.north + 2 * halo, 2.0, 5 + 2 * halo, 4 + 2 * halo)
+    assert covered(RoadMask(grid, TILE, np.zeros(grid.shape, bool), outside)) == (bounds, beyond_m2)

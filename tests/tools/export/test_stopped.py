@@ -135,23 +135,6 @@ def test_interrupted_export_has_exit_code_130_and_goes_on(made_city, whole, tmp_
     goes_on(made_city, name, out, folder)
 
 
-def test_interrupted_export_keeps_the_parts_that_it_has(made_city, whole, tmp_path, monkeypatch):
-    from flexroad.tools.export import tile_outputs
-
-    written, write = [], tile_outputs._write
-
-    def second_is_interrupted(job):
-        written.append(job.tile.id)
-        if len(written) == 2:
-            raise KeyboardInterrupt
-        return write(job)
-
-    monkeypatch.setattr(tile_outputs, "_write", second_is_interrupted)
-    assert command_line.call(*words(made_city, "landxml", tmp_path)).code == 130
-    goes_on(made_city, "landxml", tmp_path, whole[0])
-    assert written == [*made_city.done, made_city.done[1]]
-
-
 def test_dask_writes_the_same_bytes(made_city, whole, cluster, tmp_path):
     executor = DaskExecutor(scheduler=cluster.scheduler_address)
     # With OpenCRG in the same export, OpenDRIVE refers to it: that of `whole` does not.

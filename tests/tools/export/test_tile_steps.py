@@ -73,15 +73,10 @@ def test_road_over_tiles_apart_ends_with_1_and_says_by_how_much(tmp_path, flexro
     assert "misses the surface by at most 9" in said.out
     allowed = flexroad(*words, "--allow-steps").expected(0)
     assert "note: crg: 2 roads lie on tiles that do not meet" in allowed.err
-
-
-def test_road_over_a_small_step_is_fit(tmp_path, flexroad):
-    run = level_tiles(tmp_path / "survey", plane(tmp_path), 100.0, 100.04)
-    roads = streets(tmp_path, [(10, 10), (110, 20)])
-    flexroad("export", run, "--format", FORMATS, "--roads", roads, "-o", tmp_path / "out").expected(0)
-    steps, entries = figures(tmp_path / "out")
-    assert steps == pytest.approx([40], abs=0.01)
-    assert entries["lines"]["tile_steps_max_mm"] == pytest.approx(40, abs=0.01)
+    crossing, inside = (f"{WEST + west} {SOUTH + 10}, {WEST + 110} {SOUTH + 10}" for west in (10, 70))
+    said = flexroad("query", run, "--line", crossing, "--step", 25).expected(0)
+    assert "note: the line crosses tiles that do not meet, by up to 80 mm; use a run of prod" in said.err
+    assert flexroad("query", run, "--line", inside, "--step", 25).expected(0).err == ""
 
 
 def test_step_beside_a_road_along_a_border_counts_on_its_carriageway_alone(tmp_path, flexroad):
@@ -114,18 +109,15 @@ def test_lift_onto_tiles_apart_ends_with_1_and_says_by_how_much(tmp_path, flexro
         assert "note: " in flexroad(*words, "--allow-steps").expected(0).err or not code
 
 
-def test_query_along_a_line_over_tiles_apart_says_by_how_much(tmp_path, flexroad):
-    run = level_tiles(tmp_path / "survey", plane(tmp_path), 100.0, 100.08)
-    line = f"{WEST + 10} {SOUTH + 10}, {WEST + 110} {SOUTH + 10}"
-    said = flexroad("query", run, "--line", line, "--step", 25).expected(0)
-    assert "note: the line crosses tiles that do not meet, by up to 80 mm; use a run of prod" in said.err
-    inside = f"{WEST + 70} {SOUTH + 10}, {WEST + 110} {SOUTH + 10}"
-    assert flexroad("query", run, "--line", inside, "--step", 25).expected(0).err == ""
-
-
-def test_rasters_and_meshes_of_tiles_apart_have_a_note(tmp_path, flexroad):
-    run = level_tiles(tmp_path / "survey", plane(tmp_path), 100.0, 100.08)
-    said = flexroad("export", run, "--format", "mosaic,obj", "-o", tmp_path / "out").expected(0)
+def test_small_step_is_fit_for_roads_and_noted_for_meshes(tmp_path, flexroad):
+    run = level_tiles(tmp_path / "survey", plane(tmp_path), 100.0, 100.04)
+    roads = streets(tmp_path, [(10, 10), (110, 20)])
+    words = "export", run, "-o", tmp_path / "out", "--format"
+    flexroad(*words, FORMATS, "--roads", roads).expected(0)
+    steps, entries = figures(tmp_path / "out")
+    assert steps == pytest.approx([40], abs=0.01)
+    assert entries["lines"]["tile_steps_max_mm"] == pytest.approx(40, abs=0.01)
+    said = flexroad(*words, "mosaic,obj").expected(0)
     assert "note: mosaic, obj: the tiles of this run do not meet, and heights have steps there" in said.err
 
 

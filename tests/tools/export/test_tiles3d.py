@@ -7,7 +7,6 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from pyproj import Transformer
 
 from flexroad.tools.export.georeference import Datum, Georeference, geocentric
 from flexroad.tools.export.relief import Relief, encode_sheet, sheet
@@ -21,6 +20,7 @@ from flexroad.tools.export.tiles3d import (
     tile,
     tileset,
 )
+from tests.read_exports import from_earth
 
 PLACE = Georeference("EPSG:25832", (450_000.0, 5_550_000.0, 0.0))
 DATUM = Datum("offset", "47.5")
@@ -53,29 +53,25 @@ def test_transforms_of_neighbours_agree_on_their_border():
     assert np.linalg.norm(both[0] - both[1], axis=1).max() < 0.002
 
 
-def test_region_contains_all_vertices():
-    leaf = at(500_000.0, 5_600_000.0, 250)
-    rng = np.random.default_rng(2)
-    points = rng.uniform((500_000, 5_600_000, 100), (500_250, 5_600_250, 160), (500, 3))
-    longitude, latitude, height = DATUM.geographic(PLACE.crs, *points.T)
-    west, south, east, north, low, high = leaf["region"]
-    assert np.radians(longitude).min() >= west
-    assert np.radians(longitude).max() <= east
-    assert np.radians(latitude).min() >= south
-    assert np.radians(latitude).max() <= north
-    assert low <= height.min() <= height.max() <= high
+def test_regions_contain_all_vertices():
+    east, north = 500_000.0, 5_600_000.0
+    points = np.random.default_rng(2).uniform((east, north, 100), (east + 250, north + 250, 160), (500, 3))
+    made, placed_sheet, _ = sheet_of(4000.0, east, north, 64.0)
+    for region, inside in ((at(east, north, 250)["region"], points), (placed_sheet["region"], made.points)):
+        longitude, latitude, height = DATUM.geographic(PLACE.crs, *inside.T)
+        plan, (west, south, east_, north_, low, high) = np.radians([longitude, latitude]), region
+        assert (plan.min(axis=1) > [west, south]).all()
+        assert (plan.max(axis=1) < [east_, north_]).all()
+        assert low <= height.min() < height.max() <= high
+    west, _, east_, *_ = placed_sheet["region"]
+    assert east_ - west < np.ptp(plan[0]) + 1e-7
 
 
 @given(st.lists(st.tuples(*[st.floats(-1, 1)] * 6), min_size=1, max_size=9))
 def test_around_contains_each_region(regions):
     west, south, east, north, low, high = around(regions)
-    for region in regions:
-        assert west <= region[0]
-        assert south <= region[1]
-        assert east >= region[2]
-        assert north >= region[3]
-        assert low <= region[4]
-        assert high >= region[5]
+    assert (np.array(regions)[:, [0, 1, 4]] >= [west, south, low]).all()
+    assert (np.array(regions)[:, [2, 3, 5]] <= [east, north, high]).all()
 
 
 def matrix_of(entry):
@@ -92,13 +88,6 @@ def sheet_of(side, east, north, spacing):
     return made, *sheet_placed("b.glb", made.points, PLACE.crs, DATUM)
 
 
-def back(points):
-    """From the Earth's centre to easting, northing and height of the run."""
-    plan = Transformer.from_crs("EPSG:4978", "EPSG:25832", always_xy=True).transform(*points.T)[:2]
-    height = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*points.T)[2]
-    return np.column_stack([*plan, height - 47.5])
-
-
 @pytest.mark.parametrize("east", [500_000.0, 770_000.0])
 def test_sheet_of_4_km_is_where_its_points_are_within_2_mm(east):
     """As a viewer reads it: float32 vertices with the transform of the tile."""
@@ -107,21 +96,11 @@ def test_sheet_of_4_km_is_where_its_points_are_within_2_mm(east):
     scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
     x, y, z = scene.geometry["ground"].vertices.astype(np.float32).T.astype(np.float64)
     matrix = matrix_of(tile(placed_sheet, 64.0))
-    read = back(np.column_stack([x, -z, y]) @ matrix[:3, :3].T + matrix[:3, 3])
+    read = from_earth(np.column_stack([x, -z, y]) @ matrix[:3, :3].T + matrix[:3, 3])
     assert np.abs(read - made.points).max() < 0.002
     # A rigid frame: lengths on the Earth, not those of the map.
     np.testing.assert_allclose(matrix[:3, :3].T @ matrix[:3, :3], np.eye(3), atol=1e-14)
     assert np.abs(local).max() < 4000
-
-
-def test_sheet_region_contains_its_points():
-    made, placed_sheet, _ = sheet_of(4000.0, 500_000.0, 5_600_000.0, 64.0)
-    longitude, latitude, height = DATUM.geographic(PLACE.crs, *made.points.T)
-    west, south, east, north, low, high = placed_sheet["region"]
-    assert west < np.radians(longitude.min()) < np.radians(longitude.max()) < east
-    assert south < np.radians(latitude.min()) < np.radians(latitude.max()) < north
-    assert low <= height.min() < height.max() <= high
-    assert east - west < np.radians(np.ptp(longitude)) + 1e-7
 
 
 def test_east_north_up_is_where_the_place_is():

@@ -1,6 +1,5 @@
 """3D Tiles of a run: coarse meshes with their error, bounding volumes, photos, and what is written again."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -20,17 +19,18 @@ from flexroad.tasks.products import glb
 from flexroad.tools.export import tile_outputs
 from flexroad.tools.export import tileset as coarse
 from flexroad.tools.export.driver import export
-from flexroad.tools.export.georeference import Datum, Georeference
+from flexroad.tools.export.georeference import Georeference
 from flexroad.tools.export.relief import of_mesh
-from flexroad.tools.export.source import Options, select
+from flexroad.tools.export.source import select
 from flexroad.tools.export.tiles3d import placed
-from flexroad.tools.export.tileset import Aerial, Node, aerial_of, blocks, joined
+from flexroad.tools.export.tileset import Aerial, Node, aerial_of, blocks, joined, of_classes
 from flexroad.tools.synthetic.scenes import write_scenes
 from tests.builders import LIGHT
+from tests.read_exports import entries, from_earth, mesh_of
 from tests.validators.gltf import gltf_issues
 
-OFFSET_M = 47.5
-OPTIONS = Options(Datum("offset", str(OFFSET_M)))
+from .conftest import OPTIONS
+
 DRAPED = replace(OPTIONS, drape=True)
 WITHOUT = 3
 """Number of the tile without a photo."""
@@ -71,38 +71,9 @@ def draped(city, tmp_path_factory):
     return exported(city, tmp_path_factory.mktemp("draped"), DRAPED)
 
 
-def entries(folder, file="tileset.json", transform=None, above=None):
-    """Yield each tile's entry, its GLB file, the product of the transforms, and the entry above it."""
-    path = folder / file
-    todo = [(json.loads(path.read_text())["root"], np.eye(4) if transform is None else transform, above)]
-    while todo:
-        entry, outer, parent = todo.pop()
-        matrix = outer @ np.reshape(entry.get("transform", np.eye(4)), (4, 4)).T
-        uri = entry.get("content", {}).get("uri", "")
-        if uri.endswith(".json"):
-            yield from entries(folder, (path.parent / uri).relative_to(folder), matrix, entry)
-        else:
-            yield entry, (path.parent / uri).resolve() if uri else None, matrix, parent
-        todo += [(child, matrix, entry) for child in entry.get("children", ())]
-
-
-def mesh_of(file, matrix):
-    """The mesh of a GLB file in coordinates from the Earth's centre, as viewers place it."""
-    mesh = trimesh.load_scene(file, process=False).to_geometry()
-    east, up, south = mesh.vertices.T
-    return np.column_stack([east, -south, up]) @ matrix[:3, :3].T + matrix[:3, 3], mesh.faces
-
-
-def in_run(points):
-    """From the Earth's centre to easting, northing and height of the run."""
-    plan = Transformer.from_crs("EPSG:4978", "EPSG:25832", always_xy=True).transform(*points.T)[:2]
-    height = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*points.T)[2]
-    return np.column_stack([*plan, height - OFFSET_M])
-
-
 def contains(outer, inner):
-    west, south, east, north, low, high = np.array(outer) - inner
-    return west <= 0 and south <= 0 and east >= 0 and north >= 0 and low <= 0 and high >= 0
+    difference = np.array(outer) - inner
+    return (difference[[0, 1, 4]] <= 0).all() and (difference[[2, 3, 5]] >= 0).all()
 
 
 def test_all_files_are_valid_by_the_khronos_validator(plain, draped):
@@ -134,7 +105,7 @@ def test_error_of_coarse_meshes_is_no_less_than_their_distance_from_the_tiles(ci
     entry, file, matrix, _ = found
     assert len(entry["children"]) == 4
     points, faces = mesh_of(file, matrix)
-    x, y, z = in_run(points).T
+    x, y, z = from_earth(points).T
     corner = x.min(), y.min()
     (ax, ay), (bx, by) = np.moveaxis(np.diff(np.column_stack([x, y])[faces], axis=1), 0, -1)
     area = ax * by - ay * bx
@@ -323,3 +294,58 @@ def test_photo_becomes_pixels_at_its_place_in_little_memory(size):
     # At its end the photo is repeated, as pixels are means of whole numbers of its own.
     np.testing.assert_allclose(image[:, 1:-1, 0].mean(axis=0), expected[1:-1], atol=1.5)
     np.testing.assert_allclose(image[1:-1, :, 1].mean(axis=1), expected[1:-1], atol=1.5)
+
+
+def ramp(bounds, rows, columns):
+    """An image whose red is its easting, and green its northing."""
+    west, south, east, north = bounds
+    x = west + (np.arange(columns) + 0.5) * (east - west) / columns
+    y = north - (np.arange(rows) + 0.5) * (north - south) / rows
+    red, green = np.meshgrid(x, y)
+    return Aerial(bounds, np.stack([red, green, np.full_like(red, 9)], axis=-1), np.ones(red.shape))
+
+
+def black_and_white(width, road, pixel):
+    """An image of 40 m x 40 m of two triangles over its western part; road is black."""
+    corners = np.array([[0, 0, 1], [width, 0, 1], [width, 40, 1], [0, 40, 1]], float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return of_classes(corners, faces, np.array(road), ((0, 0, 0), (255, 255, 255)), (0, 0, 40, 40), pixel)
+
+
+def test_of_classes_pixel_has_the_share_of_road():
+    """Road is the triangle south-east of the diagonal."""
+    image = black_and_white(40, [True, False], 4.0)
+    assert image.colour.shape == (10, 10, 3)
+    row, column = np.indices((10, 10))
+    assert (image.colour[row + column > 9] == 0).all()
+    assert (image.colour[row + column < 9] == 255).all()
+    # Places on the diagonal count as road.
+    np.testing.assert_allclose(image.colour[row + column == 9], 255 * 6 / 16)
+    assert (image.share == 1).all()
+
+
+def test_of_classes_pixel_beside_the_mesh_is_unknown():
+    image = black_and_white(20, [True, True], 8.0)
+    np.testing.assert_array_equal(image.share, np.tile([1, 1, 0.5, 0, 0], (5, 1)))
+    assert (image.complete() == 0).all()
+
+
+@pytest.mark.parametrize("pixel", [4.0, 7.0, 3.3])
+def test_joined_pixels_are_means_over_their_area(pixel):
+    bounds = (0.0, 0.0, 64.0, 32.0)
+    parts = [ramp((0.0, 0.0, 32.0, 32.0), 64, 64), ramp((32.0, 0.0, 64.0, 32.0), 128, 128)]
+    image = joined(parts, bounds, pixel)
+    expected = ramp(bounds, *image.share.shape)
+    np.testing.assert_allclose(image.colour, expected.colour, atol=0.02)
+    np.testing.assert_allclose(image.share, 1)
+
+
+def test_joined_weighs_colours_by_what_is_known_and_takes_the_nearest_elsewhere():
+    image = joined([ramp((0.0, 0.0, 10.0, 10.0), 10, 10)], (0.0, 0.0, 20.0, 10.0), 1.0)
+    np.testing.assert_array_equal(image.share, np.tile([1.0] * 10 + [0.0] * 10, (10, 1)))
+    complete = image.complete()
+    np.testing.assert_array_equal(complete[:, 10:], np.repeat(complete[:, 9:10], 10, axis=1))
+    part = Aerial((0.0, 0.0, 2.0, 1.0), np.array([[[100.0] * 3, [200.0] * 3]]), np.array([[1.0, 0.25]]))
+    image = joined([part], (0.0, 0.0, 2.0, 1.0), 2.0)
+    np.testing.assert_allclose(image.colour, [[[120.0] * 3]])
+    np.testing.assert_allclose(image.share, [[0.625]])

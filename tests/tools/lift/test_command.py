@@ -16,10 +16,12 @@ import pytest
 from tests import command_line
 from tests.faulty_files import FAULTS, Faulty, intercepted
 from tests.make_rasters import UTM
+from tests.tools.lift.test_opendrive import LINE, document, road
 from tests.tools.lift.test_sumo import lane, points
 from tests.tools.results.test_command import SOUTH, WEST, ground, made_run
 
 PROJECTED = "+proj=utm +zone=32 +ellps=GRS80"
+UTM_HEADER = f'<geoReference>{PROJECTED}</geoReference><offset x="{WEST}" y="{SOUTH}" z="0" hdg="0"/>'
 
 
 def net(crs: str = PROJECTED, offset: str = f"{-WEST},{-SOUTH}", more: str = "", y: float = 20) -> str:
@@ -44,7 +46,12 @@ def osm(*places: tuple[float, float], more: str = "") -> str:
     return f'<osm version="0.6">\n{nodes}{way}</osm>\n'
 
 
-FILES = {"net.net.xml": net(), "streets.osm": osm((1, 20), (39, 20))}
+FILES = {
+    "net.net.xml": net(),
+    "streets.osm": osm((1, 20), (39, 20)),
+    "road.xodr": document(road(LINE.replace('x="10"', 'x="1"'), 38.0), header=UTM_HEADER),
+}
+NOUNS = {".xml": "edge", ".osm": "way", ".xodr": "road"}
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +91,7 @@ def assert_refused(said, out: Path, *words: str) -> None:
 def test_lift_writes_the_heights_of_the_ground(run, flexroad, source, tmp_path):
     out, report = tmp_path / "new" / f"out.{source.name}", tmp_path / "lifted.csv"
     said = flexroad("lift", source, run, "-o", out, "--report", report, "--grade-limit", 4).expected(0)
-    noun = "edge" if "net" in source.name else "way"
-    assert said.out.startswith(f"{out}: 1 {noun}, 38 m")
+    assert said.out.startswith(f"{out}: 1 {NOUNS[source.suffix]}, 38 m")
     assert said.err == ""
     row = pd.read_csv(report).iloc[0]
     assert row.length_m == pytest.approx(38, abs=0.02)
@@ -98,27 +104,11 @@ def test_lift_writes_the_heights_of_the_ground(run, flexroad, source, tmp_path):
     assert {path.name for path in out.parent.iterdir()} == {out.name}
 
 
-def test_heights_of_a_network_are_those_of_the_ground(run, flexroad, tmp_path):
-    out = tmp_path / "out.net.xml"
-    flexroad("lift", written(tmp_path / "n.net.xml", net()), run, "-o", out).expected(0)
-    found = points(out.read_text())
-    np.testing.assert_allclose(found[:, 2], ground(WEST + found[:, 0], SOUTH + found[:, 1]), atol=1.5e-3)
-
-
 def test_summary_and_notes_say_what_has_no_heights(run, flexroad, tmp_path):
     bridge = '<param key="bridge" value="yes"/>'
     source = written(tmp_path / "n.net.xml", net(more=bridge).replace('39,20"', '139,20"'))
-    said = flexroad(
-        "lift",
-        source,
-        run,
-        "-o",
-        tmp_path / "o.net.xml",
-        "--report",
-        tmp_path / "r.csv",
-        "--crossfall-limit",
-        2,
-    ).expected(0)
+    limit = ["--report", tmp_path / "r.csv", "--crossfall-limit", 2]
+    said = flexroad("lift", source, run, "-o", tmp_path / "o.net.xml", *limit).expected(0)
     assert said.out == (
         f"{tmp_path}/o.net.xml: 1 edge, 0.1 km; 99 m beyond the tiles keep their heights; "
         "39 m on decks or in tunnels of unknown height; at most 0 mm from the surface\n"
@@ -152,35 +142,44 @@ def test_network_without_crs_needs_one(run, flexroad, tmp_path):
     np.testing.assert_allclose(found[:, 2], ground(WEST + found[:, 0], SOUTH + found[:, 1]), atol=1.5e-3)
 
 
+def numbers_to_nan(data: bytes) -> bytes:
+    for before in (b'"1', b'"39', b" 39", b'lat="5', b'lon="9'):
+        data = data.replace(before, before.rstrip(b"0123456789") + b"nan")
+    return data
+
+
 @pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda data: data[:-20], "is not complete XML"),
-        (lambda data: data.replace(b"</", b"<", 1), "is not complete XML"),
-        (
-            lambda data: b'<!DOCTYPE a [<!ENTITY b "c"><!ENTITY d "&b;&b;">]>' + data,
-            "declares the entity 'b'",
-        ),
-        (lambda data: b'<?xml version="1.0" encoding="x"?>' + data, "is in 'x'; save it again"),
-        (lambda data: b"", "is of no known format"),
-        (lambda data: b"<svg/>", "has the root element svg; give "),
-        (lambda data: data.decode().encode("utf-16"), ""),
-        (
-            lambda data: (
-                data.replace(b'"1', b'"nan')
-                .replace(b'"39', b'"nan')
-                .replace(b" 39", b" nan")
-                .replace(b'lat="5', b'lat="nan5')
-                .replace(b'lon="9', b'lon="nan9')
-            ),
-            "",
-        ),
-    ],
+    ("change", "words"), [(lambda data: data[:-20], "is not complete XML"), (numbers_to_nan, "")]
 )
 def test_broken_files_are_refused_in_one_line(run, flexroad, source, tmp_path, change, words):
     source.write_bytes(change(source.read_bytes()))
     out = tmp_path / "out.xml"
     assert_refused(flexroad("lift", source, run, "-o", out), out, str(source), words)
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "is of no known format"),
+        (b"  0\nSECTION\n", "convert others, such as DXF, with ogr2ogr NEW.gpkg FILE"),
+        (b"<svg/>", "has the root element svg; give "),
+        (b"BZh91AY&SY", "is compressed with bzip2; unpack it: bunzip2 --keep "),
+        (b"\0\0\0\x0d\x0a\x09OSMHeader\x18", "is OSM's PBF; convert it: osmium cat "),
+        (b"<osmChange version='0.6'/>", "is a list of changes (osmChange); give the complete file (.osm)"),
+        (b"<OpenDRIVE/>", "has no road or feature with coordinates"),
+    ],
+)
+def test_other_files_are_refused_with_the_remedy(run, flexroad, tmp_path, data, words):
+    source, out = tmp_path / "a.osm", tmp_path / "o.osm"
+    source.write_bytes(data)
+    assert_refused(flexroad("lift", source, run, "-o", out, "--crs", UTM), out, f"{source} ", words)
+
+
+def test_missing_file_and_limits_without_report_are_refused(run, flexroad, source, tmp_path):
+    out, missing = tmp_path / "o.xml", tmp_path / "none.osm"
+    assert_refused(flexroad("lift", missing, run, "-o", out), out, str(missing))
+    said = flexroad("lift", source, run, "-o", out, "--grade-limit", 5)
+    assert_refused(said, out, "give --report FILE.csv")
 
 
 def test_compressed_files_are_copied_and_refused_if_they_are_cut_off(run, flexroad, source, tmp_path):
@@ -209,28 +208,6 @@ def test_output_is_neither_the_input_nor_a_device(run, flexroad, source, tmp_pat
     assert len(said.err.splitlines()) == 1
     assert source.read_bytes() == before
     assert Path("/dev/null").is_char_device()
-
-
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        (b"BZh91AY&SY", "is compressed with bzip2; unpack it: bunzip2 --keep "),
-        (b"\0\0\0\x0d\x0a\x09OSMHeader\x18", "is OSM's PBF; convert it: osmium cat "),
-        (b"<osmChange version='0.6'/>", "is a list of changes (osmChange); give the complete file (.osm)"),
-    ],
-)
-def test_other_forms_of_osm_are_refused_with_the_remedy(run, flexroad, tmp_path, data, words):
-    source, out = tmp_path / "a.osm", tmp_path / "o.osm"
-    source.write_bytes(data)
-    assert_refused(flexroad("lift", source, run, "-o", out), out, f"{source} {words}")
-
-
-def test_missing_file_and_limits_without_report_are_refused(run, flexroad, source, tmp_path):
-    out = tmp_path / "o.xml"
-    assert_refused(flexroad("lift", tmp_path / "none.osm", run, "-o", out), out, str(tmp_path / "none.osm"))
-    assert_refused(
-        flexroad("lift", source, run, "-o", out, "--grade-limit", 5), out, "give --report FILE.csv"
-    )
 
 
 def test_a_full_disk_leaves_what_was_there(run, flexroad, source, tmp_path):

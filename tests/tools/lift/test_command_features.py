@@ -93,18 +93,6 @@ def test_lift_of_features_gives_heights_of_the_ground_and_keeps_the_rest(
     assert new["geometry_type"] in (old["geometry_type"], f"{old['geometry_type']} Z")
 
 
-def test_lift_of_degrees_adds_vertices_within_the_tolerance(run, flexroad, tmp_path):
-    # A straight line in degrees bends against the ground by 8 mm in 1 km.
-    to_degrees = pyproj.Transformer.from_crs(UTM, "EPSG:4326", always_xy=True)
-    line = LineString(np.column_stack(to_degrees.transform(*np.array(place((1, 1), (39, 39))).T)))
-    source = write(tmp_path / "line.geojson", [line], "EPSG:4326")
-    flexroad("lift", source, run, "-o", tmp_path / "out.geojson").expected(0)
-    (shape,) = geopandas.read_file(tmp_path / "out.geojson").geometry
-    back = pyproj.Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
-    assert_on_ground(shape, 1e-3, back.transform)
-    assert len(shape.coords) == 2
-
-
 def test_lift_of_a_geopackage_keeps_all_tables_ids_styles_and_triggers(run, flexroad, tmp_path):
     source = write(tmp_path / "in.gpkg", LINES)
     other = geopandas.GeoDataFrame({"a": [1]}, geometry=[Point(9.5, 50.5)], crs="EPSG:4326")
@@ -284,14 +272,16 @@ def test_a_line_with_heights_beyond_the_survey_keeps_them_or_goes_on_level(run, 
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_columns_and_report_have_grade_crossfall_and_error(run, flexroad, tmp_path, suffix):
+def test_columns_and_report_have_grades_errors_and_decks_of_unknown_height(run, flexroad, tmp_path, suffix):
     east = LineString(place((2, 5), (30, 5)))
     north = LineString(place((5, 2), (5, 30)))
-    source = write(tmp_path / f"in.{suffix}", [east, north], index=suffix != "fgb", id=[1, 2])
+    columns = {"id": [1, 2], "bridge": [None, "yes"]}
+    source = write(tmp_path / f"in.{suffix}", [east, north], index=suffix != "fgb", **columns)
     out, report = tmp_path / f"out.{suffix}", tmp_path / "rows.csv"
     limits = ["--grade-limit", 4, "--crossfall-limit", 4]
     words = ["--columns", "--report", report, *limits, "--crs", UTM]
-    flexroad("lift", source, run, "-o", out, *words).expected(0)
+    said = flexroad("lift", source, run, "-o", out, *words).expected(0)
+    assert "28.0 m of 1 feature are on a deck of unknown height" in said.err
     table, rows = geopandas.read_file(out), list(csv.DictReader(report.open()))
     names = ["grade_max_percent", "crossfall_max_percent", "error_estimate_m"]
     columns = ["grade_pct", "crossf_pct", "error_m"] if suffix == "shp" else names
@@ -301,6 +291,7 @@ def test_columns_and_report_have_grade_crossfall_and_error(run, flexroad, tmp_pa
     assert list(table.id) == [1, 2]
     np.testing.assert_allclose([float(row["grade_max_percent"]) for row in rows], [5, 2], atol=1e-3)
     np.testing.assert_allclose([float(row["length_m"]) for row in rows], 28, atol=1e-3)
+    assert [float(row["unknown_deck_m"]) for row in rows] == [0, 28]
     places = geopandas.read_file(report.with_suffix(".gpkg"))
     assert list(places.kind) == ["grade", "crossfall"]
     assert_on_ground(places.geometry)
@@ -357,13 +348,6 @@ def test_lift_to_another_format_or_elsewhere_is_an_error(run, flexroad, tmp_path
     assert not list(tmp_path.glob("out*"))
 
 
-def test_lift_replaces_no_geopackage_that_is_open(run, flexroad, tmp_path):
-    source = write(tmp_path / "in.gpkg", LINES[:1])
-    (tmp_path / "out.gpkg-wal").write_bytes(b"x")
-    said = flexroad("lift", source, run, "-o", tmp_path / "out.gpkg").expected(2)
-    assert "out.gpkg-wal" in said.err
-
-
 def test_lift_of_dates_and_times_in_fgb_keeps_them(run, flexroad, tmp_path):
     when = [datetime.datetime(2026, 1, 2, 3, 4, 5)]
     source = write(tmp_path / "in.fgb", LINES[:1], day=pd.to_datetime(when), yes=[True])
@@ -372,10 +356,13 @@ def test_lift_of_dates_and_times_in_fgb_keeps_them(run, flexroad, tmp_path):
     pd.testing.assert_frame_equal(old[["day", "yes"]], new[["day", "yes"]])
 
 
-def test_lift_to_or_from_a_folder_or_pipe_is_one_line(run, flexroad, tmp_path):
+def test_lift_to_or_from_a_folder_a_pipe_or_an_open_file_is_one_line(run, flexroad, tmp_path):
     source = write(tmp_path / "in.gpkg", LINES[:1])
     os.mkfifo(tmp_path / "pipe.gpkg")
     (tmp_path / "folder.gpkg").mkdir()
+    (tmp_path / "open.gpkg-wal").write_bytes(b"x")
+    said = flexroad("lift", source, run, "-o", tmp_path / "open.gpkg").expected(2)
+    assert "is open in another program, as open.gpkg-wal is there" in said.err
     for name in ("pipe.gpkg", "folder.gpkg"):
         for words in (
             (source, run, "-o", tmp_path / name),
@@ -395,25 +382,3 @@ def test_lift_replaces_an_older_copy(run, flexroad, tmp_path):
     flexroad("lift", out, run, "-o", tmp_path / "again.gpkg").expected(0)
     first, again = geopandas.read_file(out), geopandas.read_file(tmp_path / "again.gpkg")
     assert list(first.geometry.to_wkb()) == list(again.geometry.to_wkb())
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_a_bridge_of_which_the_run_has_no_level_is_reported(run, flexroad, tmp_path, suffix):
-    lines = [LineString(place((2, 5), (30, 5))), LineString(place((5, 2), (5, 30)))]
-    columns = {"id": [1, 2], "bridge": [None, "yes"]}
-    source = write(tmp_path / f"in.{suffix}", lines, index=suffix != "fgb", **columns)
-    report = tmp_path / "rows.csv"
-    words = ["-o", tmp_path / f"out.{suffix}", "--report", report, "--crs", UTM]
-    said = flexroad("lift", source, run, *words).expected(0)
-    assert "28.0 m of 1 feature are on a deck of unknown height" in said.err
-    rows = list(csv.DictReader(report.open()))
-    assert [float(row["unknown_deck_m"]) for row in rows] == [0, 28]
-
-
-def test_lift_of_a_dxf_is_refused_with_the_command_that_converts_it(run, flexroad, tmp_path):
-    # GDAL would write back lines without their texts, blocks, colours and header.
-    source = tmp_path / "in.dxf"
-    geopandas.GeoDataFrame(geometry=LINES[:1], crs=UTM).to_file(source, driver="DXF", engine="pyogrio")
-    said = flexroad("lift", source, run, "-o", tmp_path / "out.dxf", "--crs", UTM).expected(2)
-    assert "such as DXF, with ogr2ogr NEW.gpkg FILE" in said.err
-    assert not (tmp_path / "out.dxf").exists()

@@ -1,4 +1,6 @@
-"""Points, lines and polygons on surfaces of known heights: tolerance, levels, limits and batches."""
+"""Features on surfaces of known heights: tolerance, levels and batches; and their WKB, against shapely."""
+
+import struct
 
 import numpy as np
 import pytest
@@ -6,7 +8,8 @@ import shapely
 from shapely import LineString, Point, Polygon
 
 from flexroad.pipeline.run.sampler import Heights
-from flexroad.tools.lift import features
+from flexroad.tasks.errors import TaskError
+from flexroad.tools.lift import features, types
 from flexroad.tools.lift.features import Feature, grades, level_columns, lifted, wanted_levels
 from flexroad.tools.lift.network import ANY
 from flexroad.tools.lift.shapes import of_wkb, to_wkb
@@ -80,7 +83,7 @@ def test_fewer_vertices_with_a_larger_tolerance_and_none_if_not_wanted():
     assert len(one(line, run, add_vertices=False)[0].coords) == 2
 
 
-def test_line_over_a_deck_takes_it_by_its_level_or_by_continuity():
+def test_line_or_point_over_a_deck_takes_it_by_its_level_or_by_continuity():
     run, line = Waves(deck=True), LineString([(10, 0), (90, 0)])
     below, row = one(line, run)
     assert row.levels == (0,)
@@ -92,10 +95,7 @@ def test_line_over_a_deck_takes_it_by_its_level_or_by_continuity():
     assert row.levels == (0,)
     _, row = one(line, run, wanted=1)
     assert row.unknown_deck_m == pytest.approx(60, abs=1)
-
-
-def test_point_without_a_level_takes_the_highest():
-    run = Waves(deck=True)
+    # A point takes the highest level if nothing names another.
     assert one(Point(50, 0), run)[0].z == pytest.approx(run.height(50, 0) + 6)
     assert one(Point(50, 0), run, wanted=0)[0].z == pytest.approx(run.height(50, 0))
 
@@ -123,13 +123,6 @@ def test_a_line_far_longer_than_the_run_is_not_sampled_off_it():
     assert run.largest <= features.MOST_PIECES + 2
 
 
-def test_places_above_limits_are_the_steepest_of_each_stretch():
-    _, row = one(LineString([(0, 0), (100, 0)]), Waves(), grade_limit=0.2)
-    # The wave is steepest at its zeros, every 28.3 m.
-    assert [place.x for place in row.steep] == pytest.approx(9 * np.pi * np.arange(4), abs=0.6)
-    assert row.grade == pytest.approx(2 / 9, rel=0.01)
-
-
 def test_columns_have_the_crossfall_of_lines_and_the_largest_error():
     _, row = one(LineString([(0, 2 * np.pi), (900, 2 * np.pi)]), Waves(), columns=True)
     assert row.crossfall == pytest.approx(0.3 / 4, rel=0.02)
@@ -148,3 +141,69 @@ def test_levels_are_read_from_columns_that_say_them():
     assert level_columns(["Bridge", "layer", "b"]) == ["Bridge", "layer"]
     assert wanted_levels({"Bridge": ["yes", None], "layer": ["2", "1"]}, 2) == [2, 0]
     assert wanted_levels({}, 2) == [ANY, ANY]
+
+
+def test_each_part_has_its_heights_in_order_whatever_the_batch(monkeypatch):
+    asked = []
+
+    def heights(x, y):
+        asked.append(len(x))
+        return Heights((0,), (x + y)[None])
+
+    parts = [*"ab", 3, 0, *"c", 5]
+    for size in (1, 4, 100):
+        monkeypatch.setattr(types, "POINTS", size)
+        found = types.with_heights(
+            parts,
+            lambda part: types.NO_POINTS if isinstance(part, str) else (np.arange(part), np.ones(part)),
+            heights,
+        )
+        result = [(part, own.ground.tolist()) for part, own in found]
+        assert [part for part, _ in result] == parts
+        assert [own for _, own in result] == [[], [], [1, 2, 3], [], [], [1, 2, 3, 4, 5]]
+    assert asked[-1] == 8
+
+
+TEXTS = [
+    *("POINT (1 2)", "POINT EMPTY", "LINESTRING (1 2, 3 4)", "LINESTRING EMPTY", "POLYGON EMPTY"),
+    *("POLYGON ((0 0, 4 0, 4 4, 0 0), (1 1, 2 1, 2 2, 1 1))", "MULTIPOINT ((1 2), (3 4))"),
+    *("MULTILINESTRING ((1 2, 3 4), (5 6, 7 8))", "MULTIPOLYGON (((0 0, 4 0, 4 4, 0 0)))"),
+    "GEOMETRYCOLLECTION (POINT (1 2), GEOMETRYCOLLECTION (LINESTRING (1 2, 3 4)), POLYGON EMPTY)",
+    *("POINT Z (1 2 3)", "LINESTRING Z (1 2 3, 4 5 6)", "LINESTRING M (1 2 3, 4 5 6)", "POINT ZM (1 2 3 4)"),
+]
+
+
+@pytest.mark.parametrize("text", TEXTS)
+@pytest.mark.parametrize("form", [{"flavor": "iso"}, {"byte_order": 0}, {"include_srid": True}])
+def test_geometry_read_and_written_is_the_same(text, form):
+    shape = shapely.from_wkt(text)
+    if "include_srid" in form:
+        shape = shapely.set_srid(shape, 25832)
+    data = shapely.to_wkb(shape, **form)
+    assert to_wkb(of_wkb(data)) == shapely.to_wkb(shapely.set_srid(shape, 0), flavor="iso", byte_order=1)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_cut_geometry_is_an_error(text):
+    data = shapely.to_wkb(shapely.from_wkt(text))
+    for end in range(0, len(data) - 1, 3):
+        with pytest.raises(TaskError, match="damaged geometry"):
+            of_wkb(data[:end])
+
+
+def test_geometry_with_a_false_number_of_points_is_an_error():
+    with pytest.raises(TaskError, match="damaged geometry"):
+        of_wkb(struct.pack("<BII", 1, 2, 2**32 - 1))
+
+
+def test_collections_too_deep_within_each_other_are_an_error():
+    with pytest.raises(TaskError, match="more than 32 collections"):
+        of_wkb(struct.pack("<BII", 1, 7, 1) * 1000)
+
+
+@pytest.mark.parametrize(
+    ("code", "name"), [(1009, "CompoundCurve"), (1016, "TIN"), (999, "of the number 999")]
+)
+def test_curves_and_surfaces_are_an_error_that_names_them(code, name):
+    with pytest.raises(TaskError, match=f"has a geometry of the type {name}; write it"):
+        of_wkb(struct.pack("<BI", 1, code))

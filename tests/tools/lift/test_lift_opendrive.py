@@ -11,8 +11,8 @@ import pytest
 from flexroad.tools.lift import plan_view
 from flexroad.tools.lift.plan_view import extent
 from tests import validators
-from tests.read_opendrive import polynomial, quality_issues
-from tests.tools.lift.test_opendrive import LINE, lifted, places, road, write
+from tests.read_opendrive import quality_issues
+from tests.tools.lift.test_opendrive import LINE, elevation, lifted, places, road, write
 from tests.tools.results.test_command import SOUTH, WEST, ground, made_run
 from tests.validators.opendrive import by_carla, by_sumo
 
@@ -49,45 +49,11 @@ def test_roads_get_the_heights_of_the_run(run, flexroad, tmp_path, header, words
     turned = "1.57" in header
     for s in (0.0, 10.0, 30.0):
         x, y = (20.0, 2 + 5 + s) if turned else (5 + s, 20.0)
-        z = polynomial(element, "elevationProfile/elevation", s)
+        z = elevation(element, s)
         assert z + down == pytest.approx(ground(WEST + x, SOUTH + y), abs=2e-3)
     (row,) = csv.DictReader(report.open())
     assert float(row["superelevation_max_mm"]) < 1
     assert float(row["grade_max_percent"]) == pytest.approx(2 if turned else 5, abs=0.01)
-
-
-def test_roads_that_stay_are_named_with_the_reason(run, flexroad, tmp_path):
-    bad = road(length=0.0, name="9")
-    source, out = write(tmp_path, ROAD, bad, header=UTM + HERE), tmp_path / "out.xodr"
-    said = flexroad("lift", source, run, "-o", out).expected(0)
-    assert said.err == "note: 1 road: has a length of 0 m; it stays as it was (9)\n"
-    assert bad in out.read_text()
-
-
-@pytest.mark.parametrize(
-    ("text", "words", "message"),
-    [
-        (None, [], "carries no CRS; give it with --crs"),
-        (None, ["--crs", "EPSG:25832"], "does not lie on the finished tiles"),
-        ("<OpenDRIVE><road>", ["--crs", "EPSG:25832"], "is not complete XML"),
-        ("<OpenDRIVE/>", ["--crs", "EPSG:25832"], "has no road or feature with coordinates"),
-        ("<OpenDRIVE><header><geoReference>+proj=what</geoReference></header></OpenDRIVE>", [], "not read"),
-        ('<!DOCTYPE a [<!ENTITY b "c">]><OpenDRIVE>&b;</OpenDRIVE>', [], "declares the entity 'b'"),
-        ("<OpenDRIVE><header><offset x='b'/></header></OpenDRIVE>", [], "offset with x 'b'"),
-    ],
-)
-def test_a_file_that_cannot_be_lifted_is_one_line_and_leaves_nothing(
-    run, flexroad, tmp_path, text, words, message
-):
-    source, out = write(tmp_path, ROAD), tmp_path / "out.xodr"
-    if text is not None:
-        source.write_text(text)
-    said = flexroad("lift", source, run, "-o", out, *words)
-    assert said.code == 2
-    assert message in said.err
-    assert str(source) in said.err
-    assert len(said.err.strip().splitlines()) == 1
-    assert [path.name for path in tmp_path.iterdir()] == [source.name]
 
 
 @pytest.mark.parametrize(
@@ -174,9 +140,9 @@ def test_linked_roads_of_netconvert_meet_within_a_millimetre(network):
             ends = []
             for each, at in ((element, s), (other, end)):
                 x, y, heading = (float(value[0]) for value in plan_view.read(each).at(np.array([at])))
-                z = polynomial(each, "elevationProfile/elevation", at)
+                z = elevation(each, at)
                 step = 1e-4 if at == 0 else -1e-4
-                grade = (polynomial(each, "elevationProfile/elevation", at + step) - z) / step
+                grade = (elevation(each, at + step) - z) / step
                 ends.append((x, y, heading, z, grade))
             (x, y, heading, z, grade), (x_2, y_2, heading_2, z_2, grade_2) = ends
             if np.hypot(x - x_2, y - y_2) > 0.01:

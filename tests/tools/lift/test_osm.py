@@ -10,6 +10,8 @@ from flexroad.pipeline.run.sampler import Heights
 from flexroad.tasks.errors import TaskError
 from flexroad.tools.lift import osm
 from flexroad.tools.lift.types import Frame, Options
+from tests.tools.lift import test_sumo
+from tests.tools.lift.test_sumo import hills, plane
 
 WEST, SOUTH = 9.0, 50.55
 EAST_M, NORTH_M = (
@@ -44,14 +46,6 @@ OSM = """<?xml version='1.0' encoding='UTF-8'?>
 
 def metres(x, y):
     return (np.asarray(x) - WEST) * EAST_M, (np.asarray(y) - SOUTH) * NORTH_M
-
-
-def plane(x, y):
-    return 100 + 0.05 * x - 0.02 * y
-
-
-def hills(x, y):
-    return 100 + 1.5 * np.sin(x / 9) * np.cos(y / 12)
 
 
 def over(surface, where=lambda x, y: x > -1e9):
@@ -187,46 +181,26 @@ def test_local_coordinates_are_used_where_there_are_no_others(lifted, tmp_path):
     assert osm.frame(tmp_path / "a.osm") == Frame("EPSG:4326")
 
 
-def street(name: int, nodes: str, tags: str = '<tag k="highway" v="primary"/>') -> str:
+def street(name: int, nodes: str, tags: str) -> str:
     refs = "".join(f'<nd ref="{ref}"/>' for ref in nodes.split())
     return f'<way id="{name}">{refs}{tags}</way>\n'
 
 
 def crossing(street_tags: str, deck_tags: str) -> str:
     """A street along y = 30 m in three ways, with a deck from 40 to 60 m, and one below it along x = 50 m."""
-    places = {
-        1: (0, 30),
-        2: (41, 30),
-        3: (59, 30),
-        4: (100, 30),
-        5: (50, 0),
-        6: (50, 30),
-        7: (50, 60),
-        8: (50, 30),
-    }
+    places = [(0, 30), (41, 30), (59, 30), (100, 30), (50, 0), (50, 30), (50, 60), (50, 30)]
     text = "".join(
         f'<node id="{i}" lat="{SOUTH + y / NORTH_M:.9f}" lon="{WEST + x / EAST_M:.9f}"/>\n'
-        for i, (x, y) in places.items()
+        for i, (x, y) in enumerate(places, 1)
     )
-    ways = [
-        ("1 2", street_tags),
-        ("2 6 3", deck_tags),
-        ("3 4", street_tags),
-        ("5 8", street_tags),
-        ("8 7", street_tags),
-    ]
-    return f"<osm>{text}{''.join(street(i, *way) for i, way in enumerate(ways, 1))}</osm>"
+    ways = [street(i, refs, street_tags) for i, refs in ((1, "1 2"), (3, "3 4"), (4, "5 8"), (5, "8 7"))]
+    return f"<osm>{text}{ways[0]}{street(2, '2 6 3', deck_tags)}{''.join(ways[1:])}</osm>"
 
 
 def levels(number: int = 1, deck: bool = True):
     def heights(x, y):
-        x, y = metres(x, y)
-        way = 100 + 0.02 * x
-        below = np.where((x > 40.5) & (x < 59.5), 94.0, way)
-        on = (x >= 40) & (x <= 60) & (np.abs(y - 30) <= 5)
-        if not deck:
-            return Heights((0,), below[None])
-        return Heights((0, number), np.stack([below, np.where(on, way, np.nan)]))
+        found = test_sumo.crossing(*metres(x, y))
+        return Heights((0, number), found.z) if deck else Heights((0,), found.z[:1])
 
     return heights
 

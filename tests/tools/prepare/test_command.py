@@ -17,7 +17,6 @@ from tests.make_clouds import write_cloud
 from tests.permissions import permissions_enforced
 
 WEST, SOUTH = 356_000.0, 5_699_000.0
-AHN = ("--bridge-class", "26")
 
 
 def flexroad(*words, expect=0) -> str:
@@ -67,11 +66,12 @@ def test_prepare_points_options_are_applied(cloud, tmp_path):
 
     flexroad(
         "prepare", cloud, "-o", tmp_path, "--cell", 2, "--dop-cell", 1, "--ground-class", 2, 6,
-        "--workers", 1,
+        "--bridge-class", 6, "--workers", 1,
     )  # fmt: skip
     with rasterio.open(tmp_path / "dtm.tif") as raster:
         assert raster.res == (2, 2)
         assert "2, 6" in raster.tags()["DTM"]
+    assert (tmp_path / "bridges.tif").is_file()
 
 
 @pytest.mark.parametrize(
@@ -79,9 +79,6 @@ def test_prepare_points_options_are_applied(cloud, tmp_path):
     [
         (["nowhere.laz"], "nowhere.laz"),
         (["CLOUD", "--crs", "EPSG:4"], "EPSG:4"),
-        (["CLOUD", "--to-crs", "EPSG:4326"], "EPSG:4326"),
-        (["CLOUD", "--roads", "nowhere.gpkg"], "nowhere.gpkg"),
-        (["CLOUD", "--dop-cell", "0.3"], "--dop-cell"),
         (["CLOUD", "--ground", "classes", "--ground-class", "9"], "class 9"),
         (["nowhere.obj"], "nowhere.obj"),
         (["nowhere"], "nowhere does not exist; give point clouds (.las, .laz), a mesh ("),
@@ -113,12 +110,6 @@ def test_prepare_into_folder_with_raster_of_others_changes_nothing(cloud, tmp_pa
     assert contents(tmp_path) == {"dtm.tif": b"mine"}
 
 
-def test_prepare_again_replaces_own_outputs(cloud, tmp_path):
-    for _ in range(2):
-        flexroad("prepare", cloud, "-o", tmp_path, "--workers", 1)
-    assert not (tmp_path / "lock.json").exists()
-
-
 def test_prepare_into_folder_in_use_is_refused(cloud, tmp_path):
     with run_lock(tmp_path):
         error = refusal(cloud, "-o", tmp_path)
@@ -127,11 +118,12 @@ def test_prepare_into_folder_in_use_is_refused(cloud, tmp_path):
         assert contents(tmp_path).keys() == {"lock.json"}
 
 
-def test_prepare_into_folder_of_killed_process_takes_over_its_lock(cloud, tmp_path):
-    (tmp_path / "lock.json").write_bytes(replace(Owner.me(), pid=2**22 + 1).data)
-    said = flexroad("prepare", cloud, "-o", tmp_path, "--workers", 1)
-    assert "note: took over the lock of pid" in said
-    assert not (tmp_path / "lock.json").exists()
+def test_prepare_again_takes_over_the_lock_of_a_killed_process_and_replaces_own_outputs(cloud, tmp_path):
+    for took_over in (False, True):
+        said = flexroad("prepare", cloud, "-o", tmp_path, "--workers", 1)
+        assert ("note: took over the lock of pid" in said) == took_over
+        assert not (tmp_path / "lock.json").exists()
+        (tmp_path / "lock.json").write_bytes(replace(Owner.me(), pid=2**22 + 1).data)
 
 
 def test_prepare_into_folder_that_cannot_be_written_names_the_remedy(cloud, tmp_path):

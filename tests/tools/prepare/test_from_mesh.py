@@ -1,5 +1,8 @@
 """A textured mesh is converted to rasters that `run` can read; invalid input leaves no files."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import rasterio
@@ -144,25 +147,18 @@ def test_prepare_mesh_in_feet_gives_metres(box, tmp_path):
 def test_prepare_mesh_without_dop_writes_no_orthophoto(box, tmp_path):
     (tmp_path / "m.png").unlink()
     published = prepare(box, tmp_path / "out", mesh_options=MeshOptions(offset=ZERO, dop=False))
-    assert sorted(path.name for path in published.catalog.parent.iterdir()) == [
-        "catalog.parquet",
-        "dsm.tif",
-        "dtm.tif",
-        "road_height.tif",
-    ]
+    names = {path.name for path in published.catalog.parent.iterdir()}
+    assert names == {"catalog.parquet", "dsm.tif", "dtm.tif", "road_height.tif"}
 
 
-@pytest.mark.parametrize("invalid", ["texture", "crs", "roads", "cells"])
-def test_prepare_mesh_invalid_input_leaves_no_folder(invalid, box, tmp_path):
-    options = OPTIONS
-    if invalid == "texture":
+@pytest.mark.parametrize(
+    "options",
+    [OPTIONS, PrepareOptions(), replace(OPTIONS, roads=Path("gone.gpkg")), replace(OPTIONS, dop_cell_m=0.3)],
+    ids=["texture", "crs", "roads", "cells"],
+)
+def test_prepare_mesh_invalid_input_leaves_no_folder(options, box, tmp_path):
+    if options is OPTIONS:
         (tmp_path / "m.png").unlink()
-    elif invalid == "crs":
-        options = PrepareOptions()
-    elif invalid == "roads":
-        options = PrepareOptions(crs=CRS, roads=tmp_path / "gone.gpkg")
-    else:
-        options = PrepareOptions(crs=CRS, dop_cell_m=0.3)
     with pytest.raises((TaskError, ConfigError)):
         prepare(box, tmp_path / "out", options)
     assert not (tmp_path / "out").exists()

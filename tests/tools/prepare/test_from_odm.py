@@ -1,11 +1,9 @@
 """An OpenDroneMap project: its rasters are resampled to the cells, missing ones are made."""
 
 import numpy as np
-import pyproj
 import pytest
 import rasterio
 from affine import Affine
-from PIL import Image
 
 from flexroad.catalog import Catalog, CatalogError
 from flexroad.pipeline.errors import ConfigError
@@ -15,6 +13,8 @@ from flexroad.tools.prepare.from_mesh import POINTS
 from flexroad.tools.prepare.from_odm import prepare_odm
 from flexroad.tools.prepare.options import PrepareOptions
 from tests.command_line import call
+from tests.make_clouds import write_cloud
+from tests.tools.prepare.test_from_mesh import write as write_mesh
 
 CRS = "EPSG:32615"
 WEST, NORTH, SIDE = 576_000.0, 5_188_040.0, 40
@@ -34,19 +34,11 @@ def centres(cell):
 def write(path, bands, cell, crs=CRS, nodata=None):
     path.parent.mkdir(parents=True, exist_ok=True)
     bands = bands if bands.ndim == 3 else bands[None]
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        count=len(bands),
-        height=bands.shape[1],
-        width=bands.shape[2],
-        dtype=bands.dtype,
-        crs=crs,
-        transform=Affine(cell, 0, WEST, 0, -cell, NORTH),
-        nodata=nodata,
-        **({"photometric": "RGB", "alpha": "YES"} if len(bands) == 4 else {}),
-    ) as raster:
+    count, height, width = bands.shape
+    form = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": bands.dtype}
+    form |= {"transform": Affine(cell, 0, WEST, 0, -cell, NORTH), "crs": crs, "nodata": nodata}
+    form |= {"photometric": "RGB", "alpha": "YES"} if count == 4 else {}
+    with rasterio.open(path, "w", **form) as raster:
         raster.write(bands)
 
 
@@ -82,32 +74,16 @@ def model(folder):
     path = folder / odm.MESHES[0]
     path.parent.mkdir(parents=True)
     corners = [(0, 0), (SIDE, 0), (SIDE, SIDE), (0, SIDE)]
-    lines = ["mtllib m.mtl", *(f"v {x} {y} {ground(x, y)}" for x, y in corners)]
-    lines += [f"vt {x / SIDE} {y / SIDE}" for x, y in corners] + [
-        "usemtl m",
-        "f 1/1 2/2 3/3",
-        "f 1/1 3/3 4/4",
-    ]
-    path.write_text("\n".join(lines) + "\n")
-    (path.parent / "m.mtl").write_text("newmtl m\nmap_Kd m.png\n")
-    Image.new("RGB", (8, 8), (10, 200, 30)).save(path.parent / "m.png")
+    write_mesh(path.parent, [[(x, y, ground(x, y)) for x, y in corners]], path.name)
     coords = folder / "odm_georeferencing" / "coords.txt"
     coords.parent.mkdir()
     coords.write_text(f"WGS84 UTM 15N\n{WEST:.0f} {NORTH - SIDE:.0f}\n12.5 3.25 350.0\n")
 
 
 def cloud(folder):
-    import laspy
-
-    header = laspy.LasHeader(point_format=2, version="1.4")
-    header.offsets, header.scales = (WEST, NORTH - SIDE, 300), (0.001,) * 3
-    header.add_crs(pyproj.CRS(CRS))
-    las = laspy.LasData(header)
     x, y = np.random.default_rng(0).uniform(0, SIDE, (2, 20_000))
-    las.x, las.y, las.z = WEST + x, NORTH - SIDE + y, ground(x, y)
-    las.red = las.green = las.blue = np.full(len(x), 30_000, np.uint16)
-    (folder / odm.CLOUDS[0]).parent.mkdir(parents=True)
-    las.write(folder / odm.CLOUDS[0])
+    xyz = np.column_stack([WEST + x, NORTH - SIDE + y, ground(x, y)])
+    write_cloud(folder / odm.CLOUDS[0], xyz, 1, CRS, np.full((len(x), 3), 30_000), scale=0.001)
 
 
 def project(tmp_path, *makers):

@@ -16,7 +16,6 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.tasks.io.dsm_and_dtm import vertical_crs
 from flexroad.tasks.load import Options as LoadOptions
 from flexroad.tasks.load import load
-from flexroad.tools.prepare import from_points as points
 from flexroad.tools.prepare import point_buckets, point_reading
 from flexroad.tools.prepare.from_points import prepare_points
 from flexroad.tools.prepare.options import PrepareOptions
@@ -74,15 +73,8 @@ def two_files(folder: Path, *, crs="EPSG:25832", suffix="laz", swap=False, **wor
 
 def prepare(files, out, executor=None, ground="auto", options=None, **common):
     lines = []
-    result = prepare_points(
-        files,
-        out,
-        PrepareOptions(**common),
-        options or Options(),
-        executor or SerialExecutor(),
-        lines.append,
-        ground,
-    )
+    executor, options = executor or SerialExecutor(), options or Options()
+    result = prepare_points(files, out, PrepareOptions(**common), options, executor, lines.append, ground)
     return result, lines
 
 
@@ -156,28 +148,6 @@ def check_road_height(out, dsm):
     assert (below[count > 5] > 0).mean() > 0.9
 
 
-def test_prepare_points_dop_has_colour_of_highest_point(tmp_path):
-    """Colours have 16 bits in the files and 8 bits in the raster."""
-    files = two_files(tmp_path)
-    prepare(files, tmp_path / "out", dop_cell_m=0.5)
-    photo, raster = read(tmp_path / "out", "dop")
-    xyz, kind, colour = world()
-    keep = ~np.isin(kind, (7, 18))
-    xyz, colour = xyz[keep], colour[keep]
-    col = np.floor((xyz[:, 0] - raster.bounds.left) / 0.5).astype(int)
-    row = np.floor((raster.bounds.top - xyz[:, 1]) / 0.5).astype(int)
-    order = np.argsort(xyz[:, 2], kind="stable")
-    expected = np.zeros((3, *raster.shape), np.uint8)
-    for index in order:
-        expected[:, row[index], col[index]] = colour[index]
-    hit = np.zeros(raster.shape, bool)
-    hit[row, col] = True
-    same = (photo.data == expected).all(axis=0)[hit]
-    # Points of equal height in a pixel may give either colour.
-    assert same.mean() > 0.999
-    assert raster.dtypes[0] == "uint8"
-
-
 @pytest.mark.parametrize(
     ("colours", "expected"),
     [
@@ -224,22 +194,16 @@ def check_same(out, expected):
     assert np.allclose(read(out, "dtm")[0], expected["dtm"], rtol=0, atol=1e-5, equal_nan=True)
 
 
-def test_prepare_points_in_many_chunks_and_blocks_gives_the_same_rasters(plain, tmp_path, monkeypatch):
-    files, expected = plain
+def test_prepare_points_in_other_order_and_small_chunks_gives_the_same_rasters(plain, tmp_path, monkeypatch):
+    """Both the files and the points within them are in another order; some heights are out of range."""
     monkeypatch.setattr(point_reading, "CHUNK", 997)
-    monkeypatch.setattr(point_buckets, "POINTS_PER_BLOCK", 1)
-    monkeypatch.setattr(point_buckets, "SHORTEST_EDGE_M", 37.0)
-    _, lines = prepare(files, tmp_path / "out", ground="filter")
-    (blocks,) = (int(line.split()[0]) for line in lines if " blocks of " in line)
-    assert blocks >= 9
-    check_same(tmp_path / "out", expected)
-
-
-def test_prepare_points_in_other_order_gives_the_same_rasters(plain, tmp_path):
-    """Both the files and the points within them are in another order."""
     two_files(tmp_path / "clouds", swap=True)
-    prepare([tmp_path / "clouds"], tmp_path / "out", ground="filter")
+    xyz, *_ = world()
+    far_below = np.column_stack([xyz[:3, :2], np.full(3, -32767)])
+    write_cloud(tmp_path / "clouds" / "c.laz", far_below, 2, "EPSG:25832", np.full((3, 3), 60_000))
+    result, _ = prepare([tmp_path / "clouds"], tmp_path / "out", ground="filter")
     check_same(tmp_path / "out", plain[1])
+    assert "left out 3 points with heights outside -500..9000 m; check --height-unit" in result.notes
 
 
 @pytest.mark.parametrize("despike_m", [None, 5])
@@ -326,15 +290,9 @@ def test_prepare_points_dense_noisy_cloud_gives_unbiased_ground(tmp_path):
     assert abs(np.nanmedian(dtm) - 50) < 0.01
 
 
-def test_prepare_points_out_of_range_heights_are_left_out_with_note(tmp_path):
-    xyz, kind, _ = world()
-    xyz[:3, 2] = -32767
-    result, _ = prepare([write_cloud(tmp_path / "a.laz", xyz, kind, "EPSG:25832")], tmp_path / "out")
-    assert "left out 3 points with heights outside -500..9000 m; check --height-unit" in result.notes
-    assert np.nanmin(read(tmp_path / "out", "dtm")[0]) > 40
-
-
-def bad_inputs(folder: Path):
+@pytest.fixture(scope="module")
+def bad_inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bad")
     xyz, kind, _ = world()
     crs = "EPSG:25832"
     good = write_cloud(folder / "good.laz", xyz, kind, crs)
@@ -347,9 +305,9 @@ def bad_inputs(folder: Path):
     return {
         "missing": ([folder / "none.laz"], {}, "none.laz does not exist"),
         "empty": ([good, empty], {}, "empty.laz has no points; leave it out"),
-        "cut short": ([good, cut], {}, "cut.laz cannot be read as a point cloud.*download it again"),
-        "cut las": ([good, las], {}, "cut.las is cut short: .* download it again"),
-        "no crs": ([good, write_cloud(folder / "bare.laz", xyz)], {}, "bare.laz carries no CRS; .* --crs"),
+        "cut_laz": ([good, cut], {}, "cut.laz cannot be read as a point cloud.*download it again"),
+        "cut_las": ([good, las], {}, "cut.las is cut short: .* download it again"),
+        "no_crs": ([good, write_cloud(folder / "bare.laz", xyz)], {}, "bare.laz carries no CRS; .* --crs"),
         "mixed": (
             [good, write_cloud(folder / "feet.laz", xyz, kind, "EPSG:2994")], {},
             "mixed CRS: .*feet.laz is in EPSG:2994, .*good.laz in EPSG:25832",
@@ -367,14 +325,12 @@ def bad_inputs(folder: Path):
     }  # fmt: skip
 
 
-BAD = "missing|empty|cut short|cut las|no crs|mixed|contradicted|noise|far|mercator|cells|unit|target".split(
-    "|"
-)
+BAD = "missing empty cut_laz cut_las no_crs mixed contradicted noise far mercator cells unit target"
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_prepare_points_invalid_input_is_one_line_and_leaves_no_folder(tmp_path, name):
-    files, options, message = bad_inputs(tmp_path / "clouds")[name]
+@pytest.mark.parametrize("name", BAD.split())
+def test_prepare_points_invalid_input_is_one_line_and_leaves_no_folder(bad_inputs, tmp_path, name):
+    files, options, message = bad_inputs[name]
     with pytest.raises((CatalogError, ConfigError), match=message) as error:
         prepare(files, tmp_path / "out", **options)
     assert "\n" not in str(error.value)
@@ -393,16 +349,6 @@ def test_prepare_points_full_disk_is_one_line_and_keeps_existing_files(tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
     assert {path: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
-
-
-def test_prepare_points_failing_block_leaves_no_folder(tmp_path, monkeypatch):
-    def fail(*_):
-        raise ConfigError("no more")
-
-    monkeypatch.setattr(points, "write_blocks", fail)
-    with pytest.raises(ConfigError, match="no more"):
-        prepare(two_files(tmp_path), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -457,43 +403,42 @@ def test_date_is_that_of_the_points_else_of_the_header(tmp_path, options, expect
 
 def test_date_of_several_flights_is_the_first_and_option_goes_before(tmp_path):
     files = [flight(tmp_path / f"{day}.laz", gps=FLOWN + day * 86_400, standard=True) for day in (2, 0, 5)]
-    result, _ = prepare(files, tmp_path / "out", tile_size_m=20)
-    tiles = Catalog.read(result.catalog).tiles
-    assert len(tiles) > 1
-    assert {f"{tile.datetime:%Y-%m-%d}" for tile in tiles} == {"2019-04-03"}
-    assert "date of the survey: 2019-04-03 to 2019-04-08, by GPS time" in result.notes
-    result, _ = prepare(files, tmp_path / "other", date=datetime(2020, 5, 1))
-    (tile,) = Catalog.read(result.catalog).tiles
-    assert (f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == ("2020-05-01", False)
+    undated = flight(tmp_path / "undated.las")
 
+    def dates(files, **options):
+        result, _ = prepare(files, tmp_path / "out", tile_size_m=20, **options)
+        tiles = Catalog.read(result.catalog).tiles
+        assert len(tiles) > 1
+        return {(f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) for tile in tiles}, result.notes
 
-def test_date_is_only_assumed_if_one_file_has_none(tmp_path):
-    files = [flight(tmp_path / "a.las", gps=FLOWN, standard=True), flight(tmp_path / "b.las")]
-    result, _ = prepare(files, tmp_path / "out")
-    (tile,) = Catalog.read(result.catalog).tiles
-    assert (f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == ("2021-06-07", True)
+    found, notes = dates(files)
+    assert found == {("2019-04-03", False)}
+    assert "date of the survey: 2019-04-03 to 2019-04-08, by GPS time" in notes
+    assert dates(files, date=datetime(2020, 5, 1))[0] == {("2020-05-01", False)}
+    # It is only assumed if one file has none.
+    assert dates([files[1], undated])[0] == {("2021-06-07", True)}
 
 
 @pytest.mark.parametrize(
-    ("classes", "is_bridge"), [(None, False), ((26,), True), ((17, 26), True), ((17,), False)]
+    ("class_", "classes", "is_bridge"),
+    [
+        (26, None, False),
+        (26, (26,), True),
+        (26, (17, 26), True),
+        (26, (17,), False),
+        (17, (26,), False),
+        (17, (17, 26), True),
+    ],
 )
-def test_structures_of_ahn_are_bridges_only_if_told(tmp_path, classes, is_bridge):
-    """A deck of class 26, 6 m above the ground."""
+def test_decks_are_bridges_only_if_their_class_is_told(tmp_path, class_, classes, is_bridge):
+    """A deck, 6 m above the ground. Its class in AHN is 26."""
     xyz, kind, _ = world()
-    path = write_cloud(tmp_path / "a.las", xyz, np.where(kind == 17, 26, kind), "EPSG:25832")
+    path = write_cloud(tmp_path / "a.las", xyz, np.where(kind == 17, class_, kind), "EPSG:25832")
     options = Options() if classes is None else Options(bridge_classes=classes)
     result, _ = prepare([path], tmp_path / "out", options=options)
     assert (tmp_path / "out" / "bridges.tif").is_file() == is_bridge
-    noted = [note for note in result.notes if "--bridge-class 26" in note]
+    noted = [note for note in result.notes if "--bridge-class" in note]
     assert len(noted) == (not is_bridge)
-    assert all(f"{(kind == 17).sum():,} points of class 26" in note for note in noted)
-
-
-def test_bridge_decks_of_las_that_are_not_used_are_noted(tmp_path):
-    xyz, kind, _ = world()
-    path = write_cloud(tmp_path / "a.las", xyz, kind, "EPSG:25832")
-    result, _ = prepare([path], tmp_path / "out", options=Options(bridge_classes=(26,)))
-    (noted,) = [note for note in result.notes if "--bridge-class 17" in note]
-    assert f"{(kind == 17).sum():,} points of class 17" in noted
-    result, _ = prepare([path], tmp_path / "used", options=Options(bridge_classes=(17, 26)))
-    assert not [note for note in result.notes if "--bridge-class" in note]
+    for note in noted:
+        assert f"{(kind == 17).sum():,} points of class {class_}" in note
+        assert f"--bridge-class {class_}" in note

@@ -37,50 +37,32 @@ def grid(bounds, out, photo=True, per_cell=0, **common):
     return prepared_grid(bounds, CRS, PrepareOptions(**common), "a.laz", out, photo=photo, per_cell=per_cell)
 
 
-def test_point_2000_km_away_is_named_with_its_file(tmp_path):
-    files = [cloud(tmp_path / "a.laz"), cloud(tmp_path / "b.laz", (2e6, 7))]
-    with pytest.raises(
-        CatalogError, match=r"b.laz has a point at easting 2356000.00 and northing 5699007.00"
-    ):
+@pytest.mark.parametrize(
+    ("clouds", "chunk", "message"),
+    [
+        (([], [(2e6, 7)]), 5000, "b.las has a point at easting 2356000.00 and northing 5699007.00"),
+        (([(9, 2e6)],), 5000, "a.las has a point at easting 356009.00 and northing 7699000.00"),
+        # A part of a file, far from the parts before: its farthest point.
+        (([(0, 2e6), (5, 2.1e6)],), 1000, "a.las has a point at easting 356005.00 and northing 7799000.00"),
+        # Few points behind a gap.
+        (
+            ([], [(70_000, 60_000), (70_001, 60_000)]),
+            5000,
+            r"b.las has points at easting 42600[01].00 and northing 5759000.00 \(m\), \d\d km from the",
+        ),
+    ],
+)
+def test_distant_points_are_named_with_their_file(tmp_path, monkeypatch, clouds, chunk, message):
+    monkeypatch.setattr(point_reading, "CHUNK", chunk)
+    files = [cloud(tmp_path / f"{name}.las", *far) for name, far in zip("ab", clouds, strict=False)]
+    with pytest.raises(CatalogError, match=message):
         prepare(files, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_first_file_with_a_distant_point_names_that_point(tmp_path):
-    with pytest.raises(CatalogError, match="a.laz has a point at easting 356009.00 and northing 7699000.00"):
-        prepare([cloud(tmp_path / "a.laz", (9, 2e6))], tmp_path / "out")
-
-
-def test_part_of_a_file_far_from_those_before_names_its_farthest_point(tmp_path, monkeypatch):
-    monkeypatch.setattr(point_reading, "CHUNK", 100)
-    place = np.zeros((300, 3))
-    place[200:], place[250] = [0, 2e6, 0], [5, 2.1e6, 0]
-    file = write_cloud(tmp_path / "a.las", SITE + place, 2, CRS)
-    with pytest.raises(CatalogError, match="a.las has a point at easting 356005.00 and northing 7799000.00"):
-        prepare([file], tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_few_points_behind_a_gap_are_named_with_their_file(tmp_path):
-    files = [cloud(tmp_path / "a.laz"), cloud(tmp_path / "b.laz", (70_000, 60_000), (70_001, 60_000))]
-    match = r"b.laz has points at easting 42600[01].00 and northing 5759000.00 \(m\), \d\d km from the others"
-    with pytest.raises(CatalogError, match=match):
-        prepare(files, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_area_with_a_gap_and_few_cells_is_prepared(tmp_path):
-    prepared = prepare(
-        [cloud(tmp_path / "a.laz", (30_000, 10))],
-        tmp_path / "out",
-        cell_m=20.0,
-        dop_cell_m=20.0,
-        tile_size_m=40,
-    )
-    assert prepared.tiles == 1
-
-
-def test_check_extent_accepts_a_whole_state():
+def test_area_with_a_gap_and_few_cells_or_of_a_whole_state_is_prepared(tmp_path):
+    coarse = {"cell_m": 20.0, "dop_cell_m": 20.0, "tile_size_m": 40}
+    assert prepare([cloud(tmp_path / "a.laz", (30_000, 10))], tmp_path / "out", **coarse).tiles == 1
     check_extent("a.laz", np.array([[280_000.0, 540_000], [5_570_000, 5_820_000]]), None)
 
 

@@ -51,24 +51,16 @@ def test_file_of_others_is_refused_and_stays(tmp_path, name, write):
     assert (tmp_path / name).read_bytes() == before
 
 
-def test_outputs_of_earlier_command_are_replaced(tmp_path):
+def test_outputs_of_earlier_command_are_replaced_but_not_under_another_name(tmp_path):
     prepared(tmp_path)
-    check_replaced(tmp_path)
-    (tmp_path / "catalog.parquet").unlink()
-    check_replaced(tmp_path)
-
-
-def test_own_raster_under_another_name_is_refused(tmp_path):
-    prepared(tmp_path)
-    shutil.copy(tmp_path / "dsm.tif", tmp_path / "dtm.tif")
-    with pytest.raises(ConfigError, match=r"dtm\.tif is not of an earlier"):
-        check_replaced(tmp_path)
-
-
-def test_other_files_and_new_folders_are_no_obstacle(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     check_replaced(tmp_path)
     check_replaced(tmp_path / "new")
+    (tmp_path / "catalog.parquet").unlink()
+    check_replaced(tmp_path)
+    shutil.copy(tmp_path / "dsm.tif", tmp_path / "dtm.tif")
+    with pytest.raises(ConfigError, match=r"dtm\.tif is not of an earlier"):
+        check_replaced(tmp_path)
 
 
 def test_pipe_and_file_as_folder_are_refused(tmp_path):

@@ -15,16 +15,9 @@ from flexroad.tools.prepare.options import PrepareOptions
 from flexroad.tools.prepare.raster_writer import RasterWriter
 from flexroad.tools.prepare.roads import add_roads, burn, check_roads
 from tests.command_line import call
-from tests.make_roads import write_osm
+from tests.make_roads import in_cp1252, write, write_osm
 
 GRID = Grid("EPSG:25832", 400_000, 5_700_100, 1.0, 80, 100)
-
-
-def write(path, shapes, crs="EPSG:25832", layer=None, **columns):
-    geopandas.GeoDataFrame(columns or {"id": range(len(shapes))}, geometry=shapes, crs=crs).to_file(
-        path, layer=layer
-    )
-    return path
 
 
 def test_burn_polygons_cover_cells_with_centre_inside(tmp_path):
@@ -56,9 +49,7 @@ def test_burn_selects_features_by_layer_and_condition(tmp_path):
 
 def test_burn_reads_text_in_another_encoding_than_declared(tmp_path):
     path = write(tmp_path / "a.shp", [box(400_000, 5_700_000, 400_010, 5_700_100)], name=["xxxxxx"])
-    dbf = path.with_suffix(".dbf")
-    dbf.write_bytes(dbf.read_bytes().replace(b"xxxxxx", "Straße".encode("cp1252")))
-    path.with_suffix(".cpg").write_text("UTF-8")
+    in_cp1252(path, "xxxxxx", "Straße")
     check_roads(PrepareOptions(roads=path))
     assert burn(path, None, None, GRID).sum() == 1000
     _, notes = published(tmp_path / "out", path)

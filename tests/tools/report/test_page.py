@@ -49,6 +49,16 @@ def said(run, rows, **counts):
     return headline(table, content.counts.skipped), [(line.kind, line.text, line.command) for line in lines]
 
 
+@pytest.mark.parametrize("flag", MEANINGS)
+def test_remedy_is_a_whole_sentence_with_and_without_a_place(flag):
+    ((_, text),) = reasons({"flags": flag}, {})
+    ((_, placed),) = reasons({"flags": flag}, {flag: (1.0, 2.0)})
+    assert MEANINGS[flag].words
+    assert MEANINGS[flag].remedy
+    assert "{" not in text + placed
+    assert not re.search(r"\b(if|whether) is\b|  | :", text.partition("; ")[2])
+
+
 def test_files_that_the_catalog_skipped_are_told_first(tmp_path, made_survey):
     run = made_run(tmp_path / "run", made_survey / "catalog.parquet", ["a"])
     rows = [made_row("a", 0.02)]
@@ -63,17 +73,11 @@ def test_files_that_the_catalog_skipped_are_told_first(tmp_path, made_survey):
     assert told[0] == ("failed", text, "")
 
 
-def test_all_columns_of_the_metrics_have_a_label():
+def test_all_columns_of_the_metrics_and_all_flags_have_words():
     numbers = {name for name, kind in COLUMNS.items() if kind != "str"}
     assert set(LABELS) == numbers - {"worst_easting", "worst_northing"}
     assert set(NAMES) < set(COLUMNS)
-
-
-def test_all_flags_have_words_and_a_remedy():
     assert set(MEANINGS) == {*FLAGS, NO_ROAD, *STRUCTURE_FLAGS}
-    for meaning in MEANINGS.values():
-        assert meaning.words
-        assert meaning.remedy
 
 
 def test_dropped_road_under_a_dsm_off_the_dtm_has_that_as_its_reason():
@@ -189,21 +193,14 @@ def test_comparison_counts_better_and_worse_tiles(run):
     assert (row.before, row.now, row.change) == ("0.06", "0.16", "+0.1")
     assert (row.better, row.same, row.worse) == (0, 1, 1)
     assert list(comparison.worse.tile) == ["b"]
+    figures = comparison.table.set_index("figure, mean over tiles")
+    assert figures.now["triangles"] == "20,000"
+    assert list(figures.loc["computing time (s)", ["better", "same", "worse"]]) == ["–"] * 3
     np.testing.assert_allclose(comparison.columns["change_m"][2], [0, 0.2, np.nan, np.nan], atol=1e-12)
     other = compare(table, before.assign(variant="other"), "flexroad", "x")
     assert other.table.empty
     assert other.columns == {}
     assert other.line == "Nothing can be compared with x: no tile is done in both."
-
-
-def test_comparison_with_itself_has_no_change_and_whole_triangles(run):
-    rows = metrics_frame(ROWS)
-    comparison = compare(tile_table(run.catalog.tiles, made_content(run, ROWS)), rows, "flexroad", "itself")
-    assert set(comparison.table.change) == {"0"}
-    table = comparison.table.set_index("figure, mean over tiles")
-    assert table.now["triangles"] == "20,000"
-    assert list(table.loc["computing time (s)", ["better", "same", "worse"]]) == ["–"] * 3
-    assert comparison.worse.empty
 
 
 def test_histogram_has_all_tiles_and_the_threshold():
@@ -223,27 +220,14 @@ def test_page_of_runs_without_meshes_and_with_markup_is_whole(tmp_path, made_sur
     names = {"a": "a", "b": EVIL, "c": "c & d", "d": '"><img src=x onerror=alert(1)>'}
     run = made_run(tmp_path / "RUN", made_survey / "catalog.parquet", list(names.values()))
     rows = [row | {"tile_id": names[row["tile_id"]]} for row in rows]
-    page = html_page(run, made_content(run, rows))
+    page = html_page(run, made_content(run, rows), "view/index.html")
+    done = [row["tile_id"] for row in rows if row["status"] == "done"]
+    assert ('href="view/index.html#tile=a"' in page) == ("a" in done)
     assert EVIL not in page
     assert "<img src=x" not in page
     assert page.count("<script") == 2
     for heading in ("Did it work?", "Where?", "How good?", "What to look at first", "Details"):
         assert f"<h2>{heading}</h2>" in page
-
-
-def test_page_of_one_tile(tmp_path, made_survey):
-    run = made_run(tmp_path / "RUN", made_survey / "catalog.parquet", ["a"])
-    page = html_page(run, made_content(run, [made_row("a", 0.2, "patch")]), "view/index.html")
-    assert "Yes: the tile is done, 1 is flagged." in page
-    assert 'href="view/index.html#tile=a"' in page
-
-
-@pytest.mark.parametrize("flag", MEANINGS)
-def test_remedy_without_a_place_is_a_whole_sentence(flag):
-    ((_, text),) = reasons({"flags": flag}, {})
-    ((_, placed),) = reasons({"flags": flag}, {flag: (1.0, 2.0)})
-    assert "{" not in text + placed
-    assert not re.search(r"\b(if|whether) is\b|  | :", text.partition("; ")[2])
 
 
 @pytest.mark.slow
@@ -278,8 +262,3 @@ def test_viewer_is_found_in_the_run_or_given_and_its_address_is_relative(run, tm
         (folder / "index.html").touch()
     assert _viewer_address(run, None) == "viewer/index.html"
     assert _viewer_address(run, tmp_path / "3D & more") == "../3D%20%26%20more/index.html"
-
-
-def test_flags_of_decks_name_the_command_that_finds_them():
-    for flag in ("patch", "off-dtm"):
-        assert "`flexroad catalog check` maps bridges" in MEANINGS[flag].remedy

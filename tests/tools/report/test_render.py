@@ -1,3 +1,5 @@
+"""Pictures of the report, and the background of its map: relief, roads and the limit of the survey."""
+
 import io
 import logging
 import re
@@ -10,13 +12,14 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from flexroad.catalog import Grid
-from flexroad.tasks.types import Mesh
+from flexroad.tasks.types import Mesh, RoadMask
 from flexroad.tools.report import render
-from flexroad.tools.report.pictures import render_meshes
+from flexroad.tools.report.pictures import _square, render_meshes, webp
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
 ROW, COL = np.indices(GRID.shape)
 RELIEF = 150 + 5 * np.sin(COL / 40) + 3 * np.cos(ROW / 25)
+NOISE = np.random.default_rng(0).normal(0, 0.1, GRID.shape)
 
 
 def pixels(png: bytes) -> np.ndarray:
@@ -108,27 +111,16 @@ def test_error_map_with_road_draws_its_outline():
 
 
 @pytest.mark.filterwarnings("error")
-def test_pictures_of_empty_data_are_drawn():
-    empty = np.full(GRID.shape, np.nan)
-    none = np.zeros(GRID.shape, bool)
+@pytest.mark.parametrize("heights", [np.full(GRID.shape, np.nan), RELIEF + NOISE], ids=["empty", "noise"])
+def test_pictures_of_any_data_are_drawn_and_small(heights):
+    raw, kept = NOISE > 0, NOISE > 0.1
     for png in (
-        render.hillshade(empty, GRID),
-        render.filter_picture(empty, none, none, GRID),
-        render.error_map(empty, GRID, road=none),
-    ):
-        assert pixels(png).shape[1] == render.WIDTH_PX
-
-
-def test_pictures_of_noise_are_small():
-    noise = np.random.default_rng(0).normal(0, 0.1, GRID.shape)
-    rough = RELIEF + np.where(noise > 0.1, 10, 0)
-    for png in (
-        render.hillshade(rough, GRID),
-        render.error_map(noise, GRID),
-        render.filter_picture(rough, noise > 0, noise > 0.1, GRID),
+        render.hillshade(heights, GRID),
+        render.filter_picture(heights, raw, kept, GRID),
+        render.error_map(heights - RELIEF, GRID, road=kept),
     ):
         assert len(png) < 120_000
-        assert pixels(png).shape[1] == 480
+        assert pixels(png).shape[1] == render.WIDTH_PX == 480
 
 
 @pytest.mark.parametrize(("width", "height"), [(40, 250), (250, 40), (3, 3), (900, 1200)])
@@ -138,10 +130,6 @@ def test_hillshade_of_any_shape_has_fixed_width(width, height):
     rows, columns, _ = pixels(render.hillshade(heights, grid)).shape
     assert columns == 480
     assert rows < 2 * render.MAP_PX + 80
-
-
-def test_hillshade_twice_gives_equal_bytes():
-    assert render.hillshade(RELIEF, GRID) == render.hillshade(RELIEF, GRID)
 
 
 def sheet(n: int = 26) -> Mesh:
@@ -245,3 +233,51 @@ def test_labels_of_far_places_and_flags_of_one_place_stay_where_they_are():
     places = {"spike": (500_020.0, 5_600_100.0), "patch": (500_230.0, 5_600_101.0)}
     assert labels(places) == {"spike": (20, 100), "patch": (230, 101)}
     assert labels(dict.fromkeys(("spike", "patch"), (500_020.0, 5_600_100.0))) == {"spike, patch": (20, 100)}
+
+
+CORE = Grid("EPSG:25832", 588_000.0, 5_519_250.0, 1.0, 250, 250)
+WIDE = Grid("EPSG:25832", 587_950.0, 5_519_300.0, 1.0, 350, 350)
+WIDE_ROW, WIDE_COL = np.indices(WIDE.shape)
+
+
+class Slope:
+    """A plane that rises to one side."""
+
+    bounds = WIDE.bounds
+
+    def __init__(self, east, north):
+        self.east, self.north = east, north
+
+    def lattice(self, eastings, northings):
+        return self.east * eastings[None, :] + self.north * northings[:, None]
+
+
+def square(surface, mask=WIDE_ROW < 0, outside=WIDE_ROW < 0, side=50):
+    return _square(surface, RoadMask(WIDE, CORE, mask, outside), side).astype(int)
+
+
+def test_roads_are_darker_where_they_lie():
+    # The core begins 50 cells into the grid.
+    grey = square(Slope(0, 0), mask=(WIDE_COL >= 50) & (WIDE_COL < 100))[..., 0]
+    assert grey[:, :10].max() < grey[:, 10:].min() - 50
+    assert grey.shape == (50, 50)
+
+
+def test_slopes_that_face_north_west_are_lighter():
+    assert square(Slope(0.1, -0.1))[..., 0].mean() > square(Slope(-0.1, 0.1))[..., 0].mean() + 20
+
+
+def test_cells_beyond_the_survey_are_transparent():
+    opacity = square(Slope(0, 0), outside=WIDE_ROW >= 175)[..., 1]
+    assert (opacity[:25] == 255).all()
+    assert (opacity[25:] == 0).all()
+
+
+def test_webp_is_smaller_and_has_the_width_asked_for():
+    buffer = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 255, (300, 400, 3)).astype(np.uint8)
+    Image.fromarray(noise).save(buffer, "png")
+    small = webp(buffer.getvalue(), 200)
+    assert Image.open(io.BytesIO(small)).size == (200, 150)
+    assert len(small) < len(buffer.getvalue())
+    assert Image.open(io.BytesIO(webp(buffer.getvalue(), 500))).size == (400, 300)

@@ -10,17 +10,16 @@ import rasterio
 from matplotlib import colormaps
 from PIL import Image
 
-from flexroad.catalog import Catalog, Grid
+from flexroad.catalog import Grid
 from flexroad.catalog.errors import CatalogError
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tools.reproduce import figures, tile_figures, tile_view
 from flexroad.tools.reproduce.layout import DPI, SMALL_PX
 from flexroad.tools.reproduce.metrics_data import collect
+from tests.builders import finish_run
 
 pytestmark = pytest.mark.slow
 
@@ -41,24 +40,12 @@ ABLATION = {
         "two_things": {"fit": {"degree": 2, "control_points": [8, 8]}},
     },
 }
-ROLES = {
-    "full": "flexroad",
-    "plane": "flat",
-    "rgt": "cells",
-    "wo_nurbs": "mixed",
-    "wo_ecsrc": "bare",
-}
-
-
-def finished_run(folder, raw, survey) -> Run:
-    run = Run.create(folder, compose(raw, "quick"), Catalog.read(survey / "catalog.parquet"))
-    assert run_tiles(run, SerialExecutor()).done == len(run.catalog.tiles)
-    return run
+ROLES = {"full": "flexroad", "plane": "flat", "rgt": "cells", "wo_nurbs": "mixed", "wo_ecsrc": "bare"}
 
 
 @pytest.fixture(scope="module")
 def run(made_survey, tmp_path_factory) -> Run:
-    return finished_run(tmp_path_factory.mktemp("figures") / "run", ABLATION, made_survey)
+    return finish_run(tmp_path_factory.mktemp("figures") / "run", made_survey, compose(ABLATION, "quick"))
 
 
 @pytest.fixture(scope="module")
@@ -75,9 +62,6 @@ def row_of(rows, tile, variant):
     return rows[(rows.tile_id == tile.tile_id) & (rows.variant == variant)].iloc[0]
 
 
-# --- roles ---------------------------------------------------------------------------------------
-
-
 def test_roles_of_renamed_variants_follow_from_options(run):
     assert tile_view.roles_of(run.config) == ROLES
 
@@ -88,13 +72,6 @@ def test_roles_of_shipped_configurations_are_complete():
     assert ablation == {role: role for role in ROLES} | {"full": "flexroad"}
 
 
-def test_changes_lists_options_or_method(run):
-    chains = run.config.chains
-    assert tile_view.changes(chains["flexroad"], chains["flexroad"]) == set()
-    assert tile_view.changes(chains["sparse"], chains["flexroad"]) == {"sample.road_m", "sample.terrain_m"}
-    assert tile_view.changes(chains["mixed"], chains["flexroad"]) == {"fit.method", "sample.method"}
-
-
 def test_typical_tile_is_median_of_tiles_with_road():
     table = pd.DataFrame(
         {"tile_id": list("abcde"), "variant": "v", "l2_road_m": [0.5, 0.1, np.nan, 0.2, 0.3]}
@@ -102,9 +79,6 @@ def test_typical_tile_is_median_of_tiles_with_road():
     assert tile_view.typical_tile(table, "v") == "d"
     with pytest.raises(ConfigError, match="--tile"):
         tile_view.typical_tile(table[table.tile_id == "c"], "v")
-
-
-# --- maps -------------------------------------------------------------------------------------------------
 
 
 def test_maps_show_values_of_metrics_table(run, rows, tile, made_survey):
@@ -126,9 +100,6 @@ def test_maps_show_values_of_metrics_table(run, rows, tile, made_survey):
             np.testing.assert_allclose(angles[~on_road].mean(), row.mad_terrain_deg, rtol=1e-6, atol=1e-8)
         assert upper.get_title() == f"{label}\nroad {row.l2_road_m:.3f} m, terrain {row.l2_terrain_m:.3f} m"
         assert lower.get_title() == f"road {row.mad_road_deg:.2f}°, terrain {row.mad_terrain_deg:.2f}°"
-
-
-# --- profile ----------------------------------------------------------------------------------------------
 
 
 def test_along_is_bilinear_and_nan_next_to_nan():
@@ -203,9 +174,6 @@ def test_trajectory_on_tiny_road_is_empty_or_short(cells):
     assert row.size == col.size <= 4
 
 
-# --- renders ----------------------------------------------------------------------------------------------
-
-
 def test_vertex_colours_match_error_below(tile):
     colours = tile_figures.vertex_colours(tile, "rgt")
     mesh = tile.results["rgt"].mesh
@@ -231,9 +199,6 @@ def test_busiest_is_square_with_most_dropped_cells():
     assert tile_figures.busiest(np.zeros(small.shape, bool), small) == (1000.0, 2010.0, 1050.0, 2060.0)
 
 
-# --- trade-off --------------------------------------------------------------------------------------------
-
-
 def test_trade_off_shows_means_of_metrics_table(run, rows):
     figure = figures.trade_off(run.config, "flexroad", rows)[1]
     expected = {
@@ -256,9 +221,6 @@ def test_sweep_of_an_option_that_the_method_lacks_is_empty():
     (full,) = chains
     assert figures.sweep(chains, full, ("fit.control_points",)) == {}
     assert figures.sweep(chains, full, ("sample.road_m", "sample.terrain_m")).keys() == {full}
-
-
-# --- dataset ---------------------------------------------------------------------------------------------
 
 
 def test_statistics_match_rasters_and_metrics_table(run, rows, made_survey):
@@ -292,9 +254,6 @@ def test_dataset_figure_counts_every_tile():
     assert heights.lines[0].get_xdata()[0] == pytest.approx(45)
 
 
-# --- write_figures ------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def quick_renders(monkeypatch):
     """Replace the slow drawing of meshes by noise; `test_render` tests the drawing."""
@@ -307,9 +266,11 @@ def quick_renders(monkeypatch):
 
 
 @pytest.mark.usefixtures("quick_renders")
-def test_write_figures_twice_gives_equal_files(run, rows, tmp_path):
+def test_write_figures_twice_gives_equal_files_and_leaves_the_run_unchanged(run, rows, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*")}
     for name in ("one", "two"):
         assert figures.write_figures(run, tmp_path / name) == []
+    assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} == before
     page = (tmp_path / "one" / "figures.md").read_text()
     for name in FIGURE_NAMES:
         with Image.open(tmp_path / "one" / f"{name}.png") as picture:
@@ -336,7 +297,7 @@ def test_write_figures_without_opengl_leaves_out_renders(run, tmp_path, monkeypa
 
 
 def test_write_figures_without_variants_lists_missing_figures(made_survey, tmp_path):
-    only = finished_run(tmp_path / "run", BASE, made_survey)
+    only = finish_run(tmp_path / "run", made_survey, compose(BASE, "quick"))
     notes = figures.write_figures(only, tmp_path / "out", only.catalog.tiles[0].id)
     assert [note.split(":")[0].removeprefix("no figure ") for note in notes] == list(FIGURE_NAMES[:4])
     assert all("--config ablation" in note for note in notes)
@@ -344,7 +305,7 @@ def test_write_figures_without_variants_lists_missing_figures(made_survey, tmp_p
 
 
 def test_write_figures_leaves_out_tiles_with_failed_variant(made_survey, tmp_path):
-    part = finished_run(tmp_path / "run", BASE, made_survey)
+    part = finish_run(tmp_path / "run", made_survey, compose(BASE, "quick"))
     table = read_metrics(part.path)
     failed = table.tile_id.iloc[0]
     table.loc[table.tile_id == failed, "status"] = "failed"
@@ -359,10 +320,3 @@ def test_write_figures_leaves_out_tiles_with_failed_variant(made_survey, tmp_pat
 def test_write_figures_unknown_tile_raises(run, tmp_path):
     with pytest.raises(CatalogError, match="0_0"):
         figures.write_figures(run, tmp_path, "0_0")
-
-
-@pytest.mark.usefixtures("quick_renders")
-def test_write_figures_leaves_run_unchanged(run, tmp_path):
-    before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*")}
-    figures.write_figures(run, tmp_path)
-    assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} == before

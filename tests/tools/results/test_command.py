@@ -63,10 +63,9 @@ def assert_truth(table: pd.DataFrame) -> None:
     assert list(table["class"]) == ["road", "terrain"]
 
 
-def degrees() -> np.ndarray:
-    """Longitudes and latitudes of `POINTS`."""
-    to_degrees = pyproj.Transformer.from_crs(UTM, "EPSG:4326", always_xy=True)
-    return np.column_stack(to_degrees.transform(*POINTS.T))
+def in_crs(crs: str = "EPSG:4326") -> np.ndarray:
+    """The places of `POINTS` in another CRS, by default longitudes and latitudes."""
+    return np.column_stack(pyproj.Transformer.from_crs(UTM, crs, always_xy=True).transform(*POINTS.T))
 
 
 def csv(path: Path, header: str, rows, form: str = "{:.9f},{:.9f}") -> Path:
@@ -75,29 +74,25 @@ def csv(path: Path, header: str, rows, form: str = "{:.9f},{:.9f}") -> Path:
 
 
 @pytest.mark.parametrize(
-    ("header", "words"),
+    ("header", "crs"),
     [
-        ("longitude,latitude", []),
-        ("LON,Lat", []),
-        ("x,y", ["--crs", "EPSG:4326"]),
+        ("longitude,latitude", None),
+        ("LON,Lat", None),
+        ("x,y", "EPSG:4326"),
         # ETRS89, which the projected CRS is based on.
-        ("lon,lat", ["--crs", "EPSG:4258"]),
+        ("lon,lat", "EPSG:4258"),
+        # The register has northing first for this one.
+        ("easting,northing", "EPSG:3035"),
+        ("x\ty", UTM),
     ],
 )
-def test_query_of_degrees_gives_heights_of_the_ground(run, flexroad, tmp_path, header, words):
-    points = csv(tmp_path / "points.csv", header, degrees())
-    said = flexroad("query", run, "--points", points, *words)
-    assert_truth(answer(said))
-    read_as = f"note: {header.replace(',', ', ')} are read as EPSG:4326\n"
-    assert said.err == ("" if words else read_as)
-
-
-def test_query_of_another_projected_crs_takes_east_first(run, flexroad, tmp_path):
-    # The register has northing first for this one.
-    other = pyproj.Transformer.from_crs(UTM, "EPSG:3035", always_xy=True)
-    rows = np.column_stack(other.transform(*POINTS.T))
-    points = csv(tmp_path / "points.csv", "easting,northing", rows)
-    assert_truth(answer(flexroad("query", run, "--points", points, "--crs", "EPSG:3035")))
+def test_query_of_points_in_any_crs_gives_heights_of_the_ground(run, flexroad, tmp_path, header, crs):
+    separator = "\t" if "\t" in header else ","
+    rows = in_crs(crs or "EPSG:4326")
+    points = csv(tmp_path / "points.csv", header, rows, "{:.9f}" + separator + "{:.9f}")
+    said = flexroad("query", run, "--points", points, *(["--crs", crs] if crs else []))
+    assert_truth(answer(said, sep=separator))
+    assert said.err == ("" if crs else f"note: {header.replace(',', ', ')} are read as EPSG:4326\n")
 
 
 def test_query_keeps_semicolons_and_decimal_commas(run, flexroad, tmp_path):
@@ -122,11 +117,6 @@ def test_query_writes_no_formulas(run, flexroad, tmp_path):
         assert [row[2] for row in rows] == ["'=1+1", "-7"][: len(rows)]
 
 
-def test_query_of_tabs_and_dots(run, flexroad, tmp_path):
-    points = csv(tmp_path / "points.txt", "x\ty", POINTS, "{}\t{}")
-    assert_truth(answer(flexroad("query", run, "--points", points), sep="\t"))
-
-
 def test_query_reads_standard_input(run, flexroad, tmp_path, monkeypatch):
     text = csv(tmp_path / "points.csv", "easting,northing", POINTS).read_bytes()
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text)))
@@ -145,7 +135,7 @@ def test_query_of_vector_points_gives_heights_and_coordinates_of_the_run(run, fl
 
 
 def test_query_writes_geopackage_in_crs_of_the_run(run, flexroad, tmp_path):
-    points = csv(tmp_path / "points.csv", "lon,lat,name", [*degrees()], "{:.9f},{:.9f},a")
+    points = csv(tmp_path / "points.csv", "lon,lat,name", [*in_crs()], "{:.9f},{:.9f},a")
     with points.open("a") as file:
         file.write(",,no place\n")
     said = flexroad("query", run, "--points", points, "-o", tmp_path / "answer.gpkg")
@@ -178,7 +168,7 @@ def test_profile_along_points_has_distances_heights_and_grades(run, flexroad):
 
 
 def test_profile_of_line_in_degrees_equals_that_of_the_run(run, flexroad):
-    line = ", ".join(f"{x:.10f} {y:.10f}" for x, y in degrees())
+    line = ", ".join(f"{x:.10f} {y:.10f}" for x, y in in_crs())
     table = answer(flexroad("query", run, "--line", line, "--crs", "EPSG:4326"))
     length = np.hypot(*(POINTS[1] - POINTS[0]))
     assert len(table) == int(length) + 2
@@ -232,7 +222,7 @@ def test_query_of_points_beyond_the_survey_gives_no_heights(flexroad, tmp_path):
 
 
 def test_query_of_points_beside_all_tiles_says_where_the_tiles_are(run, flexroad, tmp_path):
-    points = csv(tmp_path / "points.csv", "x,y", degrees())
+    points = csv(tmp_path / "points.csv", "x,y", in_crs())
     said = flexroad("query", run, "--points", points)
     assert answer(said).height_m.isna().all()
     assert said.err == (
@@ -250,6 +240,7 @@ def test_query_of_points_beside_all_tiles_says_where_the_tiles_are(run, flexroad
         ("x,y\n1,2\n\n3,4 m\n", "", "points.csv, line 4: y is '4 m', not a number"),
         ("x;y\n1,5;2\n3.000,5;4\n", "", "points.csv, line 3: x is '3.000,5', not a number"),
         ("x,y\n1,5,2,5\n", "", "points.csv, line 2: 4 values, but the header has 2"),
+        ("x,y,Straße\n1,2,3\n", "", "save it as CSV in UTF-8"),
         ("x,y\n1,2\n", "--crs EPSG:1", "unknown CRS 'EPSG:1'"),
         ("x,y\n1,2\n", "-o a.shp", "ends in .csv or .gpkg"),
         ("x,y\n1,2\n", "--line 1", "give the points with --points FILE, or a line with --line"),
@@ -257,44 +248,39 @@ def test_query_of_points_beside_all_tiles_says_where_the_tiles_are(run, flexroad
 )
 def test_query_of_unusable_points_gives_one_error(run, flexroad, tmp_path, text, words, message):
     points = tmp_path / "points.csv"
-    points.write_text(text)
+    points.write_text(text, encoding="latin-1")
     said = flexroad("query", run, "--points", points, *words.split()).expected(2)
     assert message in said.err
     assert said.err.count("\n") == 1
     assert said.out == ""
 
 
-def test_query_of_csv_in_another_encoding_gives_one_error(run, flexroad, tmp_path):
-    points = tmp_path / "points.csv"
-    points.write_bytes("x,y,Straße\n1,2,3\n".encode("latin-1"))
-    assert "save it as CSV in UTF-8" in flexroad("query", run, "--points", points).expected(2).err
+ORIGIN = Point(0, 0)
+
+
+def line(*places) -> LineString:
+    return LineString(places)
 
 
 @pytest.mark.parametrize(
-    ("option", "shapes", "crs", "words", "message"),
+    ("option", "shape", "crs", "words", "message"),
     [
-        (
-            "--points",
-            [LineString([(0, 0), (1, 1)])],
-            UTM,
-            "",
-            "type LineString, not points; lines go to --line",
-        ),
-        ("--line", [Point(0, 0)], UTM, "", "type Point, not lines; points go to --points"),
-        ("--points", [Point(0, 0)], None, "", "carries no CRS; give it with --crs"),
-        ("--points", [Point(0, 0)], UTM, "--crs EPSG:4326", "is in EPSG:25832, not EPSG:4326"),
-        ("--points", [Point(0, 0)], UTM, "|layername=b", "no layer 'b'; it has points"),
-        ("--line", [LineString([(0, 0), (0, 0)])], UTM, "", "has no length"),
-        ("--line", [LineString([(200, 95), (201, 96)])], "EPSG:4326", "", "cannot be transformed"),
-        ("--line", [LineString([(0, 0), (9e9, 1)])], UTM, "", "at most 10000000"),
+        ("--points", line((0, 0), (1, 1)), UTM, "", "type LineString, not points; lines go to --line"),
+        ("--line", ORIGIN, UTM, "", "type Point, not lines; points go to --points"),
+        ("--points", ORIGIN, None, "", "carries no CRS; give it with --crs"),
+        ("--points", ORIGIN, UTM, "--crs EPSG:4326", "is in EPSG:25832, not EPSG:4326"),
+        ("--points", ORIGIN, UTM, "|layername=b", "no layer 'b'; it has points"),
+        ("--line", line((0, 0), (0, 0)), UTM, "", "has no length"),
+        ("--line", line((200, 95), (201, 96)), "EPSG:4326", "", "cannot be transformed"),
+        ("--line", line((0, 0), (9e9, 1)), UTM, "", "at most 10000000"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:'crs' was not provided")
 def test_query_of_unusable_features_gives_one_error(
-    run, flexroad, tmp_path, option, shapes, crs, words, message
+    run, flexroad, tmp_path, option, shape, crs, words, message
 ):
     path = tmp_path / "points.gpkg"
-    geopandas.GeoDataFrame(geometry=shapes, crs=crs).to_file(path)
+    geopandas.GeoDataFrame(geometry=[shape], crs=crs).to_file(path)
     layer = words if words.startswith("|") else ""
     said = flexroad("query", run, option, f"{path}{layer}", *words.removeprefix(layer).split()).expected(2)
     assert message in said.err

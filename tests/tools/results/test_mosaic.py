@@ -46,14 +46,7 @@ def test_mosaic_of_overlapping_tiles_has_cells_of_the_first(read):
 
 @pytest.mark.parametrize(
     "part",
-    [
-        np.s_[3, 5],
-        np.s_[1:7:3, ::2],
-        np.s_[::-1, 4:],
-        np.s_[2, :],
-        np.s_[[0, 5, 2], 1:3],
-        np.s_[0:0, :],
-    ],
+    [np.s_[3, 5], np.s_[1:7:3, ::2], np.s_[::-1, 4:], np.s_[2, :], np.s_[[0, 5, 2], 1:3], np.s_[0:0, :]],
 )
 def test_part_of_mosaic_equals_part_of_whole(read, part):
     np.testing.assert_array_equal(lazy_layer()[part], expected()[part])

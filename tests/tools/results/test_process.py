@@ -65,13 +65,6 @@ def test_run_of_some_tiles_and_rerun_of_the_failed_one(run, survey):
     assert set(again.tiles["state"]) == {"done"}
 
 
-def test_run_into_a_folder_with_other_files_raises(run, tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "mine.txt").write_text("")
-    with pytest.raises(flexroad.ConfigError, match=r"has files that are not of a run, such as mine.txt"):
-        run()
-
-
 def test_run_with_invalid_option_or_unknown_tile_raises_and_writes_nothing(run, tmp_path):
     with pytest.raises(flexroad.ConfigError, match="fit.spacing"):
         run(settings=["fit.spacing=3"])

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import flexroad
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.sampler import RunSampler
 from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 from flexroad.tools.results.run import _joined
 
@@ -54,6 +56,32 @@ def test_surface_over_tiles_of_other_cells_raises(town):
     grids = [tiles[0].grid, replace(tiles[1].grid, cell=0.5)]
     with pytest.raises(flexroad.ConfigError, match="no common lattice; give bounds with tiles of one"):
         _joined(grids, iter(()))
+
+
+def test_tile_of_an_opened_run_has_inputs_masks_and_surface(light_run, monkeypatch):
+    tile = light_run.catalog.tiles[0]
+    flexroad_run, raster_run = (flexroad.open_run(light_run.path, name) for name in ("flexroad", "rgt"))
+    sampler = RunSampler.open(light_run.path)
+    # Nothing opens the run again.
+    monkeypatch.delattr(Run, "open")
+    dataset = flexroad_run.tile(tile.id)
+    assert set(dataset.data_vars) == {
+        "dsm", "dtm", "reference", "reference_road", "road", "road_filtered", "surface",
+    }  # fmt: skip
+    assert dataset.rio.crs.to_epsg() == 25832
+    assert tuple(dataset.rio.bounds()) == tile.grid.bounds
+    assert not (dataset.road_filtered & ~dataset.road).any()
+    east, north = np.meshgrid(dataset.x, dataset.y)
+    height = sampler.at(east.ravel(), north.ravel()).height
+    assert np.allclose(dataset.surface.values.ravel(), height, atol=1e-9)
+    assert np.array_equal(raster_run.tile(tile.id).surface, dataset.dsm)
+    with pytest.raises(flexroad.CatalogError, match="did you mean"):
+        flexroad_run.tile("1_1")
+
+
+def test_run_of_an_unknown_variant_raises(light_run):
+    with pytest.raises(flexroad.ConfigError, match="no variant 'x'"):
+        flexroad.open_run(light_run.path, "x")
 
 
 def test_surface_over_one_tile_has_the_borders_of_the_tile(town):

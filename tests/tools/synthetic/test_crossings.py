@@ -6,7 +6,6 @@ import pytest
 import shapely
 
 from flexroad.catalog import Grid
-from flexroad.tasks import TaskError
 from flexroad.tools.synthetic import Kind, block
 from flexroad.tools.synthetic.crossings import (
     CROSS_M,
@@ -177,10 +176,3 @@ def test_scene_has_cars_and_parapets_but_no_car_on_a_deck_from_the_road_below():
     cars = scene.kind == Kind.PARKED_CAR
     assert cars.sum() > 30
     assert (scene.dsm - scene.reference)[cars].max() < 1.6
-    same = make_crossings(GRID, 1, CrossingOptions(dsm_noise_m=0, dtm_noise_m=0))
-    assert np.array_equal(scene.dsm, same.dsm)
-
-
-def test_negative_seed_raises():
-    with pytest.raises(TaskError, match="a seed is 0 or more, not -1"):
-        make_crossings(GRID, -1)

@@ -7,7 +7,7 @@ from scipy import ndimage
 from flexroad.catalog.grid import Grid
 from flexroad.tools.prepare.mesh.sample import orthophoto as mesh_orthophoto
 from flexroad.tools.prepare.mesh.sample import project_down
-from flexroad.tools.synthetic import Kind
+from flexroad.tools.synthetic import Kind, make_scene
 from flexroad.tools.synthetic.dsc3d import (
     BUMPS_M,
     FRAGMENTS,
@@ -39,32 +39,13 @@ def height(scene):
     return project_down(scene.mesh, scene.surface.grid)[0]
 
 
-def test_sites_span_ranges_of_paper():
-    assert (min(s.triangles for s in SITES), max(s.triangles for s in SITES)) == (35_000, 101_000)
-    assert (min(s.rise_m for s in SITES), max(s.rise_m for s in SITES)) == (4.5, 33.9)
-    assert len({s.name for s in SITES}) == 5
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_survey_scenes_have_rise_of_site(seed):
-    from flexroad.tools.synthetic import make_scene
-
-    places = survey(seed=seed)
+def test_survey_scenes_have_rise_of_site():
+    places = survey(seed=1)
     for place in places:
-        truth = make_scene(place.grid, seed, place.site.stratum, place.options)
+        truth = make_scene(place.grid, 1, place.site.stratum, place.options)
         assert np.ptp(truth.reference) == pytest.approx(place.site.rise_m, rel=0.05)
         assert 0.1 < truth.reference_road.mean() < 0.4
-    assert survey(2, seed) == places[:2]
-
-
-def test_survey_masks_are_all_ground_between_roofs_and_crowns():
-    """T = 40K of 45K needs a mask of 89%; RGT's 15.4 m on terrain needs high objects on the rest."""
-    from flexroad.tools.synthetic import make_scene
-
-    scenes = [make_scene(p.grid, SEED, p.site.stratum, p.options) for p in survey(seed=SEED)]
-    assert np.mean([scene.road_mask.mean() for scene in scenes]) == pytest.approx(0.89, abs=0.03)
-    heights = [(scene.dsm - scene.reference)[~scene.road_mask].mean() for scene in scenes]
-    assert np.mean(heights) == pytest.approx(15.4, rel=0.25)
+    assert survey(2, 1) == places[:2]
 
 
 @pytest.mark.slow

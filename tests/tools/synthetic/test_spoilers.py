@@ -1,18 +1,18 @@
-"""Each option of the spoilers changes what it describes, and nothing else."""
+"""Each option of the spoilers and of the road mask changes what it describes, and nothing else."""
 
 from functools import lru_cache
 
 import numpy as np
 import pytest
-from scipy.ndimage import binary_dilation, distance_transform_edt, maximum_filter, minimum_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, label, maximum_filter, minimum_filter
 
 from flexroad.catalog import Grid
 from flexroad.tools.synthetic import Kind, Scene, SceneOptions, block, make_scene
-from flexroad.tools.synthetic.gerod import PRESET
+from flexroad.tools.synthetic.gerod import PRESET, survey
 from flexroad.tools.synthetic.network import Plan
+from flexroad.tools.synthetic.population import rails, wires
 from flexroad.tools.synthetic.spoilers import BARE
 from flexroad.tools.synthetic.surfaces import CIRCLE_M, ISLAND_M
-from flexroad.tools.synthetic.world import generator
 
 GRID = block(1)[0][1]
 QUIET = {"dsm_noise_m": (0, 0), "dtm_noise_m": 0, "flight_offset_m": 0}
@@ -30,9 +30,8 @@ def made(base: str = "empty", seed: int = 2, stratum: str = "urban", **options: 
 @pytest.mark.parametrize("stratum", PRESET)
 def test_all_spoilers_truth_does_not_depend_on_cell_size(stratum):
     fine = Grid(GRID.crs, GRID.west, GRID.north, 1.0, 240, 240)
-    coarse = Grid(
-        GRID.crs, GRID.west, GRID.north, 3.0, 80, 80
-    )  # its centres are also centres of the fine grid
+    # The centres of the coarse cells are also centres of the fine grid.
+    coarse = Grid(GRID.crs, GRID.west, GRID.north, 3.0, 80, 80)
     fine_scene, coarse_scene = (make_scene(grid, 3, stratum, PRESET[stratum]) for grid in (fine, coarse))
     assert np.allclose(fine_scene.reference[1::3, 1::3], coarse_scene.reference, atol=1e-6)
     assert np.array_equal(fine_scene.reference_road[1::3, 1::3], coarse_scene.reference_road)
@@ -48,16 +47,33 @@ def test_all_spoilers_only_raise_and_have_a_kind(stratum):
     assert (scene.dsm >= scene.reference)[~void].all()
     assert 0 < void.mean() < 0.1
     assert {Kind.PLANTS, Kind.WIRE, Kind.RAIL, Kind.MIXED} <= set(np.unique(scene.kind).tolist())
+    on_road = scene.kind[scene.reference_road]
+    assert not (on_road == Kind.BUILDING).any()
+    assert (on_road == Kind.CROWN).any()
 
 
-def test_preset_neighbouring_tiles_join():
-    west, east = GRID, block(2)[1][1]
-    both = make_scene(Grid(GRID.crs, GRID.west, GRID.north, 1.0, 500, 250), 4, "urban", PRESET["urban"])
-    for half, tile in ((slice(0, 250), west), (slice(250, 500), east)):
-        part = make_scene(tile, 4, "urban", PRESET["urban"])
+@pytest.mark.parametrize("stratum", PRESET)
+def test_cars_are_low(stratum):
+    scene = made("quiet", 1, stratum)
+    cars = np.isin(scene.kind, (Kind.PARKED_CAR, Kind.MOVING_CAR))
+    assert 0 < (scene.dsm - scene.reference)[cars].max() < 3.5
+
+
+def test_neighbouring_tiles_join():
+    """A tile twice as wide equals the two tiles: no step, no house cut in two."""
+    options = PRESET["urban"].model_copy(update=QUIET)
+    both = make_scene(Grid(GRID.crs, GRID.west, GRID.north, 1.0, 500, 250), 4, "urban", options)
+    for half, tile in ((slice(0, 250), GRID), (slice(250, 500), block(2)[1][1])):
+        part = make_scene(tile, 4, "urban", options)
+        # Depth of streams and edges of roads may differ by rounding of coordinates.
         assert np.mean(np.abs(part.reference - both.reference[:, half]) > 1e-6) < 1e-4
+        assert np.mean(np.abs(part.dtm - both.dtm[:, half]) > 1e-3) < 1e-3
         assert np.mean(part.reference_road != both.reference_road[:, half]) < 1e-4
         assert np.mean(part.road_mask != both.road_mask[:, half]) < 1e-4
+        crown = (part.kind == Kind.CROWN) | (both.kind[:, half] == Kind.CROWN)
+        for kind in (Kind.BUILDING, Kind.PARKED_CAR):
+            differs = (part.kind == kind) != (both.kind[:, half] == kind)
+            assert np.mean(differs & ~crown) < 1e-4
 
 
 def test_curb_raises_pavement_only():
@@ -195,10 +211,102 @@ def test_towers_overhang_and_storeys_change_roofs():
 
 
 def test_rails_and_wires_without_streets_are_empty():
-    from flexroad.tools.synthetic.population import rails, wires
-
     def unused(x, y):
         raise AssertionError("the ground is not needed")
 
     assert rails([], 0, unused, 1).size == wires([], 0, unused, 1).size == 0
-    assert generator(1, "a", 2).random() == generator(1, "a", 2).random()
+
+
+def plain(**options: float) -> Scene:
+    return made("quiet", stream_share=0, **options)
+
+
+def false_road(scene: Scene) -> np.ndarray:
+    return scene.road_mask & ~scene.reference_road
+
+
+def test_benchmark_false_road_is_coherent():
+    """Nearly all false cells lie in patches of more than 10 m2, as yards and strips do and noise does not."""
+    for _, grid, stratum, options in survey(3, 1):
+        scene = make_scene(grid, 1, stratum, options)
+        false = false_road(scene)
+        patches, count = label(false)
+        area = np.bincount(patches.ravel(), minlength=count + 1)[1:]
+        assert area[area > 10].sum() > 0.85 * false.sum()
+        scattered = np.random.default_rng(0).permutation(false.ravel()).reshape(false.shape)
+        sizes = np.bincount(label(scattered)[0].ravel())[1:]
+        assert sizes[sizes > 10].sum() < 0.3 * false.sum()
+
+
+def test_patches_mask_is_constant_on_them():
+    mask = plain(patch_m=2).road_mask
+    blocks = mask.reshape(125, 2, 125, 2)
+    assert (blocks == blocks[:, :1, :, :1]).all()
+    both = (mask & plain().road_mask).sum() / (mask | plain().road_mask).sum()
+    assert 0.85 < both < 1
+
+
+def test_perfect_mask_has_no_errors_of_any_kind():
+    options = {"patch_m": 2, "verge_m": 3, "yards": 3, "lean": 0.3, "facades": 1, "false_roofs": 1}
+    perfect = plain(mask_errors=0, **options)
+    assert np.array_equal(perfect.road_mask, perfect.reference_road)
+
+
+def test_verge_widens_mask_except_on_roofs_and_crowns():
+    narrow, wide = plain(), plain(verge_m=3, verge_share=1)
+    added = wide.road_mask & ~narrow.road_mask
+    away = distance_transform_edt(~wide.reference_road)
+    assert added.sum() > 0.3 * wide.reference_road.sum()
+    # An edge wobbles by 0.5 m (rms); distances are to cell centres.
+    assert np.percentile(away[added], 99) < 3 + 3 * 0.5
+    beside = (away > 1) & (away < 2) & np.isin(wide.kind, (Kind.GROUND, Kind.PAVED))
+    assert wide.road_mask[beside].mean() > 0.8
+    assert wide.road_mask[wide.kind == Kind.BUILDING].mean() < 0.02
+    off_road = (wide.kind == Kind.CROWN) & ~wide.reference_road
+    assert wide.road_mask[off_road].mean() < 0.1
+
+
+def test_verge_share_is_that_of_the_length():
+    none, half, whole = (plain(verge_m=3, verge_share=share).road_mask.sum() for share in (0, 0.5, 1))
+    assert none < half < whole
+    assert (half - none) / (whole - none) == pytest.approx(0.5, abs=0.2)
+
+
+def test_open_ground_is_all_but_roofs_and_crowns():
+    half, whole = plain(open_ground=0.5), plain(open_ground=1)
+    covered = np.isin(whole.kind, (Kind.BUILDING, Kind.CROWN)) & ~whole.reference_road
+    assert whole.road_mask[~covered].mean() > 0.97
+    assert whole.road_mask[covered].mean() < 0.15
+    assert 0.3 < false_road(half).sum() / false_road(whole).sum() < 0.7
+
+
+def test_yards_are_paved_and_partly_in_mask():
+    yards = plain(yards=3)
+    paved = yards.kind == Kind.PAVED
+    assert paved.sum() > 500
+    assert not (paved & yards.reference_road).any()
+    assert 0.4 < yards.road_mask[paved].mean() < 0.9
+
+
+def test_facades_are_false_road_on_roofs_where_they_lean():
+    upright, leaning, shown = (
+        plain(verge_m=2, lean=lean, facades=share) for lean, share in ((0, 1), (0.3, 0), (0.3, 1))
+    )
+    roof = upright.kind == Kind.BUILDING
+    assert np.array_equal(upright.dsm, shown.dsm)
+    assert max(false_road(scene)[roof].mean() for scene in (upright, leaning)) < 0.02
+    facade = shown.road_mask & ~leaning.road_mask
+    assert facade.sum() > 100
+    assert facade[roof].sum() > 0.8 * facade.sum()
+    # They are strips at the walls, as wide as roofs are displaced: 0.3 of the height or less.
+    inside = distance_transform_edt(roof)[facade & roof]
+    assert 1 < np.percentile(inside, 95) < 0.3 * 20
+
+
+def test_leaning_roof_hides_road_mask_beside_it():
+    upright, leaning = (plain(verge_m=4, verge_share=1, lean=lean) for lean in (0, 0.4))
+    hidden = upright.road_mask & ~leaning.road_mask
+    walls = distance_transform_edt(upright.kind != Kind.BUILDING)
+    assert hidden.sum() > 50
+    assert np.percentile(walls[hidden], 95) < 0.4 * np.sqrt(2) * 20
+    assert np.array_equal(upright.dsm, leaning.dsm)

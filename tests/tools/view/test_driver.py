@@ -93,11 +93,7 @@ def test_index_has_the_places_of_the_flags_of_finished_tiles(city, folder):
 
 
 def test_tile_script_has_surface_rasters_and_degrees_of_the_run(city, folder):
-    tile = next(
-        tile
-        for tile in Run.open(city).catalog.tiles
-        if tile.id in handed_over(folder / "run.js")[0]["tiles"]["id"]
-    )
+    tile = Run.open(city).catalog.tiles[0]
     tile_id, scene = handed_over(folder / "tiles" / f"{tile.id}.js")
     assert tile_id == tile.id
     grid = scene["grid"]
@@ -115,24 +111,15 @@ def test_tile_script_has_surface_rasters_and_degrees_of_the_run(city, folder):
 
 def test_pictures_are_of_the_finished_tiles(folder):
     (index,), (pictures,) = (handed_over(folder / name) for name in ("run.js", "pictures.js"))
-    done = [
-        tile
-        for tile, state in zip(*(index["tiles"][name] for name in ("id", "state")), strict=True)
-        if state == 1
-    ]
+    states = dict(zip(index["tiles"]["id"], index["tiles"]["state"], strict=True))
     assert index["pictures"]
-    assert sorted(pictures) == sorted(done)
+    assert sorted(pictures) == sorted(tile for tile, state in states.items() if state == viewer.DONE)
     assert all(base64.b64decode(text)[8:12] == b"WEBP" for text in pictures.values())
 
 
-def test_second_writing_changes_no_tile(city, folder):
-    before = {file: file.stat().st_mtime_ns for file in (folder / "tiles").iterdir()}
-    written = write_viewer(Run.open(city), folder, SerialExecutor())
-    assert (written.tiles, written.others, written.notes) == (2, 2, ())
-    assert {file: file.stat().st_mtime_ns for file in (folder / "tiles").iterdir()} == before
-
-
-def test_interrupted_writing_leaves_no_page(city, folder, tmp_path, monkeypatch):
+def test_interrupted_writing_leaves_no_page(city, tmp_path, monkeypatch):
+    """A folder with hidden files alone is taken."""
+    (tmp_path / ".DS_Store").write_bytes(b"x")
     write_viewer(Run.open(city), tmp_path, SerialExecutor())
     assert (tmp_path / PAGE).exists()
 
@@ -154,16 +141,11 @@ def test_folder_with_files_of_others_is_refused(city, tmp_path, name):
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "<h1>mine</h1>")]
 
 
-def test_folder_with_hidden_files_alone_is_taken(city, tmp_path):
-    (tmp_path / ".DS_Store").write_bytes(b"x")
-    write_viewer(Run.open(city), tmp_path, SerialExecutor())
-    assert (tmp_path / PAGE).exists()
-
-
-@pytest.mark.parametrize("inside", [".", "..", "tiles", "tiles/viewer", "store"])
-def test_folder_of_the_run_is_refused(city, inside):
+@pytest.mark.parametrize("inside", [".", "..", "tiles", "tiles/viewer", "store", "run.json"])
+def test_folder_of_the_run_and_file_are_refused(city, inside):
     before = sorted(city.rglob("*"))
-    with pytest.raises(ConfigError, match="choose another"):
+    message = "is a file; choose a folder with -o" if inside == "run.json" else "choose another"
+    with pytest.raises(ConfigError, match=message):
         write_viewer(Run.open(city), city / inside, SerialExecutor())
     assert sorted(city.rglob("*")) == before
 
@@ -179,22 +161,24 @@ def test_viewer_of_another_run_is_kept(city, tmp_path):
     assert (tmp_path / "page" / PAGE).stat().st_mtime_ns == before
 
 
-def test_output_that_is_a_file_is_refused(city, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="is a file; choose a folder with -o"):
-        write_viewer(Run.open(city), tmp_path / "file", SerialExecutor())
-
-
 def test_viewer_that_was_brought_up_to_date_equals_a_new_one(city, tmp_path):
     run = Run.open(city)
-    write_viewer(run, tmp_path / "old", SerialExecutor(), [run.catalog.tiles[1].id])
+    one, another = ([tile.id] for tile in run.catalog.tiles[:2])
+
+    def files(name):
+        return {file.name: file.read_bytes() for file in (tmp_path / name).rglob("*") if file.is_file()}
+
+    write_viewer(run, tmp_path / "old", SerialExecutor(), one)
     for name in ("old", "new"):
         write_viewer(run, tmp_path / name, SerialExecutor())
-    old, new = (
-        {file.name: file.read_bytes() for file in (tmp_path / name).rglob("*") if file.is_file()}
-        for name in ("old", "new")
-    )
-    assert old == new
+    assert files("old") == files("new")
+    before = {file: file.stat().st_mtime_ns for file in (tmp_path / "old" / "tiles").iterdir()}
+    written = write_viewer(run, tmp_path / "old", SerialExecutor())
+    assert (written.tiles, written.others, written.notes) == (2, 2, ())
+    assert {file: file.stat().st_mtime_ns for file in (tmp_path / "old" / "tiles").iterdir()} == before
+    for name in ("old", "small"):
+        write_viewer(run, tmp_path / name, SerialExecutor(), another)
+    assert files("old") == files("small")
 
 
 def test_used_port_is_named(city, flexroad, tmp_path):
@@ -247,16 +231,6 @@ def test_changed_photo_changes_the_script_of_its_tile_alone(city, tmp_path):
         os.utime(file, ns=(kept[1], kept[1]))
     changed = [script.read_bytes() != old for script, old in zip(scripts, before, strict=True)]
     assert changed == [True, False]
-
-
-def test_smaller_selection_removes_the_scripts_of_the_others(city, tmp_path):
-    run = Run.open(city)
-    write_viewer(run, tmp_path, SerialExecutor())
-    assert len(list((tmp_path / "tiles").iterdir())) == 2
-    chosen = run.catalog.tiles[0].id
-    write_viewer(run, tmp_path, SerialExecutor(), [chosen])
-    assert [file.stem for file in (tmp_path / "tiles").iterdir()] == [chosen]
-    assert handed_over(tmp_path / "run.js")[0]["tiles"]["id"] == [chosen]
 
 
 def test_command_writes_into_the_run_and_names_the_page(city, flexroad):

@@ -92,25 +92,33 @@ def pixel_of(box, easting, northing):
     return [x, box["height"] / 2 - (northing - box["northing"]) * box["scale"]]
 
 
-def test_click_on_the_map_opens_the_tile_and_its_neighbours_and_escape_returns(run, page):
+def test_click_on_the_map_opens_the_tile_and_its_neighbours_and_back_and_escape_return(run, page):
     (box,) = browse(page, {"eval": f"{INSPECT}.box"})
     tile = run.catalog.tiles[0]
     west, south, east, north = tile.grid.bounds
-    place = pixel_of(box, (west + east) / 2, (south + north) / 2)
-    before, _, _, opened, link, _, after = browse(
+    results = browse(
         page,
         {"eval": INSPECT},
-        {"click": place},
+        {"click": pixel_of(box, (west + east) / 2, (south + north) / 2)},
         {"wait": "() => FLEXROAD.inspect().loaded.length === 3"},
         {"eval": INSPECT},
         {"eval": "location.hash"},
+        {"key": "ArrowUp"},
+        {"key": "ArrowUp"},
+        {"eval": "history.back()"},
+        {"wait": f"() => {INSPECT}.view === 'map'"},
+        {"eval": "history.forward()"},
+        {"wait": f"() => {INSPECT}.view === 'tile'"},
+        {"eval": f"{INSPECT}.tile"},
         {"key": "Escape"},
         {"eval": INSPECT},
     )
+    before, opened, link, again, after = (results[step] for step in (0, 3, 4, 11, 13))
     assert (before["view"], before["loaded"]) == ("map", [])
     assert (opened["view"], opened["tile"]) == ("tile", tile.id)
     assert set(opened["loaded"]) == {tile.id for tile in run.catalog.tiles[:3]}
     assert f"tile={tile.id}" in link
+    assert again == tile.id
     assert (after["view"], after["loaded"]) == ("map", [])
 
 
@@ -259,24 +267,28 @@ def test_drive_moves_the_camera_along_the_road_just_above_it(run, page):
     assert (after["view"], after["driving"]) == ("tile", False)
 
 
-def test_phone_shows_settings_and_readout_by_taps(run, page):
+def test_phone_shows_settings_and_readout_by_taps_and_closes_the_settings_for_a_section(run, page):
+    display = {"eval": "getComputedStyle(document.getElementById('panel-content')).display"}
     results = browse(
         page,
         {"wait": SETTLED},
-        {"eval": "getComputedStyle(document.getElementById('panel-content')).display"},
+        display,
         {"tap": [195, 420]},
         {"eval": READOUT},
         {"press": "#panel-toggle"},
-        {"eval": "getComputedStyle(document.getElementById('panel-content')).display"},
+        display,
         {"eval": "document.documentElement.scrollWidth"},
+        {"press": "#panel-content button[data-tool=measure]"},
+        display,
+        {"eval": "document.getElementById('hint').textContent"},
         fragment=f"#tile={run.catalog.tiles[0].id}",
         width=390,
         height=844,
     )
     assert results[1] == "none"
     assert results[3]["tile"]
-    assert results[5] == "block"
-    assert results[6] == 390
+    assert results[5:7] == ["block", 390]
+    assert results[8:] == ["none", "Choose where the section begins."]
 
 
 def test_phone_zooms_by_two_fingers_on_the_map_and_in_a_tile(run, page):
@@ -304,24 +316,6 @@ def test_first_view_has_the_whole_tile_beside_the_settings(run, page, width, hei
     assert (seen["free"] < width) == (width > 900)
     spans = np.ptp(np.array(seen["corners"]), axis=0) / [seen["free"], height]
     assert spans.max() > 0.5
-
-
-def test_back_and_forward_lead_from_the_tile_to_the_map_and_again_to_the_tile(run, page):
-    (box,) = browse(page, {"eval": f"{INSPECT}.box"})
-    west, south, east, north = run.catalog.tiles[0].grid.bounds
-    results = browse(
-        page,
-        {"click": pixel_of(box, (west + east) / 2, (south + north) / 2)},
-        {"wait": SETTLED},
-        {"key": "ArrowUp"},
-        {"key": "ArrowUp"},
-        {"eval": "history.back()"},
-        {"wait": f"() => {INSPECT}.view === 'map'"},
-        {"eval": "history.forward()"},
-        {"wait": f"() => {INSPECT}.view === 'tile'"},
-        {"eval": f"{INSPECT}.tile"},
-    )
-    assert results[-1] == run.catalog.tiles[0].id
 
 
 @pytest.fixture(scope="module")
@@ -390,47 +384,26 @@ def test_outline_of_the_tile_lies_on_the_surface_and_goes_with_the_tile(flagged)
     np.testing.assert_allclose(z, finished.surface.height(x, y), rtol=0, atol=viewer.STEP_M)
 
 
-def test_unknown_tile_in_the_address_is_named(run, page):
-    _, text, view = browse(
-        page,
-        {"wait": "() => window.FLEXROAD.inspect"},
-        {"eval": "document.getElementById('panel-content').textContent"},
-        {"eval": f"{INSPECT}.view"},
-        fragment="#tile=nope",
-    )
-    assert "This run has no tile nope." in text
-    assert view == "map"
-
-
-def test_enter_opens_the_first_tile_that_is_found(run, page):
+def test_unknown_tile_in_the_address_is_named_and_enter_opens_the_first_tile_that_is_found(run, page):
     search = "#panel-content input[type=search]"
     typed = (
         f"(e => {{ e.value = '_'; e.dispatchEvent(new Event('input')) }})(document.querySelector('{search}'))"
     )
-    opened = browse(
+    _, text, view, *_, opened = browse(
         page,
+        {"wait": "() => window.FLEXROAD.inspect"},
+        {"eval": "document.getElementById('panel-content').textContent"},
+        {"eval": f"{INSPECT}.view"},
         {"eval": typed},
         {"focus": search},
         {"key": "Enter"},
         {"wait": SETTLED},
         {"eval": f"{INSPECT}.tile"},
-    )[-1]
-    assert opened == run.catalog.tiles[0].id
-
-
-def test_phone_closes_the_settings_while_a_section_is_made(run, page):
-    results = browse(
-        page,
-        {"wait": SETTLED},
-        {"press": "#panel-toggle"},
-        {"press": "#panel-content button[data-tool=measure]"},
-        {"eval": "getComputedStyle(document.getElementById('panel-content')).display"},
-        {"eval": "document.getElementById('hint').textContent"},
-        fragment=f"#tile={run.catalog.tiles[0].id}",
-        width=390,
-        height=844,
+        fragment="#tile=nope",
     )
-    assert results[3:] == ["none", "Choose where the section begins."]
+    assert "This run has no tile nope." in text
+    assert view == "map"
+    assert opened == run.catalog.tiles[0].id
 
 
 def test_ten_thousand_tiles_are_drawn_and_coloured_by_a_measure(tmp_path):

@@ -1,6 +1,7 @@
 """Meshes are read without loss; invalid files are an error of one line."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -190,146 +191,88 @@ def test_read_mesh_prj_gives_only_the_crs(tmp_path, texture):
         read_mesh(path)
 
 
-def no_crs(folder, texture):
-    return write_obj(folder, texture), {}
+def bare_glb(folder, texture):
+    mesh = textured(texture)
+    mesh.vertices = CORNERS[:, [0, 2, 1]] * (1, 1, -1)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=UV, material=trimesh.visual.material.PBRMaterial())
+    (folder / "m.glb").write_bytes(trimesh.Scene(mesh).export(file_type="glb"))
+    return folder / "m.glb"
 
 
-def no_offset(folder, texture):
-    return write_obj(folder, texture), {"crs": CRS}
+def obj(**options):
+    return lambda folder, texture: write_obj(folder, texture, **options)
 
 
-def wrong_crs(folder, texture):
-    return write_obj(folder, texture), {"crs": "EPSG:nothing", "offset": ZERO}
-
-
-def sidecar_without_zone(folder, texture):
-    (folder / "data_meta.json").write_text('{"reference_utm": {"offset": [1, 2, 3]}}')
-    return write_obj(folder, texture), {}
-
-
-def sidecar_without_offset(folder, texture):
-    (folder / "coords.txt").write_text("WGS84 UTM 17N\n")
-    return write_obj(folder, texture), {}
-
-
-def sidecar_of_a_tangent_plane(folder, texture):
-    (folder / "metadata.xml").write_text(MODEL_METADATA.format("ENU:37.2,-80.4", "0,0,0"))
-    return write_obj(folder, texture), {}
-
-
-def sidecar_with_half_an_origin(folder, texture):
-    (folder / "metadata.xml").write_text(MODEL_METADATA.format("EPSG:32617", "552208,4114742"))
-    return write_obj(folder, texture), {}
-
-
-def no_texture(folder, texture):
-    path = write_obj(folder, texture)
-    (folder / "m.png").unlink()
-    return path, PLACED
-
-
-def no_texture_of_ply(folder, texture):
-    path = write_ply(folder, texture)
-    (folder / "m.png").unlink()
-    return path, PLACED
-
-
-def broken_texture(folder, texture):
-    path = write_obj(folder, texture)
-    (folder / "m.png").write_bytes((folder / "m.png").read_bytes()[:200])
-    return path, PLACED
-
-
-def no_materials(folder, texture):
-    path = write_obj(folder, texture)
-    (folder / "m.mtl").unlink()
-    return path, PLACED
-
-
-def no_uv(folder, texture):
-    return write_obj(folder, texture, "usemtl m\nf 1 2 3\nf 1 3 4\n"), PLACED
-
-
-def no_colours(folder, texture):
-    return write_obj(folder, texture, head="", faces="f 1 2 3\nf 1 3 4\n"), PLACED
-
-
-def no_texture_in_glb(folder, texture):
-    path = folder / "m.glb"
-    bare = textured(texture)
-    bare.vertices = CORNERS[:, [0, 2, 1]] * (1, 1, -1)
-    bare.visual = trimesh.visual.TextureVisuals(uv=UV, material=trimesh.visual.material.PBRMaterial())
-    path.write_bytes(trimesh.Scene(bare).export(file_type="glb"))
-    return path, PLACED
-
-
-def no_faces(folder, texture):
-    return write_obj(folder, texture, ""), PLACED
-
-
-def no_area(folder, texture):
-    return write_obj(folder, texture, "usemtl m\nf 1/1 2/2 2/2\n"), PLACED
-
-
-def no_numbers(folder, texture):
-    path = write_obj(folder, texture)
-    path.write_text(path.read_text().replace("601", "nan"))
-    return path, PLACED
-
-
-def cut_short(folder, texture):
-    path = write_glb(folder, texture)
+def cut_short(path):
     path.write_bytes(path.read_bytes()[:300])
-    return path, PLACED
 
 
-def missing(folder, texture):
-    return folder / "gone.obj", PLACED
+GONE = Path.unlink
+BARE_FACES = "f 1 2 3\nf 1 3 4\n"
+NO_COLOURS = [
+    (write_obj, {"m.png": GONE}, "m.obj needs the texture .*m.png, which does not exist.*--no-dop"),
+    (write_ply, {"m.png": GONE}, "m.ply needs the texture .*m.png, which does not exist.*--no-dop"),
+    (write_obj, {"m.png": cut_short}, "the texture .*m.png of .*m.obj cannot be read"),
+    (write_obj, {"m.mtl": GONE}, "m.obj needs the material file m.mtl, which is not beside it.*--no-dop"),
+    (obj(faces="usemtl m\n" + BARE_FACES), {}, "m.obj has a texture but no texture coordinates.*--no-dop"),
+    (obj(head="", faces=BARE_FACES), {}, "m.obj has no colours.*--no-dop"),
+]
+"""Meshes that can be read without colours: how they are written, what is done to a file, and the error."""
+SIDECAR_FAULTS = [
+    ("data_meta.json", '{"reference_utm": {"offset": [1, 2, 3]}}', " has no reference_utm"),
+    ("coords.txt", "WGS84 UTM 17N\n", " has no CRS in its first line and an offset"),
+    (
+        "metadata.xml",
+        MODEL_METADATA.format("ENU:37.2,-80.4", "0,0,0"),
+        " has no SRS like .*ENU:37.2,-80.4.*--crs and --offset",
+    ),
+    (
+        "metadata.xml",
+        MODEL_METADATA.format("EPSG:32617", "552208,4114742"),
+        " has no SRS like .* with an SRSOrigin of three numbers",
+    ),
+]
+NO_NUMBER = obj(head="mtllib m.mtl\nv nan 0 0\n", faces="usemtl m\nf 1/1 2/2 3/3\n")
+BAD = [
+    *((write, changes, PLACED, message) for write, changes, message in NO_COLOURS),
+    *((write_obj, {name: text}, {}, name + message) for name, text, message in SIDECAR_FAULTS),
+    (bare_glb, {}, PLACED, "m.glb has no colours"),
+    (write_obj, {}, {}, "m.obj has no georeference.*--crs EPSG:.*--offset"),
+    (write_obj, {}, {"crs": CRS}, "m.obj has no georeference"),
+    (write_obj, {}, {"crs": "EPSG:nothing", "offset": ZERO}, "m.obj: unknown CRS 'EPSG:nothing'"),
+    (obj(faces=""), {}, PLACED, "m.obj has no faces"),
+    (obj(faces="usemtl m\nf 1/1 2/2 2/2\n"), {}, PLACED, "m.obj has faces but no area"),
+    (NO_NUMBER, {}, PLACED, "m.obj has faces with missing or non-finite corners"),
+    (write_glb, {"m.glb": cut_short}, PLACED, "m.glb cannot be read as a mesh"),
+    (lambda folder, _: folder / "gone.obj", {}, PLACED, "gone.obj does not exist"),
+    (lambda folder, _: folder / "m.fbx", {"m.fbx": "x"}, PLACED, "m.fbx is not a mesh of a supported format"),
+]
 
 
-def other_format(folder, texture):
-    (folder / "m.fbx").write_bytes(b"Kaydara")
-    return folder / "m.fbx", PLACED
+def written(write, changes, folder, texture):
+    """Write a mesh; then write texts to files of its folder, or change them."""
+    path = write(folder, texture)
+    for name, change in changes.items():
+        if isinstance(change, str):
+            (folder / name).write_text(change)
+        else:
+            change(folder / name)
+    return path
 
 
-BAD = {
-    no_crs: "m.obj has no georeference.*--crs EPSG:.*--offset",
-    no_offset: "m.obj has no georeference",
-    wrong_crs: "m.obj: unknown CRS 'EPSG:nothing'",
-    sidecar_without_zone: "data_meta.json has no reference_utm",
-    sidecar_without_offset: "coords.txt has no CRS in its first line and an offset",
-    sidecar_of_a_tangent_plane: "metadata.xml has no SRS like .*ENU:37.2,-80.4.*--crs and --offset",
-    sidecar_with_half_an_origin: "metadata.xml has no SRS like .* with an SRSOrigin of three numbers",
-    no_texture: "m.obj needs the texture .*m.png, which does not exist.*--no-dop",
-    no_texture_of_ply: "m.ply needs the texture .*m.png, which does not exist.*--no-dop",
-    broken_texture: "the texture .*m.png of .*m.obj cannot be read",
-    no_materials: "m.obj needs the material file m.mtl, which is not beside it.*--no-dop",
-    no_uv: "m.obj has a texture but no texture coordinates.*--no-dop",
-    no_colours: "m.obj has no colours.*--no-dop",
-    no_texture_in_glb: "m.glb has no colours",
-    no_faces: "m.obj has no faces",
-    no_area: "m.obj has faces but no area",
-    no_numbers: "m.obj has faces with missing or non-finite corners",
-    cut_short: "m.glb cannot be read as a mesh",
-    missing: "gone.obj does not exist",
-    other_format: "m.fbx is not a mesh of a supported format",
-}
-
-
-@pytest.mark.parametrize("case", BAD, ids=lambda case: case.__name__)
-def test_read_mesh_invalid_input_is_one_line_with_file_and_remedy(case, tmp_path, texture):
-    path, options = case(tmp_path, texture)
-    with pytest.raises(TaskError, match=BAD[case]) as caught:
+@pytest.mark.parametrize(("write", "changes", "options", "message"), BAD)
+def test_read_mesh_invalid_input_is_one_line_with_file_and_remedy(
+    write, changes, options, message, tmp_path, texture
+):
+    path = written(write, changes, tmp_path, texture)
+    with pytest.raises(TaskError, match=message) as caught:
         read_mesh(path, **options)
     assert "\n" not in str(caught.value)
     assert caught.value.file
 
 
-@pytest.mark.parametrize(
-    "case", [no_texture, no_texture_of_ply, broken_texture, no_materials, no_uv, no_colours]
-)
-def test_read_mesh_without_colours_ignores_missing_textures(case, tmp_path, texture):
-    path, options = case(tmp_path, texture)
-    mesh = read_mesh(path, **options, colours=False)
+@pytest.mark.parametrize(("write", "changes", "message"), NO_COLOURS)
+def test_read_mesh_without_colours_ignores_missing_textures(write, changes, message, tmp_path, texture):
+    mesh = read_mesh(written(write, changes, tmp_path, texture), **PLACED, colours=False)
     check_vertices(mesh)
     assert not mesh.coloured

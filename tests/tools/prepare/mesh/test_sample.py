@@ -1,5 +1,7 @@
 """Points and orthophotos of synthetic meshes have the true positions, heights and colours."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chisquare
@@ -57,10 +59,14 @@ def texture():
     return np.random.default_rng(1).integers(0, 256, (12, 16, 3), dtype=np.uint8)
 
 
-def test_orthophoto_has_each_texel_at_its_position(texture):
-    photo = orthophoto(textured(rectangle(0, 0, 16, 12, 100), texture), grid(16, 12))
+def test_orthophoto_has_each_texel_at_its_position_and_means_of_finer_textures(texture):
+    mesh = textured(rectangle(0, 0, 16, 12, 100), texture)
+    photo = orthophoto(mesh, grid(16, 12))
     assert photo.known.all()
     assert np.abs(np.moveaxis(photo.colour, 0, -1).astype(int) - texture).max() <= 1
+    mean = texture.reshape(6, 2, 8, 2, 3).mean(axis=(1, 3))
+    coarse = orthophoto(mesh, grid(8, 6, cell=2)).colour
+    assert np.abs(np.moveaxis(coarse, 0, -1) - mean).max() <= 1
 
 
 def test_orthophoto_outside_the_mesh_is_masked(texture):
@@ -69,12 +75,6 @@ def test_orthophoto_outside_the_mesh_is_masked(texture):
     valid[4:16, 2:18] = True
     assert np.array_equal(photo.known, valid)
     assert not photo.colour[:, ~valid].any()
-
-
-def test_orthophoto_averages_finer_texture(texture):
-    photo = orthophoto(textured(rectangle(0, 0, 16, 12, 100), texture), grid(8, 6, cell=2))
-    mean = texture.reshape(6, 2, 8, 2, 3).mean(axis=(1, 3))
-    assert np.abs(np.moveaxis(photo.colour, 0, -1) - mean).max() <= 1
 
 
 def test_orthophoto_in_many_bands_is_the_same(texture, monkeypatch):
@@ -113,41 +113,30 @@ def test_surface_heights_of_a_plane_are_exact():
     np.testing.assert_allclose(heights, truth, atol=1e-8)
 
 
-def test_covered_cells_have_no_gap_at_edges_of_triangles():
-    """A fan of thin triangles whose edges cross many cell centres."""
+def test_covered_cells_are_those_with_centre_in_a_face_without_gaps_at_edges():
+    """Two rectangles; a fan of thin triangles whose edges cross many cell centres."""
+    mesh = plain((rectangle(2, 3, 6.4, 8, 0), RED), (rectangle(5, 0, 9.6, 4, 50), RED))
+    truth = np.zeros((10, 10), bool)
+    truth[2:7, 2:6] = truth[6:10, 5:10] = True
+    assert np.array_equal(project_down(mesh, grid(10, 10))[1] >= 0, truth)
     angles = np.linspace(0, 2 * np.pi, 721)[:-1]
     rim = np.column_stack([EAST + 10.5 + 15 * np.cos(angles), NORTH + 10.5 + 15 * np.sin(angles)])
     vertices = np.column_stack([np.vstack([[EAST + 10.5, NORTH + 10.5], rim]), np.full(721, 5.0)])
     around = np.arange(720)
     faces = np.column_stack([np.zeros(720, int), around + 1, (around + 1) % 720 + 1]).astype(np.int32)
-    mesh = TexturedMesh(CRS, vertices, faces, np.full(720, -1, np.int32))
-    assert (project_down(mesh, grid(21, 21, cell=1))[1] >= 0).all()
+    fan = TexturedMesh(CRS, vertices, faces, np.full(720, -1, np.int32))
+    assert (project_down(fan, grid(21, 21, cell=1))[1] >= 0).all()
+    assert all_points(fan, 10, 0).colour is None
 
 
 def test_orthophoto_of_inside_out_or_non_manifold_mesh_is_the_same(texture):
     mesh = textured(rectangle(0, 0, 16, 12, 100), texture)
-    reversed_ = TexturedMesh(
-        CRS, mesh.vertices, mesh.faces[:, ::-1].copy(), mesh.texture, mesh.textures, mesh.uv[:, ::-1]
-    )
-    repeated = TexturedMesh(
-        CRS,
-        mesh.vertices,
-        np.tile(mesh.faces, (3, 1)),
-        np.tile(mesh.texture, 3),
-        mesh.textures,
-        np.tile(mesh.uv, (3, 1, 1)),
-    )
+    reversed_ = replace(mesh, faces=mesh.faces[:, ::-1].copy(), uv=mesh.uv[:, ::-1])
+    three_times = {name: np.concatenate([getattr(mesh, name)] * 3) for name in ("faces", "texture", "uv")}
     expected = orthophoto(mesh, grid(16, 12))
-    for other in (reversed_, repeated):
+    for other in (reversed_, replace(mesh, **three_times)):
         assert np.array_equal(orthophoto(other, grid(16, 12)).colour, expected.colour)
         assert np.array_equal(project_down(other, grid(16, 12))[0], project_down(mesh, grid(16, 12))[0])
-
-
-def test_covered_cells_are_those_with_centre_in_a_face():
-    mesh = plain((rectangle(2, 3, 6.4, 8, 0), RED), (rectangle(5, 0, 9.6, 4, 50), RED))
-    truth = np.zeros((10, 10), bool)
-    truth[2:7, 2:6] = truth[6:10, 5:10] = True
-    assert np.array_equal(project_down(mesh, grid(10, 10))[1] >= 0, truth)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -187,22 +176,12 @@ def test_sample_points_have_colour_and_height_of_the_surface(texture):
     assert np.abs(points.colour[inside].astype(int) - truth).max() <= 1
 
 
-def test_sample_in_many_chunks_gives_the_same_points(monkeypatch, texture):
+def test_sample_in_many_chunks_gives_the_same_points_and_another_seed_others(monkeypatch, texture):
     mesh = textured(rectangle(0, 0, 16, 12, 100), texture)
     whole = all_points(mesh, 10, 7)
+    assert not np.array_equal(whole.easting, all_points(mesh, 10, 1).easting)
     monkeypatch.setattr(sample_module, "CHUNK", 128)
     parts = list(sample(mesh, 10, 7))
     assert len(parts) == 15
     for name in ("easting", "northing", "height", "colour"):
         assert np.array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name))
-
-
-def test_sample_other_seed_gives_other_points(texture):
-    mesh = textured(rectangle(0, 0, 16, 12, 100), texture)
-    assert not np.array_equal(all_points(mesh, 10, 0).easting, all_points(mesh, 10, 1).easting)
-
-
-def test_without_colours_points_have_none():
-    points, faces = rectangle(0, 0, 3, 3, 0)
-    bare = TexturedMesh(CRS, points, faces.astype(np.int32), np.full(2, -1, np.int32))
-    assert all_points(bare, 10, 0).colour is None

@@ -81,13 +81,8 @@ def test_read_shot_position_is_right_in_all_hemispheres(longitude, latitude):
         ({}, (3, 5), "above mean sea level as the drone takes it"),
         ({"RtkFlag": 50}, (0.03, 0.06), "above mean sea level as the drone takes it"),
         (
-            {
-                "RtkFlag": 50,
-                "RtkStdLon": 0.011,
-                "RtkStdLat": 0.012,
-                "RtkStdHgt": 0.025,
-                "AltitudeType": "RtkAlt",
-            },
+            {"RtkFlag": 50, "AltitudeType": "RtkAlt"}
+            | {"RtkStdLon": 0.011, "RtkStdLat": 0.012, "RtkStdHgt": 0.025},
             (0.012, 0.025),
             "above the WGS 84 ellipsoid",
         ),
@@ -100,11 +95,6 @@ def test_read_shot_prefers_position_in_xmp(tmp_path, dji, accuracy, heights):
     assert (shot.latitude, shot.longitude, shot.altitude) == (50.9962, 7.8603, 151.2)
     assert shot.accuracy == accuracy
     assert heights in (None, shot.heights)
-
-
-def test_read_shot_xmp_altitude_alone_keeps_exif_position(tmp_path):
-    shot = read_shot(write(tmp_path / "a.jpg", make_photos.exif(CENTRE), AbsoluteAltitude="+151.20"))
-    assert shot.altitude == 140.0
 
 
 @pytest.mark.parametrize(
@@ -126,41 +116,48 @@ def test_read_shot_focal_length_is_in_pixels(tmp_path, size, film_mm, dji, focal
     assert read_shot(path).focal_px == pytest.approx(focal)
 
 
-def test_read_shot_without_position_is_an_error(tmp_path):
-    path = write(tmp_path / "indoors.jpg")
-    with pytest.raises(TaskError, match=r"indoors\.jpg has no GNSS position.*leave it out"):
-        read_shot(path)
+PLACE = {"GpsLongitude": "8", "GpsLatitude": "50", "AbsoluteAltitude": "100"}
 
 
-def test_read_shot_receiver_without_fix_is_an_error(tmp_path):
+@pytest.mark.parametrize(
+    ("dji", "message"),
+    [
+        ({}, "has no GNSS position.*leave it out"),
+        (PLACE | {"AbsoluteAltitude": "1e300"}, "has no GNSS position"),
+        (
+            PLACE | {"RtkStdLon": "x", "RtkStdLat": "1", "RtkStdHgt": "1"},
+            "numbers that cannot be read; leave",
+        ),
+        (PLACE | {"RtkFlag": "1e3"}, "numbers that cannot be read; leave it out"),
+        (PLACE | {"CalibratedFocalLength": "3000 px"}, "numbers that cannot be read; leave it out"),
+    ],
+)
+def test_read_shot_tags_that_cannot_be_used_are_an_error(tmp_path, dji, message):
+    with pytest.raises(TaskError, match=rf"indoors\.jpg.* {message}"):
+        read_shot(write(tmp_path / "indoors.jpg", **dji))
+
+
+def test_read_shot_without_a_fix_and_truncated_file_are_errors(tmp_path):
     tags = make_photos.exif(CENTRE)
+    path = write(tmp_path / "cut.jpg", tags, (640, 480))
+    path.write_bytes(path.read_bytes()[:-1500])
+    with pytest.raises(TaskError, match=r"cut\.jpg cannot be read as a photograph"):
+        read_shot(path)
     gps = tags.get_ifd(ExifTags.IFD.GPSInfo)
     gps[ExifTags.GPS.GPSLongitude] = gps[ExifTags.GPS.GPSLatitude] = (0, 0, 0)
     with pytest.raises(TaskError, match="no GNSS position"):
         read_shot(write(tmp_path / "a.jpg", tags))
 
 
-def test_read_shot_truncated_file_is_an_error(tmp_path):
-    path = write(tmp_path / "cut.jpg", make_photos.exif(CENTRE), (640, 480))
-    path.write_bytes(path.read_bytes()[:-1500])
-    with pytest.raises(TaskError, match=r"cut\.jpg cannot be read as a photograph"):
-        read_shot(path)
-
-
-def test_place_photos_two_photographs_are_an_error(three):
-    with pytest.raises(TaskError, match="2 photographs are too few"):
-        place_photos(three[:2])
-
-
-def test_place_photos_two_places_are_an_error(three, tmp_path):
+def test_place_photos_that_cannot_be_placed_are_an_error(three, tmp_path):
     far = read_shot(write(tmp_path / "far.jpg", make_photos.exif(CENTRE, offset=(3000, 0, 0))))
-    with pytest.raises(TaskError, match=r"2 places more than 1000 m apart.*far\.jpg"):
-        place_photos([*three, far])
-
-
-def test_place_photos_to_crs_in_degrees_is_an_error(three):
-    with pytest.raises(TaskError, match="is in degree"):
-        place_photos(three, "EPSG:4326")
+    for shots, crs, message in (
+        (three[:2], None, "2 photographs are too few"),
+        ([*three, far], None, r"2 places more than 1000 m apart.*far\.jpg"),
+        (three, "EPSG:4326", "is in degree"),
+    ):
+        with pytest.raises(TaskError, match=message):
+            place_photos(shots, crs)
 
 
 def test_read_control_groups_by_name_and_transforms(three, tmp_path):
@@ -204,27 +201,12 @@ def test_opencv_has_the_same_limit():
     assert int(done.stdout) == images.MOST_PIXELS == 400_000_000
 
 
-@pytest.mark.parametrize(
-    "tags",
-    [
-        {"RtkStdLon": "x", "RtkStdLat": "1", "RtkStdHgt": "1"},
-        {"RtkFlag": "1e3"},
-        {"CalibratedFocalLength": "3000 px"},
-    ],
-)
-def test_read_shot_tag_that_is_no_number_is_an_error(tmp_path, tags):
-    place = {"GpsLongitude": "8", "GpsLatitude": "50", "AbsoluteAltitude": "100"}
-    with pytest.raises(TaskError, match="numbers that cannot be read; leave it out"):
-        read_shot(write(tmp_path / "a.jpg", **place, **tags))
-
-
-def test_read_shot_extreme_numbers_are_not_used(tmp_path):
-    place = {"GpsLongitude": "8", "GpsLatitude": "50", "AbsoluteAltitude": "100"}
+def test_read_shot_extreme_numbers_and_an_altitude_alone_are_not_used(tmp_path):
     odd = {"RtkStdLon": "inf", "RtkStdLat": "1", "RtkStdHgt": "1", "CalibratedFocalLength": "1e300"}
-    shot = read_shot(write(tmp_path / "a.jpg", **place, **odd))
+    shot = read_shot(write(tmp_path / "a.jpg", **PLACE, **odd))
     assert (shot.accuracy, shot.focal_px) == ((3, 5), None)
-    with pytest.raises(TaskError, match="has no GNSS position"):
-        read_shot(write(tmp_path / "b.jpg", **place | {"AbsoluteAltitude": "1e300"}))
+    shot = read_shot(write(tmp_path / "b.jpg", make_photos.exif(CENTRE), AbsoluteAltitude="+151.20"))
+    assert shot.altitude == 140.0
 
 
 @pytest.mark.slow

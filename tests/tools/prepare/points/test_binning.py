@@ -1,9 +1,9 @@
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tools.prepare.points.binning import bins, highest, means, spikes, top_layer
+from flexroad.tools.prepare.points.binning import Points, bins, highest, means, photo, spikes, top_layer
 from tests.make_clouds import Top
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 7, 5)
@@ -108,3 +108,27 @@ def test_top_layer_of_noisy_slope_is_unbiased_and_the_highest_point_is_not():
     cells = bins(grid.west + x, grid.north - y, grid)
     assert abs(np.nanmean(layer.height - truth)) < 0.002
     assert np.nanmean(highest(cells, height, grid.shape) - truth) > 1.5 * noise
+
+
+COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 0, 1)]
+cells_around = st.tuples(st.integers(-3, GRID.width + 2), st.integers(-3, GRID.height + 2))
+coloured = st.lists(st.tuples(cells_around, st.integers(0, 2), st.sampled_from(COLOURS)), max_size=25)
+
+
+@given(coloured, st.sampled_from([0, 1, 2, 3]))
+@settings(max_examples=60)
+def test_photo_matches_definition(cloud, pixels):
+    col, row = np.array([place for place, _, _ in cloud], float).reshape(-1, 2).T
+    z, colour = np.array([z for _, z, _ in cloud], float), np.array([c for *_, c in cloud], np.uint8)
+    kind = np.zeros(len(z), np.uint8)
+    points = Points(GRID.west + (col + 0.5) / 2, GRID.north - (row + 0.5) / 2, z, kind, colour.reshape(-1, 3))
+    tops = {}
+    for place, z, colour in cloud:
+        tops[place] = max(tops.get(place, (-1, ())), (z, colour))
+    result = photo(points, GRID, pixels * GRID.cell)
+    for row, col in np.ndindex(GRID.shape):
+        near = [((r - row) ** 2 + (c - col) ** 2, r, c) for c, r in tops]
+        distance, r, c = min(near, default=(np.inf, 0, 0))
+        known = distance <= pixels**2
+        assert result.known[row, col] == known
+        assert tuple(result.colour[:, row, col]) == (tops[c, r][1] if known else (0, 0, 0))

@@ -3,7 +3,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexroad.tasks import TaskError
 from flexroad.tools.prepare.points.ground_filter import Options, ground, ground_cells
 from tests.tools.prepare.points import ground_oracle as oracle
 
@@ -32,7 +31,7 @@ def check_equals_oracle(cloud, options):
 
 
 @given(clouds, rules)
-@settings(max_examples=300)
+@settings(max_examples=150)
 def test_ground_equals_comparison_of_all_pairs(points, options):
     check_equals_oracle(points.T, options)
 
@@ -110,12 +109,7 @@ def test_ground_does_not_depend_on_rotation_shift_or_order(options):
     np.testing.assert_array_equal(ground(x[order], y[order], z[order], options), expected[order])
 
 
-def test_ground_level_plane_is_all_ground():
-    x, y = lattice()
-    assert ground(x, y, np.zeros_like(x), EXACT).all()
-
-
-@pytest.mark.parametrize(("fall", "kept"), [(0.25, True), (0.2501, False)])
+@pytest.mark.parametrize(("fall", "kept"), [(0.0, True), (0.25, True), (0.2501, False)])
 def test_ground_plane_is_ground_up_to_slope_limit(fall, kept):
     x, y = lattice()
     is_ground = ground(x, y, fall * x, EXACT.model_copy(update={"slope": 0.25}))
@@ -167,16 +161,6 @@ def test_ground_cells_equals_ground_of_cell_centres():
     assert not is_ground[np.isnan(surface)].any()
 
 
-def test_ground_without_valid_points_is_empty():
-    assert ground(*np.zeros((3, 0)), Options()).shape == (0,)
-    assert not ground_cells(np.full((3, 4), np.nan), 1.0, Options()).any()
-
-
 def test_ground_points_far_apart_need_few_buckets():
     x = np.array([0.0, 1.0, 3e8, 3e8 + 1])
     assert ground(x, x, np.array([0.0, 5.0, 0.0, 0.0]), EXACT).tolist() == [True, False, True, True]
-
-
-def test_ground_arrays_of_different_lengths_are_an_error():
-    with pytest.raises(TaskError, match=r"\(3,\), \(3,\) and \(2,\)"):
-        ground(np.zeros(3), np.zeros(3), np.zeros(2), Options())

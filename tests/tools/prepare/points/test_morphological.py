@@ -104,11 +104,11 @@ def test_ground_depends_on_near_points_alone_in_any_order():
     assert 0 < expected.sum() < expected.size
 
 
-def test_ground_without_valid_points_is_empty():
-    assert ground(*np.zeros((3, 0)), Options()).shape == (0,)
-    assert not ground(np.zeros(3), np.zeros(3), np.array([np.nan, np.inf, -np.inf]), Options()).any()
-
-
-def test_ground_arrays_of_different_lengths_are_an_error():
-    with pytest.raises(TaskError, match="must have the same length"):
-        ground(np.zeros(2), np.zeros(2), np.zeros(3), Options())
+@pytest.mark.parametrize(
+    ("filter_", "options"), [(ground, Options()), (ground_filter.ground, ground_filter.Options())]
+)
+def test_ground_of_both_filters_is_empty_without_valid_points_and_needs_equal_lengths(filter_, options):
+    assert filter_(*np.zeros((3, 0)), options).shape == (0,)
+    assert not filter_(np.zeros(3), np.zeros(3), np.array([np.nan, np.inf, -np.inf]), options).any()
+    with pytest.raises(TaskError, match=r"\(3,\), \(3,\) and \(2,\)"):
+        filter_(np.zeros(3), np.zeros(3), np.zeros(2), options)
