@@ -52,7 +52,7 @@ from flexroad.catalog.storage.paths import (
     write,
 )
 from flexroad.catalog.trust import AllowedFolders
-from flexroad.pipeline.config.loading import compose, load_config, read_mapping
+from flexroad.pipeline.config.loading import compose, read_mapping
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.config.stages import STAGE_NAMES, model_files
 from flexroad.pipeline.errors import ConfigError
@@ -362,8 +362,6 @@ def _config(path: Location) -> Config:
         raise ConfigError(f"{path} is empty, as after a power failure; `flexroad run` writes it again")
     if file is None and exists(path):
         raise ConfigError(f"{path} is not a regular file; `flexroad run` writes it again")
-    if isinstance(path, Path):
-        return load_config(path)
     return compose(read_mapping(read(path), str(path)), str(path))
 
 
