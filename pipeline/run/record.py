@@ -360,8 +360,9 @@ def _config(path: Location) -> Config:
     if file is not None and not file.size:
         # An empty file would be valid: a configuration with all defaults.
         raise ConfigError(f"{path} is empty, as after a power failure; `flexroad run` writes it again")
-    if file is None and exists(path):
-        raise ConfigError(f"{path} is not a regular file; `flexroad run` writes it again")
+    if file is None:
+        fault = "is not a regular file" if exists(path) else "is no configuration: it is missing"
+        raise ConfigError(f"{path} {fault}; `flexroad run` writes it again")
     return compose(read_mapping(read(path), str(path)), str(path))
 
 

@@ -180,7 +180,7 @@ DAMAGES = {
     "metrics empty": Damage(written("metrics.parquet", "")),
     "record without content": Damage(written("run.json", "{}"), NO_RUN),
     "configuration wrong": Damage(written("config.yaml", "fit: {degre: 3}"), "fit.degre: unknown key"),
-    "configuration lost": Damage(removed("config.yaml"), "no configuration"),
+    "configuration lost": Damage(removed("config.yaml"), "is no configuration: it is missing"),
     "configuration empty": Damage(written("config.yaml", ""), "config.yaml is empty"),
     "catalog empty": Damage(written("catalog.parquet", ""), "is not a FlexRoad catalog"),
 }
