@@ -1,7 +1,7 @@
 """What changed since the soak tests passed: ``python tests/changed.py AREA`` ends with 0 if the area did.
 
-Soak tests are marked ``soak`` with the name of an area. ``pytest --soak changed`` leaves out those of areas
-that are as in the commit that ``tests/soak/passed`` names.
+Soak tests are marked ``soak`` with the name of an area. ``pytest --soak changed`` leaves out an area if it has
+not changed since the commit in ``tests/soak/passed``.
 """
 
 import subprocess

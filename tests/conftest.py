@@ -37,7 +37,7 @@ QUICK = {
 
 def pytest_addoption(parser):
     helped = (
-        "all soak tests; those of changed areas (tests/changed.py); or all, and record the commit if all pass"
+        "all soak tests; tests of changed areas (tests/changed.py); or all, and record the commit if all pass"
     )
     parser.addoption("--soak", choices=("all", "changed", "record"), default="all", help=helped)
 

@@ -107,7 +107,7 @@ class Crossing:
         return Tile(self.surface(grid), road, RoadClusters(grid, mask.astype(np.int32)), Frame(*parts))
 
     def surface(self, grid: Grid) -> LevelledSurface:
-        """Return the plane of the ground, and that of the deck."""
+        """Return the planes of the ground and of the deck."""
         lattice = Lattice.of((grid.width, grid.height), 1.0, 3, 3.6)
         n, m = lattice.intervals
         space, _ = lattice.part(grid.shape, (grid.height, 0), (0, n), (0, m))

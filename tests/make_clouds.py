@@ -74,15 +74,15 @@ class Rasters:
 
     grid: Grid
     dsm: Floats
-    """Highest point per cell, ``(H, W)``, m; NaN where there is none."""
+    """Highest point per cell, ``(H, W)``, m; NaN where no height is known."""
     dtm: Floats
-    """Bare ground, ``(H, W)``, m; NaN where there is none."""
+    """Bare ground, ``(H, W)``, m; NaN where no height is known."""
     top: Top
     """The points close below the DSM; its height has the same voids filled, with the count 0."""
     ground: Bools
     """Cells with ground points, ``(H, W)``; in the others the DTM is interpolated."""
     bridges: Floats | None = None
-    """Height of bridge decks, ``(H, W)``, m, NaN elsewhere; None if there are none."""
+    """Height of bridge decks, ``(H, W)``, m, NaN elsewhere; None without decks."""
     photo: Orthophoto | None = None
     """The orthophoto; None if the points have no colours."""
 

@@ -50,7 +50,7 @@ def off_surface(city, points):
         moved = points[:, :2] + corner
         for place in (moved, on_borders(city, moved)):
             spline = spline_heights(city, place)
-            # Just outside the run, the height is that of the border.
+            # Just outside the run, the height is the border's.
             heights.append(np.where(np.isnan(here), spline, here))
             heights.append(heights[-1] + true_heights(city, place) - spline)
     return np.nanmin(np.abs(points[:, 2] - np.array(heights)), axis=0)

@@ -1,4 +1,4 @@
-"""Documentation: its commands run, links have targets, named tests exist, options are those of the models."""
+"""Documentation: its commands run, links have targets, named tests exist, options are as in the models."""
 
 import re
 import shlex

@@ -1,4 +1,4 @@
-"""The wheel, the container file, the conda recipes and the built viewer are those of the sources."""
+"""The wheel, the container file, the conda recipes and the built viewer belong to the sources."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""The published results stay true: pages are those of the figures beside them, and prose quotes them."""
+"""The published results stay true: pages are made from the figures beside them, and prose quotes them."""
 
 import re
 from pathlib import Path
@@ -19,7 +19,7 @@ QUOTED = re.compile(r"<!-- results -->(.*?)<!-- /results -->", flags=re.DOTALL)
 
 
 def prose() -> dict[str, str]:
-    """Return the texts that quote the tables: pages beside them, and marked parts of others."""
+    """Return the texts that quote the tables: pages beside them, and marked parts of other pages."""
     others = ("tables.md", "figures.md", "causes.md", "real_data.md", "speed.md")
     texts = {page.name: page.read_text() for page in RESULTS.glob("*.md") if page.name not in others}
     return texts | {"causes.md (quoted)": "".join(QUOTED.findall((RESULTS / "causes.md").read_text()))}
@@ -35,7 +35,7 @@ def test_published_results_are_those_of_their_figures():
 
 
 def test_causes_counts_the_verdicts():
-    """The sentences of causes.md that count claims and changes are those of the tables."""
+    """The sentences of causes.md that count claims and changes agree with the tables."""
     causes, page = ((RESULTS / name).read_text() for name in ("causes.md", "tables.md"))
     claims = re.search(r"The paper's \d+ claims about GeRoD: [^.]*\.", page)[0]
     changes = re.search(r"\d+ changes of L2 and MAD [^.]*\.", page)[0]
@@ -91,7 +91,7 @@ def benchmark_means(name: str) -> list[float]:
 
 
 def test_readme_has_the_errors_against_the_truth():
-    """Its four rows are those of the tables and, for production, of the page on the fit."""
+    """Its four rows are as in the tables and, for production, of the page on the fit."""
     readme = (ROOT / "README.md").read_text()
     true = tables("Our figures by the segmented mask, and by the true mask and true heights")
     triangles = tables("Table I: T")

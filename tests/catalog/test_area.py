@@ -68,7 +68,7 @@ def test_area_touches_the_tiles_that_it_overlaps(tmp_path, shape, crs, touched):
 
 
 def test_area_of_degrees_has_straight_sides_in_degrees(tmp_path):
-    """A parallel is curved in metres: the area is that of the file, not of its transformed corners."""
+    """A parallel is curved in metres: the area is taken from the file, not from its transformed corners."""
     north = 5600100 - 0.5
     to_degrees = Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True)
     _, latitude = to_degrees.transform(500000, north)

@@ -1,4 +1,4 @@
-"""Parts and names of a CRS, coordinates that cannot be in it, and metres that are none on the ground."""
+"""Parts and names of a CRS, coordinates that cannot be in it, and metres of another length."""
 
 import math
 

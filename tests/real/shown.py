@@ -1,4 +1,4 @@
-"""Run the commands of a docs page, and read its tables and those of a report."""
+"""Run the commands of a docs page, and read its tables and the tables of a report."""
 
 import subprocess
 import sys

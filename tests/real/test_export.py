@@ -1,4 +1,4 @@
-"""Barbican, London, in all formats of exports: read back, the heights are those of the fitted surfaces."""
+"""Barbican, London, in all formats of exports: read back, the heights equal the fitted surfaces."""
 
 import csv
 import json

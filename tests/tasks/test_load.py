@@ -186,7 +186,7 @@ def test_load_other_lattice_is_resampled_with_note(tmp_path, models, cell, west,
 
 
 def test_load_resampling_ignores_cells_without_value(tmp_path, models):
-    """Bilinear weights without those of voids, normalised to one; voids keep their size."""
+    """Bilinear weights without the weights of voids, normalised to one; voids keep their size."""
     source = relief(24, 24)
     source[8:11, 9] = np.nan
     source[15, 15] = 1e30

@@ -1,7 +1,7 @@
 """Third-party programs that check exports: installed by ``make validators``, in an environment of their own.
 
 The tests run them as processes. ``FLEXROAD_VALIDATORS`` names their folder; without it, those tests are
-skipped. ``requirements.txt`` has the Python packages, ``package.json`` those of Node.
+skipped. ``requirements.txt`` has the Python packages, ``package.json`` the packages of Node.
 """
 
 import os

@@ -6,7 +6,7 @@ A step has one key: ``eval`` (JavaScript), ``wait`` (until JavaScript is true), 
 or ``tap`` (pixels), ``pinch`` (middle, and distance of two fingers from it before and after; pixels),
 ``press`` (selector of what is clicked, or selector, x and y in it), ``focus`` (selector), ``select``
 (selector and value), ``key``, ``shot`` (x, y, width and height; gives a PNG in base64). The output has the
-results, all requests but those of files and data, all errors of the page, and whether the page is wider than
+results, all requests except for files and data, all errors of the page, and whether the page is wider than
 the window.
 """
 

@@ -8,7 +8,7 @@ and exits with 1 if a height differs by more than the export has printed, in its
 
 Programs that are missing are named and left out. Blender and QGIS are no part of ``make validators``:
 ``BPY_PYTHON`` and ``QGIS_PYTHON`` name interpreters that have ``bpy`` (``pip install bpy``) and ``qgis``
-(Debian's ``python3-qgis``); without them those of the validators and of the system are tried.
+(Debian's ``python3-qgis``); without them the packages of the validators and of the system are tried.
 """
 
 import json
@@ -124,7 +124,7 @@ class Survey:
         return np.concatenate([tile.mesh.vertices + tile.mesh.origin for tile in select(self.run).finished()])
 
     def vertices(self, program: str, file: str, points: np.ndarray, printed: float) -> Found:
-        """Return how far vertices are above or below those of the run's meshes, which must all be there."""
+        """Return how far vertices are above or below the run's meshes, which must all be there."""
         away, nearest = scipy.spatial.KDTree(points).query(self.mesh_vertices)
         difference = 1000 * np.abs(points[nearest, 2] - self.mesh_vertices[:, 2])
         difference[away > SAME_M] = np.inf

@@ -113,7 +113,7 @@ CHUNK, ITEMS = 12, 32
 
 
 def start_of(path: Path) -> tuple[int, int]:
-    """Return the first byte of the record of the compression, and that of the points."""
+    """Return the first byte of the compression's record, and the first byte of the points."""
     with laspy.open(path) as reader:
         record = reader.header.vlrs.get("LasZipVlr")[0].record_data
         return path.read_bytes().find(record), reader.header.offset_to_point_data

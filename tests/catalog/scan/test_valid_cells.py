@@ -43,7 +43,7 @@ def test_alpha_of_any_type_is_a_void(dtype, opaque, tmp_path):
     assert height_share(GRID, [path]) == 1 - VOID.mean()
     with rasterio.open(path) as raster:
         np.testing.assert_array_equal(np.ma.getmaskarray(read_valid(raster)), VOID)
-        # GDAL's own mask has those of uint8 and uint16.
+        # GDAL's own mask has the cells of uint8 and uint16.
         assert (alpha_band(raster) is None) == (dtype in ("uint8", "uint16"))
 
 
@@ -65,7 +65,7 @@ def test_alpha_beside_a_nodata_value_counts_too_also_as_nan(dtype, tmp_path):
 @pytest.mark.parametrize("strip", [1, 64])
 @pytest.mark.parametrize("nodata", [None, -9999])
 def test_cells_read_several_as_one_do_not_mix_with_voids(strip, nodata, tmp_path, monkeypatch):
-    """Means are those of the cells with a value, and with fewer than half of them there is none."""
+    """The mean is over the cells with a value. With fewer than half of the cells there is no mean."""
     monkeypatch.setattr("flexroad.tasks.io.raster.STRIP", strip)
     path = with_alpha(tmp_path / "a.tif", PLANE, VOID, nodata=nodata)
     grid = Grid(UTM, WEST, NORTH, 4.0, COLS // 4, ROWS // 4)

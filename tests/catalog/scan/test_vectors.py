@@ -83,7 +83,7 @@ def test_roads_file_outside_folder_in_other_crs_is_used(survey, tmp_path):
     assert named(tiles) == [["r.geojson"], ["r.geojson"], []]
     roads = tiles[0].layer("roads")
     assert tiles[0].paths(roads) == (path,)
-    # Bounds in degrees are those of a slightly turned rectangle.
+    # Bounds in degrees are the bounds of a slightly turned rectangle.
     assert roads.extents[0] == pytest.approx((295_399, 5_629_299, 295_601, 5_629_301), abs=25)
     assert roads.reaching((295_500.0, 5_629_250.0, 295_600.0, 5_629_350.0)) == roads
     assert roads.reaching((295_500.0, 5_629_350.0, 295_600.0, 5_629_400.0)) is None

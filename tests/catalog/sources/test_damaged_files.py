@@ -157,7 +157,7 @@ def test_vrt_is_left_out_with_the_remedy_and_a_folder_is_passed_over(survey):
 
 @contextlib.contextmanager
 def forbidden(folder: Path, mode: int = 0):
-    """Take all permissions of a folder away, or leave those of ``mode``."""
+    """Take all permissions of a folder away, or leave the permissions ``mode``."""
     folder.chmod(mode)
     with permissions_enforced():
         yield

@@ -1,4 +1,4 @@
-"""Settings of buckets, and lists of their files: as those of folders, at a memory that does not grow."""
+"""Settings of buckets, and lists of their files: as for folders, with bounded memory."""
 
 import tracemalloc
 from types import SimpleNamespace

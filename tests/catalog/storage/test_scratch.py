@@ -1,4 +1,4 @@
-"""Temporary folders are removed when their process ends; those of killed processes by a later one."""
+"""Temporary folders are removed when their process ends; a later process removes those that a kill left."""
 
 import os
 import subprocess

@@ -331,7 +331,7 @@ def test_slurm_options_write_job_script(tmp_path):
 
 
 def test_map_on_slurm_starts_and_ends_jobs(tmp_path, monkeypatch):
-    """Commands replace those of SLURM: they start, list and kill local processes."""
+    """Commands replace SLURM's commands: they start, list and kill local processes."""
     pytest.importorskip("dask_jobqueue")
     jobs = tmp_path / "jobs"
     commands = {

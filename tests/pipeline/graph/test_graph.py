@@ -181,7 +181,7 @@ HALO = {**PAPER, "load": {"halo_m": 50}}
 
 
 def own_and_neighbours(tile, name="dsm"):
-    """Return the paths of a layer: the tile's own file, and those of its neighbours."""
+    """Return the paths of a layer: the tile's own file, and its neighbours' files."""
     own, *others = tile.paths(tile.layer(name))
     assert own.stem == tile.id
     assert others

@@ -237,7 +237,7 @@ def test_map_of_states_is_read_by_gdal(copy, tmp_path):
     assert table["id"].tolist() == [one, two, three, four]
     assert table.state.tolist() == ["done", "cached", "failed", "pending"]
     done, _, failed, pending = table.itertuples()
-    # The error estimate is that of the exported surface, not of the baselines.
+    # The error estimate is of the exported surface, not of the baselines.
     assert (done.error_estimate_m, done.flags, done.seconds) == (0.25, "patch", 1.5)
     assert done.finished.isoformat() == finished
     assert failed.error == "load: TaskError: no, file"

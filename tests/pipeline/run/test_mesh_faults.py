@@ -1,4 +1,4 @@
-"""Meshes of runs are checked: those of all variants have no fault, and one with a fault fails its tile."""
+"""Meshes of runs are checked: meshes of all variants have no fault. A mesh with a fault fails its tile."""
 
 import zipfile
 from dataclasses import replace

@@ -183,7 +183,7 @@ def test_dry_run_names_the_tiles_without_a_texture(photographed, survey, flexroa
     assert not [line for line in flexroad(*command).expected(0).out.splitlines() if "texture" in line]
 
 
-# --- notes: those of the sources, whichever results are computed and whichever are stored --------------
+# --- notes: of the sources, whichever results are computed and whichever are stored --------------
 
 CLEANED = "dsm: 2 cells outside -500..9000 m taken as nodata"
 """The note of `load` on the survey."""

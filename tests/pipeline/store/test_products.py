@@ -67,7 +67,7 @@ def test_finish_on_share_that_cannot_flush_folders_completes(tmp_path, monkeypat
 
 
 def _finish(folder: TileProducts, content: bytes) -> None:
-    """Finish the tile with two products of the same sizes as those of other contents."""
+    """Finish the tile with two products of the same sizes, with other contents."""
     products = {"a.glb": content, "a.tif": content * 2}
     assets = {name: file_entry(name, data, "") for name, data in products.items()}
     properties = {"flexroad:fingerprint": content.hex(), "flexroad:rows": []}

@@ -18,7 +18,7 @@ def cluster(mask, dsm, options=KEEP_ALL, cell=1.0) -> RoadClusters:
 
 
 def streets(rng, n=60, share=0.25):
-    """Return a mask with blobs of road and a DSM of hills with steps like those of crowns and cars."""
+    """Return a mask with blobs of road and a DSM of hills with steps as at crowns and cars."""
     field = gaussian_filter(rng.standard_normal((n, n)), 2)
     ground = gaussian_filter(rng.standard_normal((n, n)), 6) * 20
     objects = (gaussian_filter(rng.standard_normal((n, n)), 1) > 0.3) * rng.uniform(0, 3, (n, n))

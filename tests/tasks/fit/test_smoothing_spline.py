@@ -39,7 +39,7 @@ def difference(monkeypatch, data, clusters, options=OPTIONS, frame=None):
 
 
 def framed(data, clusters, options=OPTIONS):
-    """Return a frame whose control points are those of a fit of the tile alone, 0.1 m higher."""
+    """Return a frame whose control points come from a fit of the tile alone, 0.1 m higher."""
     control, p = smoothing_spline.fit(data, clusters, options).A + 0.1, options.degree
     ends = np.zeros((2, 2), bool)
 

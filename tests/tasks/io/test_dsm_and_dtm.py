@@ -39,7 +39,7 @@ def town():
 
 @pytest.mark.parametrize("stratum", ["urban", "suburban", "rural"])
 def test_survey_has_a_note_only_if_swapped_or_in_feet(stratum):
-    """In feet its differences between neighbours are more than those of open ground in metres."""
+    """In feet its differences between neighbours are larger than on open ground in metres."""
     scene = make_scene(GRID, 3, stratum)
     assert below_ground_note(scene.dsm, scene.dtm) is None
     assert below_ground_note(scene.dtm, scene.dsm).endswith("are their files swapped?")

@@ -179,7 +179,7 @@ def test_encode_texture_colour_of_each_vertex_tells_its_place(cell):
         x, _, z = attribute(data, node, "POSITION").T
         colour = looked_up(image(data), attribute(data, node, "TEXCOORD_0"))
         # The mesh starts 2 m north of the photo's south-west corner. Beyond the outermost texel centres
-        # the colour is that of the border.
+        # the colour is the border's.
         for band, place in ((0, x), (1, 2 - z)):
             errors.append(colour[:, band] / 255 * 12 - np.clip(place, cell / 2, 12 - cell / 2))
     assert max(np.abs(error).max() for error in errors) < cell

@@ -17,7 +17,7 @@ def numbers(rows: list[dict]) -> list[int]:
 
 
 def one(**row) -> int:
-    """Return the level of one row; missing values and notes are those of its table."""
+    """Return the level of one row; missing values and notes are the table's."""
     return numbers([row])[0]
 
 

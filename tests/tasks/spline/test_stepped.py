@@ -84,7 +84,7 @@ def test_steps_hidden_cells_are_on_their_side_of_wall():
 
 
 def test_height_on_the_border_is_that_of_the_spline():
-    """Neighbours meet there: the heights are those of the common spline."""
+    """Neighbours meet there: the heights are the common spline's."""
     data, clusters, _ = tile(4.0)
     surface = fitted(data, clusters)
     west, south, east, north = GRID.bounds
@@ -106,7 +106,7 @@ def test_surface_without_verge_has_no_steps():
 
 
 def test_ground_beside_the_road_is_the_dtm():
-    """Grass is in the DSM; where neither has a height, the ground is between that of the cells around."""
+    """Grass is in the DSM; where neither has a height, the ground is between the cells around."""
     data, clusters, _ = tile(1.0, noise_m=0.0)
     bank = 100 + 0.1 * np.clip(np.abs(ROWS - 29.5) - 4.5, 0, None)
     void = (slice(20, 22), slice(30, 33))

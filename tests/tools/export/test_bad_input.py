@@ -165,7 +165,7 @@ def test_folder_that_another_export_writes_is_refused(made_city, refused, flexro
 
 @each_format
 def test_files_of_tiles_no_longer_selected_are_removed(made_city, flexroad, tmp_path, name):
-    # Along the roads of the other tile alone there is none of the least length.
+    # Along the roads of the other tile alone no road has the least length.
     second, first = made_city.done
     words = ["export", made_city.path, "--format", name, *DATUM, "-o"]
     flexroad(*words, tmp_path / "one", "--tile", first).expected(0)

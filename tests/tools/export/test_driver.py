@@ -1,4 +1,4 @@
-"""An export has the surface of the run, goes on after interruptions, and its manifest is that of the docs."""
+"""An export has the surface of the run, goes on after interruptions, and its manifest is as in the docs."""
 
 import gzip
 import json

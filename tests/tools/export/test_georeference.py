@@ -35,7 +35,7 @@ def test_sidecar_lines_and_prj_have_the_place():
 
 PLACES = {
     "EPSG:25832": (366_000.0, 5_621_000.0, "GRS80"),
-    # Another ellipsoid than those of GNSS.
+    # No ellipsoid of GNSS.
     "EPSG:27700": (532_400.0, 181_800.0, "WGS84"),
     "EPSG:26910": (5e5, 4.2e6, "GRS80"),
 }

@@ -54,7 +54,7 @@ def peak_bytes(source: Source, name: str, out) -> int:
 def growth_bytes(city, name, folder) -> int:
     """The growth from few tiles to many, in a process of its own.
 
-    In that of the tests the threads of a cluster may take memory at the same time.
+    In the process of the tests the threads of a cluster may take memory at the same time.
     """
     reader, writer = os.pipe()
     if child := os.fork():

@@ -71,7 +71,7 @@ def test_write_pieces_of_the_plan_meet_with_the_same_heading(points):
         np.testing.assert_allclose((x, y), numbers(after, "x", "y"), atol=1e-6)
         turned = (heading - float(after.attrib["hdg"]) + np.pi) % (2 * np.pi) - np.pi
         assert abs(turned) < 1e-6
-        # The length is that of the curve.
+        # The length is the curve's.
         fine = np.array([plan(element, at)[:2] for at in np.linspace(s, s + length - 1e-10, 201)])
         assert np.linalg.norm(np.diff(fine, axis=0), axis=1).sum() == pytest.approx(length, abs=1e-5)
 

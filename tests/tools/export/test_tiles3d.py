@@ -98,7 +98,7 @@ def test_sheet_of_4_km_is_where_its_points_are_within_2_mm(east):
     matrix = matrix_of(tile(placed_sheet, 64.0))
     read = from_earth(np.column_stack([x, -z, y]) @ matrix[:3, :3].T + matrix[:3, 3])
     assert np.abs(read - made.points).max() < 0.002
-    # A rigid frame: lengths on the Earth, not those of the map.
+    # A rigid frame: lengths on the Earth, not on the map.
     np.testing.assert_allclose(matrix[:3, :3].T @ matrix[:3, :3], np.eye(3), atol=1e-14)
     assert np.abs(local).max() < 4000
 

@@ -167,7 +167,7 @@ def test_coarse_mesh_has_the_colours_of_its_tiles(survey, plain, draped):
     assert image.min() < 80 < 180 < image.max()
     (file,) = (draped[1] / "coarse").iterdir()
     image = image_of(file)
-    # The south-west quarter is that of the first tile.
+    # The south-west quarter is the first tile's.
     size = len(image) // 2
     with rasterio.open(survey.tiles[0].paths(survey.tiles[0].layer("dop"))[0]) as photo:
         colour = photo.read().mean(axis=(1, 2))

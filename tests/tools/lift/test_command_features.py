@@ -57,7 +57,7 @@ def run(tmp_path_factory) -> Path:
 
 
 def write(path: Path, shapes, crs=UTM, index: bool = True, **columns) -> Path:
-    """Write features; without an index, those of a FlatGeobuf keep their order."""
+    """Write features; without an index, features of a FlatGeobuf keep their order."""
     columns = columns or {name: values[: len(shapes)] for name, values in ATTRIBUTES.items()}
     geopandas.GeoDataFrame(columns, geometry=shapes, crs=crs).to_file(
         path, engine="pyogrio", **({} if index else {"SPATIAL_INDEX": "NO"})

@@ -188,7 +188,7 @@ def test_prepare_interrupted_leaves_no_folder(cloud, tmp_path, number):
 def test_prepare_points_bridge_class_selects_bridges(tmp_path, words, is_bridge):
     east, north = np.meshgrid(np.arange(0, 40, 0.5), np.arange(0, 40, 0.5))
     kind = np.where(abs(north - 20) < 4, 26, 2)
-    # A place in the Netherlands: elsewhere a metre of their CRS is none.
+    # A place in the Netherlands: elsewhere a metre of their CRS is no metre.
     xyz = np.stack([east + 155_000, north + 463_000, np.where(kind == 26, 6.0, 0.0)], -1).reshape(-1, 3)
     path = write_cloud(tmp_path / "ahn.las", xyz, kind.ravel(), "EPSG:28992")
     said = flexroad("prepare", path, "-o", tmp_path / "out", "--workers", 1, *words)

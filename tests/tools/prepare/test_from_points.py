@@ -394,7 +394,7 @@ def flight(path, **options):
     ],
 )
 def test_date_is_that_of_the_points_else_of_the_header(tmp_path, options, expected, assumed):
-    """Standard GPS times are dates; seconds of a week are none, even if the header says so."""
+    """Standard GPS times are dates; seconds of a week are no dates, even if the header says so."""
     result, _ = prepare([flight(tmp_path / "a.las", **options)], tmp_path / "out")
     (tile,) = Catalog.read(result.catalog).tiles
     assert (f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == (expected, assumed)

@@ -37,7 +37,7 @@ def test_write_tile_returns_the_tile_of_its_files(tmp_path):
     assert (first.id, second.id) == ("a", "b")
     assert (second.grid, second.stratum, second.dataset) == (GRID, "urban", "made")
     assert first.dataset == ""
-    # Without a date, it is that of the file.
+    # Without a date, it is the file's.
     assert first.datetime_assumed
     assert before < first.datetime < datetime.now(UTC) + timedelta(seconds=5)
     assert second.datetime == TAKEN

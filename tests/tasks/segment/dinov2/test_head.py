@@ -1,4 +1,4 @@
-"""Heads from others: refused if their sizes or values are not those of a head."""
+"""Heads from others: refused if a head cannot have their sizes or values."""
 
 import json
 import os

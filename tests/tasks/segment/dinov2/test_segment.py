@@ -201,7 +201,7 @@ def test_segment_threshold_changes_mask_only(model, sample):
     np.testing.assert_array_equal(strict.probability, lax.probability)
     assert not np.any(strict.mask & ~lax.mask)
     assert strict.mask.sum() < lax.mask.sum()
-    # A cell's probability is the mean of 10 x 10 pixels; its mask is that of the central pixel.
+    # A cell's probability is the mean of 10 x 10 pixels; its mask is the central pixel's.
     assert np.mean(lax.mask == (lax.probability >= 0.1)) > 0.9
 
 
