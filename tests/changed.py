@@ -1,6 +1,6 @@
 """What changed since the soak tests passed: ``python tests/changed.py AREA`` ends with 0 if the area did.
 
-Soak tests are marked ``soak`` with the name of an area. ``pytest --soak changed`` leaves out an area if it has
+Soak tests are marked ``soak`` with the name of an area. ``pytest --soak changed`` leaves out an area that has
 not changed since the commit in ``tests/soak/passed``.
 """
 
