@@ -41,6 +41,46 @@ NAMES = """
 """.split()
 COLUMNS = dict.fromkeys(NAMES, "float64") | dict.fromkeys(TEXTS, "str") | {"triangles": "Int64"}
 """Columns of metrics.parquet and their types in pandas, in the table's order."""
+LABELS: dict[str, tuple[str, str]] = {
+    "error_estimate_m": ("error estimate", "m"),
+    "worst_error_estimate_m": ("error estimate of the worst 25 m²", "m"),
+    "l2_road_m": ("road error (L2)", "m"),
+    "p95_road_m": ("road error, 95th percentile", "m"),
+    "rmse_road_m": ("road error (RMSE)", "m"),
+    "nmad_road_m": ("road error (NMAD)", "m"),
+    "l2_terrain_m": ("terrain error (L2)", "m"),
+    "rmse_terrain_m": ("terrain error (RMSE)", "m"),
+    "nearest_road_m": ("road error in 3D", "m"),
+    "nearest_terrain_m": ("terrain error in 3D", "m"),
+    "mad_road_deg": ("roughness of the road (MAD)", "°"),
+    "mad_terrain_deg": ("roughness of the terrain (MAD)", "°"),
+    "mesh_p95_road_m": ("mesh distance road p95", "m"),
+    "mesh_max_road_m": ("mesh distance road, largest", "m"),
+    "mesh_p95_terrain_m": ("mesh distance terrain p95", "m"),
+    "mesh_max_terrain_m": ("mesh distance terrain, largest", "m"),
+    "max_unexplained_area_m2": ("largest unexplained patch", "m²"),
+    "curvature_per_m": ("largest curvature", "1/m"),
+    "edge_step_m": ("step at the road's edge", "m"),
+    "residual_median_m": ("surface minus the road's heights, median", "m"),
+    "residual_nmad_m": ("surface minus the road's heights, NMAD", "m"),
+    "residual_p95_m": ("surface minus the road's heights, 95th percentile", "m"),
+    "dsm_excess_m": ("DSM above the heights that roads are fitted to, median", "m"),
+    "off_dtm_m": ("surface minus DTM, median", "m"),
+    "off_dtm_road": ("road off the DTM", "%"),
+    "measured_road": ("road with a measured height", "%"),
+    "dtm_road": ("road with the DTM's height", "%"),
+    "inferred_road": ("road without a height", "%"),
+    "dropped_road": ("road dropped by the filter", "%"),
+    "bounded_weights": ("weights at their limit", "%"),
+    "holdout_squares": ("withheld squares of road", ""),
+    "holdout_error_m": ("mean difference at withheld squares", "m"),
+    "holdout_covered": ("withheld squares within the 90% interval", "%"),
+    "road_fraction": ("share of road", "%"),
+    "completeness": ("completeness", "%"),
+    "triangles": ("triangles", ""),
+    "seconds": ("computing time", "s"),
+}
+"""Label and unit of the numeric columns of metrics.parquet, for report and viewer; shares are in percent."""
 IN_ARROW = {"str": "large_string", "float64": "float64", "Int64": "int64"}
 """Type in Arrow by type in pandas."""
 

@@ -27,6 +27,7 @@ from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run, check_links, check_own
 from flexroad.pipeline.run.status import Track, ended, peek_statuses, untracked
 from flexroad.pipeline.store.records import LEVELS
+from flexroad.pipeline.store.tables import LABELS
 from flexroad.pipeline.worker.exports import tile_photo
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.dsm_and_dtm import vertical_crs
@@ -51,21 +52,11 @@ OWNER = ".flexroad-viewer"
 """File with the path of the run whose viewer the folder has."""
 PENDING, DONE, FAILED = range(3)
 """States of tiles in the index."""
-MEASURES = {
-    "error_estimate_m": ("Error estimate", "m"),
-    "worst_error_estimate_m": ("Error estimate of the worst 25 m²", "m"),
-    "max_unexplained_area_m2": ("Largest unexplained patch", "m²"),
-    "measured_road": ("Road measured by the scan", "%"),
-    "dtm_road": ("Road from the terrain model", "%"),
-    "inferred_road": ("Road inferred", "%"),
-    "residual_p95_m": ("Road points off the surface, p95", "m"),
-    "edge_step_m": ("Step at the road's edge, p95", "m"),
-    "l2_road_m": ("Road against the reference", "m"),
-    "l2_terrain_m": ("Terrain against the reference", "m"),
-    "triangles": ("Triangles", ""),
-    "seconds": ("Computing time", "s"),
-}
-"""Title and unit of the columns of metrics.parquet that colour the map; % marks shares."""
+MEASURES = """
+    error_estimate_m worst_error_estimate_m max_unexplained_area_m2 measured_road dtm_road inferred_road
+    residual_p95_m edge_step_m l2_road_m l2_terrain_m triangles seconds
+""".split()
+"""The columns of metrics.parquet that colour the map."""
 DIGITS = 4
 """Digits of the figures in the index."""
 LOOPBACK = "127.0.0.1"
@@ -217,10 +208,14 @@ def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any
         "crs_name": label if label == name(in_plan(crs)) else f"{label}, {name(in_plan(crs))}",
         "vertical": name(vertical) if vertical else None,
         "origin": list(run.origin),
-        "measures": {key: dict(zip(("title", "unit"), MEASURES[key], strict=True)) for key in known},
+        "measures": {key: _titled(*LABELS[key]) for key in known},
         "tiles": columns,
     } | ({"levels": True} if any(LEVELS in row for row in rows) else {})
     return index, [tile for tile, state in zip(tiles, states, strict=True) if state == DONE]
+
+
+def _titled(label: str, unit: str) -> dict[str, str]:
+    return {"title": label[0].upper() + label[1:], "unit": unit}
 
 
 def _figure(value: Any) -> float | None:

@@ -16,13 +16,13 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.store.tables import COLUMNS, METRICS, metrics_frame
+from flexroad.pipeline.store.tables import COLUMNS, LABELS, METRICS, metrics_frame
 from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, STRUCTURE_FLAGS
 from flexroad.tools.report import _viewer_address, write_report
 from flexroad.tools.report.browser.figures import compare, histograms
 from flexroad.tools.report.browser.outcome import MEANINGS, headline, reasons, statements
 from flexroad.tools.report.browser.page import html_page, ranking
-from flexroad.tools.report.browser.tiles import LABELS, NAMES, as_script, errors, map_data, tile_table
+from flexroad.tools.report.browser.tiles import NAMES, as_script, errors, map_data, tile_table
 from tests.made_report import failed_row, made_content, made_row, made_run
 
 EVIL = "<script>alert(1)</script>"

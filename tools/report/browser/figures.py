@@ -11,7 +11,8 @@ import pandas as pd
 from markupsafe import Markup
 
 from flexroad.catalog.text import count
-from flexroad.tools.report.browser.tiles import LABELS, TileTable, short
+from flexroad.pipeline.store.tables import LABELS
+from flexroad.tools.report.browser.tiles import TileTable, short
 
 FIGURES = ("error_estimate_m", "l2_road_m", "l2_terrain_m", "mad_road_deg", "triangles", "seconds")
 """Figures that are compared; for all of them smaller is better."""

@@ -18,11 +18,11 @@ from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import count, printable
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
+from flexroad.pipeline.store.tables import LABELS
 from flexroad.tasks.quality.assess import FLAGS, LIMITS
 from flexroad.tools.report.browser.figures import Comparison, compare, histograms
 from flexroad.tools.report.browser.outcome import cards, described, headline, reasons, statements
 from flexroad.tools.report.browser.tiles import (
-    LABELS,
     TileTable,
     as_script,
     errors,

@@ -18,6 +18,7 @@ from flexroad.catalog import Tile
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import printable
 from flexroad.pipeline.store.records import needs_look
+from flexroad.pipeline.store.tables import LABELS
 from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, STRUCTURE_FLAGS
 from flexroad.tools.report.content import Content
 
@@ -37,46 +38,6 @@ STATES = {
 }
 """State of a tile on the map -> its name in the legend."""
 
-LABELS: dict[str, tuple[str, str]] = {
-    "error_estimate_m": ("error estimate", "m"),
-    "worst_error_estimate_m": ("error estimate of the worst 25 m²", "m"),
-    "l2_road_m": ("road error (L2)", "m"),
-    "p95_road_m": ("road error, 95th percentile", "m"),
-    "rmse_road_m": ("road error (RMSE)", "m"),
-    "nmad_road_m": ("road error (NMAD)", "m"),
-    "l2_terrain_m": ("terrain error (L2)", "m"),
-    "rmse_terrain_m": ("terrain error (RMSE)", "m"),
-    "nearest_road_m": ("road error in 3D", "m"),
-    "nearest_terrain_m": ("terrain error in 3D", "m"),
-    "mad_road_deg": ("roughness of the road (MAD)", "°"),
-    "mad_terrain_deg": ("roughness of the terrain (MAD)", "°"),
-    "mesh_p95_road_m": ("mesh distance road p95", "m"),
-    "mesh_max_road_m": ("mesh distance road, largest", "m"),
-    "mesh_p95_terrain_m": ("mesh distance terrain p95", "m"),
-    "mesh_max_terrain_m": ("mesh distance terrain, largest", "m"),
-    "max_unexplained_area_m2": ("largest unexplained patch", "m²"),
-    "curvature_per_m": ("largest curvature", "1/m"),
-    "edge_step_m": ("step at the road's edge", "m"),
-    "residual_median_m": ("surface minus the road's heights, median", "m"),
-    "residual_nmad_m": ("surface minus the road's heights, NMAD", "m"),
-    "residual_p95_m": ("surface minus the road's heights, 95th percentile", "m"),
-    "dsm_excess_m": ("DSM above the heights that roads are fitted to, median", "m"),
-    "off_dtm_m": ("surface minus DTM, median", "m"),
-    "off_dtm_road": ("road off the DTM", "%"),
-    "measured_road": ("road with a measured height", "%"),
-    "dtm_road": ("road with the DTM's height", "%"),
-    "inferred_road": ("road without a height", "%"),
-    "dropped_road": ("road dropped by the filter", "%"),
-    "bounded_weights": ("weights at their limit", "%"),
-    "holdout_squares": ("withheld squares of road", ""),
-    "holdout_error_m": ("mean difference at withheld squares", "m"),
-    "holdout_covered": ("withheld squares within the 90% interval", "%"),
-    "road_fraction": ("share of road", "%"),
-    "completeness": ("completeness", "%"),
-    "triangles": ("triangles", ""),
-    "seconds": ("computing time", "s"),
-}
-"""Label and unit of the numeric columns of metrics.parquet, in the order of the list; shares in percent."""
 NAMES = ("stratum", "method")
 """Columns with names."""
 
