@@ -28,11 +28,11 @@ def write(
     values = np.asarray(values)
     bands = values if values.ndim == 3 else values[None]
     path.parent.mkdir(parents=True, exist_ok=True)
-    form = {"driver": driver, "dtype": bands.dtype, "crs": crs, **profile}
-    form |= dict(zip(("count", "height", "width"), bands.shape, strict=True))
+    form = dict(zip(("count", "height", "width"), bands.shape, strict=True))
+    form |= {"driver": driver, "dtype": bands.dtype, "crs": crs, **profile}
     form["transform"] = transform or Affine(cell, 0, west, 0, -cell, north)
     with rasterio.open(path, "w", **form) as dst:
-        dst.write(bands)
+        dst.write(bands, [*range(1, len(bands) + 1)])
         dst.update_tags(**(tags or {}))
         if unit:
             dst.units = (unit,)

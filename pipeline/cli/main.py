@@ -19,7 +19,7 @@ from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
 COMMANDS = {
-    "init": ("tools.check.command", "Say what a folder of downloads has, and which commands fit."),
+    "init": ("tools.check.command", "List the downloads in a folder, and the commands for them."),
     "run": ("pipeline.cli.run", "Bring every tile of a run up to date."),
     "rerun": ("pipeline.cli.run", "Bring tiles of a run up to date again."),
     "status": ("pipeline.cli.run", "Show the state of a run and the failures of its tiles."),
@@ -33,7 +33,7 @@ COMMANDS = {
     "figures": ("tools.reproduce.command", "Draw the paper's figures from a run."),
     "train": ("tools.train.command", "Train the head of `segment: dinov2` on labelled tiles."),
     "catalog": ("pipeline.cli.catalogs", "Make, show and check catalogs of tiles."),
-    "prepare": ("tools.prepare.command", "Make rasters and a catalog of points, meshes or photographs."),
+    "prepare": ("tools.prepare.command", "Make rasters and a catalog from points, meshes or photographs."),
     "config": ("pipeline.cli.configs", "Show configurations."),
 }
 """The module of each command and the first line of its help (`LazyGroup.modules`)."""
